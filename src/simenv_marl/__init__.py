@@ -1,0 +1,39 @@
+"""Reinforcement learning environments out of simulations that know nothing of reinforcement learning.
+
+The layers, each importing only from those above it::
+
+    errors        the tree of errors
+    simulation    what a simulation is; RULE and TRUNCATED
+    _spaces       casting observations to spaces, checking actions against them
+    _driver       switching between a simulation's stack and its user's
+    decision      make_step: definitions, decision points, decision functions
+    _points       what ``points=`` names, and patches for what nobody has decorated
+    _plan         what an environment is made of, checked before anything runs
+    _episode      what happens when: decisions, rewards, observations, ends, errors
+    _session      a simulation over all episodes of one environment
+    envs          views: an episode read as a PettingZoo or Gymnasium environment
+"""
+
+from . import errors
+from .decision import Definition, difference, make_step
+from .envs import SimulationAECEnv, SimulationEnv, aec_env, generate_env, single_env
+from .errors import *  # noqa: F403 - the whole tree is public
+from .simulation import RULE, TRUNCATED, SimulationInterface
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "RULE",
+    "TRUNCATED",
+    "Definition",
+    "SimulationAECEnv",
+    "SimulationEnv",
+    "SimulationInterface",
+    "aec_env",
+    "difference",
+    "errors",
+    "generate_env",
+    "make_step",
+    "single_env",
+]
+__all__ += errors.__all__

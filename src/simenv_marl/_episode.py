@@ -1,0 +1,497 @@
+"""One episode of one simulation: the one place that knows what happens when.
+
+An episode may be *about to begin*, *pending* (a decision has arisen and waits for its answer), *moving*
+(the simulation runs, or its policies and mappings do) or *over*. Once it is over it stays over.
+
+What happens, in this order, when a decision arises::
+
+    simulation                   episode (on its user's stack)
+    ----------                   -----------------------------
+    calls a decision function
+      suspended         ------>  who decides? ``agent=`` names the agent
+                                 nobody, or RULE: back to the simulation, where the rule decides
+                                 reward of the agent's action before (the first of an episode is dropped)
+                                 mask, observation
+                                 a policy answers: back to the simulation with its action
+                                 else: pending, until ``turn`` brings the user's action
+                                 action checked, mapped to the decision
+      returns           <------  ... and back to the simulation
+    returns from ``run``
+      over              ------>  of each agent: last reward, last observation, flags
+
+Views read the records of agents; none of them computes an observation or a reward.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import isfinite
+from threading import get_ident
+from typing import Any, Final
+from weakref import ref
+
+import numpy as np
+
+from . import _spaces
+from ._driver import RUNNING, Driver, GreenletDriver, SimulationExit, unattended
+from ._plan import Binding, Plan
+from .decision import EVALUATING, DecisionPoint, Difference
+from .errors import (
+    AgentError,
+    EpisodeOverError,
+    MaskError,
+    NoDecisionError,
+    ReentrancyError,
+    RewardError,
+    WrongThreadError,
+)
+from .simulation import RULE, TRUNCATED
+
+UNWINDING_TRIES: Final = 8
+"""How often a simulation that is to be unwound may decide or swallow before it is given up."""
+
+_FINISHED: Final = object()
+_FAILED: Final = object()
+
+_given_up: list[Driver] = []
+"""Simulations that refused to unwind: dropping them would resume them at some random moment."""
+
+
+class Record:
+    """What an episode knows of one agent.
+
+    Attributes:
+        agent: Its name.
+        binding: The decision point where it decides.
+        policy: Who answers for it; None: the environment's user.
+        decided: Whether it has decided in this episode.
+        observation: Its latest observation, cast to its space; None before it was ever observed.
+        reward: The reward of its action before, as of its latest decision or its end.
+        info: The info of its latest decision, a dict of its own.
+        mask, choices: The legal actions of its pending decision, where its point restricts them.
+        memory: What differences remember for it.
+    """
+
+    __slots__ = (
+        "_args", "_kwargs", "_weakly", "agent", "binding", "choices", "decided", "info", "mask", "memory",
+        "observation", "policy", "reward",
+    )  # fmt: skip
+
+    def __init__(self, agent: str, binding: Binding, policy: Any) -> None:
+        self.agent = agent
+        self.binding = binding
+        self.policy = policy
+        self.decided = False
+        self.observation: Any = None
+        self.reward = 0.0
+        self.info: dict[str, Any] = {}
+        self.mask: Any = None
+        self.choices: Any = None
+        self.memory: dict[Any, Any] = {}
+        self._args: tuple[Any, ...] | None = None
+        self._kwargs: dict[str, Any] = {}
+        self._weakly: Any = None
+
+    def loosen(self) -> None:
+        """Keep the first argument weakly from now on, so that the model can let go of an entity."""
+        args = self._args
+        if args:
+            first = args[0]
+            if self._weakly is None or self._weakly() is not first:
+                try:
+                    self._weakly = ref(first)
+                except TypeError:  # cannot be held weakly
+                    self._weakly = None
+                    return
+            self._args = (self._weakly, *args[1:])
+
+    def arguments(self) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
+        """The arguments of the latest decision; None where there are none any more."""
+        args = self._args
+        if args and self._weakly is not None and args[0] is self._weakly:
+            first = self._weakly()
+            return None if first is None else ((first, *args[1:]), self._kwargs)
+        return None if args is None else (args, self._kwargs)
+
+    def forget(self) -> None:
+        """Let go of the arguments; the agent has no more to observe."""
+        self._args = self._weakly = None
+        self._kwargs = {}
+
+
+class Episode:
+    """One run of a simulation, from its reset to its end. Holds nothing of the environment.
+
+    Attributes:
+        pending: The agent whose decision waits for an answer; None while the simulation moves and when the
+            episode is over.
+        agents: The agents of the environment, by name, in the order in which they joined.
+        over: Whether the episode is over.
+        terminated, truncated: How it ended; both False until then, and where an error has ended it.
+        turns: How many actions the environment's user has given.
+    """
+
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None) -> None:
+        """Begin an episode of a simulation that has been reset: run it to its first decision.
+
+        Args:
+            plan: What the environment is made of.
+            simulation: The simulation.
+            seed: What it was reset with, for those who read an error's notes.
+
+        Raises:
+            NoDecisionError: There is no decision for the environment's user.
+            BaseException: Whatever the model, a mapping or a policy raises.
+        """
+        self.pending: Record | None = None
+        self.agents: dict[str, Record] = {}
+        self.over = self.terminated = self.truncated = False
+        self.turns = 0
+        self._answered: dict[str, Record] = {}  # those for whom policies answer
+        self._latest: Record | None = None
+        self._decisions = 0
+        self._plan, self._simulation, self._seed = plan, simulation, seed
+        self._bindings, self._max_turns = plan.bindings, plan.options.max_steps
+        self._thread = get_ident()
+        for binding in plan.active:
+            if binding.agent is not None:
+                self.agents[binding.agent] = Record(binding.agent, binding, None)
+        self._driver: Driver | None = GreenletDriver(self._simulate, self._ask)
+        self._go_on(None)
+        if self.pending is None:
+            raise NoDecisionError(
+                f"{type(simulation).__name__}.run() came to its end without a decision of"
+                f" {', '.join(binding.point.name for binding in plan.active)}; does the simulation call the"
+                " decision functions as attributes of their class or module?"
+            )
+        try:
+            with unattended():
+                self._foresee()
+        except BaseException as error:
+            self._fail(error)
+            raise
+
+    # -- on the simulation's stack ----------------------------------------------------------------
+
+    def _simulate(self, _: Any) -> tuple[Any, Any, None]:
+        try:
+            return _FINISHED, self._simulation.run(), None
+        except BaseException as error:
+            return _FAILED, error, None
+
+    def _ask(self, point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        binding = self._bindings.get(point)
+        if binding is None:
+            return point.rule(*args, **kwargs)
+        reply = self._driver.suspend((binding, args, kwargs))  # type: ignore[union-attr]
+        if reply is RULE:
+            return point.rule(*args, **kwargs)
+        if binding.deliver is not None:
+            return binding.deliver(reply, *args, **kwargs)
+        return reply
+
+    # -- on the user's stack ----------------------------------------------------------------------
+
+    def turn(self, action: Any) -> None:
+        """Answer the pending decision and run to the next one that the user is to answer, or to the end.
+
+        Args:
+            action: An action of the pending agent, or ``RULE``.
+
+        Raises:
+            InvalidActionError: The action is not legal. Nothing has moved.
+            EpisodeOverError: No decision is pending.
+            BaseException: Whatever the model, a mapping or a policy raises.
+        """
+        record = self.pending
+        if record is None:
+            raise self.nothing_pending()
+        reply = action if action is RULE else self._reply(record, action)
+        self.pending = None
+        self.turns += 1
+        if record.binding.agent is None:
+            record.loosen()
+        self._go_on(reply)
+
+    def nothing_pending(self) -> Exception:
+        """The error that says why no action can be taken now."""
+        if self.over:
+            return EpisodeOverError("the episode is over; call reset() to begin the next one")
+        return ReentrancyError("the environment was used from inside its own simulation or mappings")
+
+    def _reply(self, record: Record, action: Any) -> Any:
+        """Turn the user's action into a reply. Nothing has moved yet, and nothing moves if this fails."""
+        outer = RUNNING.pop(self._thread, None) if RUNNING else None
+        try:
+            return record.binding.reply(action, record.agent, record.mask, record.choices)
+        except Exception as error:
+            self._annotate(error)
+            raise
+        finally:
+            if outer is not None:
+                RUNNING[self._thread] = outer
+
+    def _go_on(self, reply: Any) -> None:
+        """Let the simulation go on with a reply, until a decision is pending or the episode is over."""
+        # Inside another environment's simulation, what runs on our side is none of its decisions.
+        outer = RUNNING.pop(self._thread, None) if RUNNING else None
+        driver = self._driver
+        assert driver is not None
+        try:
+            while self.pending is None and not self.over:
+                event = driver.resume(reply)
+                if type(event[0]) is Binding:
+                    reply = self._decide(*event)
+                    event = None  # a reference here would keep alive what the model lets go
+                else:
+                    kind, value, event = event
+                    self._end(kind, value)
+        except BaseException as error:
+            if driver.reachable():
+                self._fail(error)
+            else:  # another thread's: it has not moved
+                self.pending = self._latest
+                self.turns -= 1
+            raise
+        finally:
+            event = value = None
+            if outer is not None:
+                RUNNING[self._thread] = outer
+
+    def _decide(self, binding: Binding, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """See to a decision that has arisen: make it pending, or return the reply to it."""
+        agent = binding.agent
+        if agent is None:
+            agent = binding.name_agent(*args, **kwargs)  # type: ignore[misc]
+            if agent is None:
+                return RULE
+        record = self.agents.get(agent)
+        if record is None or record.binding is not binding:
+            record = self._meet(agent, binding)
+        self._latest = record
+        self._decisions += 1
+        if record.policy is not None:
+            return self._consult(record, args, kwargs)
+        record._args, record._kwargs = args, kwargs
+        if self.turns == self._max_turns:
+            self._finish(truncated=True)
+            return None
+        if Difference.used:
+            with _remembering(record):
+                self._settle(record, args, kwargs)
+        else:
+            self._settle(record, args, kwargs)
+        self.pending = record
+        return None
+
+    def _meet(self, agent: Any, binding: Binding) -> Record:
+        """Find or make the record of an agent that is not known as one of the environment's own here."""
+        if not isinstance(agent, str):
+            raise AgentError(f"agent= of {binding.point.name} must name a string or None, not {agent!r}")
+        record = self._answered.get(agent) or self.agents.get(agent)
+        if record is None:
+            policy = binding.policy or self._plan.policies.get(agent)
+            record = Record(agent, binding, policy)
+            (self.agents if policy is None else self._answered)[agent] = record
+        elif record.binding is not binding:
+            raise AgentError(
+                f"the agent {agent!r} decides at {record.binding.point.name} and at {binding.point.name};"
+                " an agent has one decision point: give each point's agents names of their own"
+            )
+        return record
+
+    def _consult(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Have a policy answer."""
+        if record.policy is RULE:
+            return RULE
+        with _remembering(record):
+            self._observe(record, args, kwargs)
+        action = record.policy(record.observation, record.info)
+        if action is RULE:
+            return RULE
+        return record.binding.reply(action, record.agent, record.mask, record.choices)
+
+    # -- rewards and observations -----------------------------------------------------------------
+
+    def _settle(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
+        """Reward the agent's action before, then observe what it decides on now, or what it ended with."""
+        binding = record.binding
+        if record.decided:
+            reward = binding.reward(*args, **kwargs)
+            if type(reward) is not float:
+                reward = _number(reward)
+            if not isfinite(reward):
+                raise RewardError(f"the reward of {record.agent!r} is {reward}, which is not finite")
+            record.reward = reward
+        elif not last:
+            binding.reward(*args, **kwargs)  # nothing was done yet that could be rewarded
+            record.decided = True
+        if binding.legal is None:
+            record.observation = binding.cast(binding.observe(*args, **kwargs))
+            record.info = {}
+        else:
+            self._observe(record, args, kwargs, last=last)
+
+    def _observe(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
+        binding = record.binding
+        mask = choices = None
+        info: dict[str, Any] = {}
+        if binding.legal is not None:
+            try:
+                mask, choices = binding.legal(args, kwargs)
+            except MaskError:
+                if not last:
+                    raise
+                mask = _spaces.open_mask(binding.definition.action_space)  # nothing is asked any more
+            info[_spaces.MASK] = _spaces.duplicate(mask)
+        record.observation = binding.observation(args, kwargs, mask)
+        record.mask, record.choices, record.info = mask, choices, info
+
+    def _foresee(self) -> None:
+        """Observe agents before their first decision, where the simulation knows the calls to come."""
+        expected = getattr(self._simulation, "expected_calls", None)
+        if expected is None:
+            return
+        for binding in self._plan.active:
+            for args in expected(binding.point.name):
+                agent = binding.agent if binding.name_agent is None else binding.name_agent(*args)
+                record = self.agents.get(agent) if isinstance(agent, str) else None
+                if record is None or record.binding is not binding or record.decided:
+                    continue
+                record._args, record._kwargs = tuple(args), {}
+                with _remembering(record):
+                    self._observe(record, tuple(args), {})
+                if binding.agent is None:
+                    record.loosen()
+
+    # -- ends -------------------------------------------------------------------------------------
+
+    def _end(self, kind: Any, value: Any) -> None:
+        """The simulation's ``run`` has returned or failed."""
+        self._let_go_of_driver()
+        if kind is _FAILED:
+            try:
+                raise value
+            finally:
+                del value  # else the error, its traceback and this frame would hold each other
+        self._finish(truncated=value is TRUNCATED)
+
+    def _finish(self, *, truncated: bool) -> None:
+        """End the episode of every agent: its last reward, its last observation."""
+        for record in self.agents.values():
+            arguments = record.arguments()
+            if arguments is None:  # it was never seen, or the model has let it go
+                record.reward, record.info = 0.0, {}
+                continue
+            with _remembering(record):
+                self._settle(record, *arguments, last=True)
+            record.forget()
+        self.over, self.truncated, self.terminated = True, truncated, not truncated
+
+    def _fail(self, error: BaseException) -> None:
+        """End the episode for an error, which says where it came from."""
+        self._annotate(error)
+        self.pending, self.over = None, True
+        for problem in self._unwind():
+            error.add_note(f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
+
+    def _annotate(self, error: BaseException) -> None:
+        record = self._latest
+        if record is None:
+            where = "before the first decision"
+        else:
+            where = f"decision {self._decisions} of the episode, of {record.agent!r} at {record.binding.point.name}"
+        error.add_note(f"simenv_marl: {where}; seed {self._seed}")
+
+    def close(self) -> None:
+        """Unwind the simulation, if it is suspended; answer none of its decisions.
+
+        Raises:
+            ReentrancyError: The simulation is moving.
+            WrongThreadError: It is suspended in another thread.
+            BaseException: What the simulation raises in its ``stop`` or while it unwinds.
+        """
+        if self.pending is None and not self.over:
+            raise self.nothing_pending()
+        if self._driver is not None and not self._driver.reachable():
+            raise WrongThreadError(
+                "the simulation is suspended in another thread, and only there it can be closed or reset"
+            )
+        self.pending, self.over = None, True
+        for problem in self._unwind():
+            self._annotate(problem)
+            raise problem
+
+    def abandon(self) -> None:
+        """Unwind the simulation when its environment is gone, from wherever that is noticed."""
+        self.pending, self.over = None, True
+        if self._driver is not None and not self._driver.reachable():
+            self._let_go_of_driver()  # its own thread unwinds it, as soon as that switches again
+        for problem in self._unwind():
+            warnings.warn(f"a simulation that was abandoned raised {problem!r}", ResourceWarning, stacklevel=2)
+
+    def _unwind(self) -> list[BaseException]:
+        """Raise ``SimulationExit`` in the suspended simulation until it is gone. Returns what else it raised."""
+        driver = self._driver
+        problems: list[BaseException] = []
+        if driver is None:
+            return problems
+        with unattended():
+            try:
+                stop = getattr(self._simulation, "stop", None)
+                if stop is not None:
+                    stop()
+            except BaseException as error:
+                problems.append(error)
+            for _ in range(UNWINDING_TRIES):
+                kind, value, _ = driver.throw()
+                if kind is _FAILED and not _is_exit(value):
+                    problems.append(value)
+                if kind is _FAILED or kind is _FINISHED:
+                    self._let_go_of_driver()
+                    return problems
+        _given_up.append(driver)
+        self._driver = None
+        warnings.warn(
+            f"{type(self._simulation).__name__} refuses to end: it went on after {UNWINDING_TRIES} times"
+            " SimulationExit was raised in it; it is left suspended. Let it re-raise what it does not know.",
+            ResourceWarning,
+            stacklevel=3,
+        )
+        return problems
+
+    def _let_go_of_driver(self) -> None:
+        if self._driver is not None:
+            self._driver.forget()
+            self._driver = None
+
+
+@contextmanager
+def _remembering(record: Record) -> Iterator[None]:
+    """Let differences know for whom they are asked."""
+    thread = get_ident()
+    outer = EVALUATING.get(thread)
+    EVALUATING[thread] = record.memory
+    try:
+        yield
+    finally:
+        if outer is None:
+            del EVALUATING[thread]
+        else:
+            EVALUATING[thread] = outer
+
+
+def _number(reward: Any) -> float:
+    try:
+        return float(reward.item() if isinstance(reward, np.ndarray) else reward)
+    except (TypeError, ValueError):
+        raise RewardError(f"the reward {reward!r} is not one number") from None
+
+
+def _is_exit(error: BaseException | None) -> bool:
+    """Whether an error is the exit that was raised in a simulation, passed on in whatever guise."""
+    while error is not None and not isinstance(error, SimulationExit):
+        error = error.__cause__
+    return error is not None

@@ -1,0 +1,343 @@
+"""What an environment is made of, all of it known and checked before anything runs.
+
+A plan says which decision points an environment decides, under which agents' names, with which policies and
+options. It holds no state of any episode, so that one plan serves any number of environments.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from . import _spaces
+from ._points import NamedPoint, Site, find_point, find_points
+from ._spaces import ILLEGAL
+from .decision import DecisionPoint, Definition, unwrapped
+from .errors import (
+    AgentError,
+    InvalidActionError,
+    MaskError,
+    OptionValueError,
+    SimEnvError,
+    UnknownOptionError,
+    UnknownPointError,
+)
+from .simulation import RULE, make_simulation
+
+RENDER_MODES = ("ansi", "human", "rgb_array")
+"""What a simulation with a method ``render`` is taken to render, unless it has ``render_modes``."""
+
+Policy = Callable[[Any, dict[str, Any]], Any]
+"""A policy as the episode calls it: of the observation and the info, returns the action."""
+
+
+# -- options --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """The options that every view takes.
+
+    Attributes:
+        driver: What switches between the simulation and its user: "greenlet".
+        max_steps: After how many calls of ``step`` with an action an episode is truncated; None: never.
+        policies: Who decides without being an agent of the environment: from the name of an agent, or from a
+            decision point (dotted name or decision function), to a callable of the observation, or of the
+            observation and the info, that returns an action. ``RULE`` in place of the callable stands for the
+            model's own rule.
+        render_mode: What ``render`` returns; one of the simulation's ``render_modes``.
+    """
+
+    driver: str = "greenlet"
+    max_steps: int | None = None
+    policies: Mapping[Any, Any] | None = None
+    render_mode: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.driver != "greenlet":
+            raise OptionValueError(f'driver must be "greenlet", not {self.driver!r}')
+        steps = self.max_steps
+        if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
+            raise OptionValueError(f"max_steps must be a positive integer or None, not {steps!r}")
+        if self.policies is not None and not isinstance(self.policies, Mapping):
+            raise OptionValueError(f"policies must be a dict from agents or points to callables, not {self.policies!r}")
+        for key, policy in (self.policies or {}).items():
+            if policy is not RULE and not callable(policy):
+                raise OptionValueError(f"the policy of {key!r} must be a callable or RULE, not {policy!r}")
+
+    def amended(self, options: Mapping[str, Any]) -> Options:
+        """The same options, but for those that are given.
+
+        Raises:
+            UnknownOptionError: There is no such option.
+            OptionValueError: An option cannot have its value.
+        """
+        known = [field.name for field in fields(self)]
+        for name in options:
+            if name not in known:
+                close = get_close_matches(name, known, n=1)
+                hint = f"; did you mean {close[0]!r}?" if close else ""
+                raise UnknownOptionError(f"there is no option {name!r}{hint} (the options are {', '.join(known)})")
+        return replace(self, **options)
+
+
+# -- bindings -------------------------------------------------------------------------------------
+
+
+class Binding:
+    """A decision point under one environment's definition: what an episode needs, made ready to be called.
+
+    Attributes:
+        point: The decision point.
+        definition: Its definition.
+        agent: The name of its agent; None where ``name_agent`` tells it at each call.
+        name_agent: A callable of the call's arguments; None where ``agent`` tells it.
+        policy: Who answers all its decisions; None: its agents' own policies, or the environment's user.
+        observe, reward: The mappings.
+        cast: Casts observations to their space.
+        legal: Returns the mask of the call, or the choices; None where all actions are always legal.
+        deliver: In the simulation, turns the reply into what a call of the decision function returns; None
+            where the reply is that.
+    """
+
+    __slots__ = (
+        "_allows", "_check", "_convert", "_mask_in_observation", "agent", "cast", "definition", "deliver",
+        "legal", "name_agent", "observe", "point", "policy", "reward",
+    )  # fmt: skip
+
+    def __init__(self, named: NamedPoint, agent: str | None, policy: Policy | None) -> None:
+        definition = named.definition
+        self.point: DecisionPoint = named.point
+        self.definition: Definition = definition
+        self.agent = agent
+        self.name_agent = definition.agent if agent is None else None
+        self.policy = policy
+        self.observe = definition.observation_space_mapping
+        self.reward = definition.reward_mapping
+        self.cast = _spaces.observation_cast(definition.observation_space)
+        self._check = _spaces.action_check(definition.action_space)
+        self._convert = definition.action_space_mapping
+        self.deliver = _delivery(definition, named.point.kind)
+        space = definition.observation_space
+        self._mask_in_observation = isinstance(space, spaces.Dict) and _spaces.MASK in space.spaces
+        self.legal: Callable[..., tuple[Any, Any]] | None = None
+        if definition.action_mask_mapping is not None:
+            self.legal = partial(_masked, definition.action_mask_mapping, _spaces.mask_cast(definition.action_space))
+        elif definition.choices is not None:
+            self.legal = partial(_chosen, definition.choices, int(definition.action_space.n), named.point.name)
+
+    def observation(self, args: tuple[Any, ...], kwargs: dict[str, Any], mask: Any) -> Any:
+        """The observation of a call whose legal actions are known."""
+        value = self.observe(*args, **kwargs)
+        if self._mask_in_observation and isinstance(value, Mapping):
+            value = {**value, _spaces.MASK: mask}
+        return self.cast(value)
+
+    def reply(self, action: Any, agent: str, mask: Any, choices: Any) -> Any:
+        """Check an action, and turn it into the reply that the simulation gets.
+
+        Args:
+            action: The action.
+            agent: Whose action it is.
+            mask: Which actions are legal; None: all of the space.
+            choices: What the action is an index into, where the point has choices.
+
+        Raises:
+            InvalidActionError: The action is not legal.
+        """
+        legal = self._check(action)
+        if legal is ILLEGAL:
+            raise InvalidActionError(
+                f"the action {action!r} of {agent!r} is not in its action space {self.definition.action_space}"
+            )
+        if mask is not None:
+            if not _spaces.mask_allows(self.definition.action_space, mask, legal):
+                raise InvalidActionError(f"the action {action!r} of {agent!r} is masked; its mask is {mask!r}")
+            if choices is not None:
+                return choices[legal]
+        return legal if self._convert is None else self._convert(legal)
+
+
+def _masked(mapping: Callable[..., Any], cast: Callable[[Any], Any], args: Any, kwargs: Any) -> tuple[Any, None]:
+    return cast(mapping(*args, **kwargs)), None
+
+
+def _chosen(mapping: Callable[..., Any], most: int, name: str, args: Any, kwargs: Any) -> tuple[Any, Any]:
+    choices = list(mapping(*args, **kwargs))
+    if not 1 <= len(choices) <= most:
+        raise MaskError(f"{name} has {len(choices)} choices; its action space holds 1 to {most}")
+    mask = np.zeros(most, np.int8)
+    mask[: len(choices)] = 1
+    return mask, choices
+
+
+def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
+    """Make what turns a reply into the value of a call, which for a generator function is a generator."""
+    apply = definition.apply
+    if kind == "function":
+        return apply
+    wrap = _returning if kind == "generator" else _awaiting
+    if apply is None:
+        return lambda reply, *args, **kwargs: wrap(reply)
+
+    def deliver(reply: Any, *args: Any, **kwargs: Any) -> Any:
+        value = apply(reply, *args, **kwargs)
+        return value if inspect.isgenerator(value) or inspect.isawaitable(value) else wrap(value)
+
+    return deliver
+
+
+def _returning(value: Any) -> Any:
+    return value
+    yield
+
+
+async def _awaiting(value: Any) -> Any:
+    return value
+
+
+# -- plans ----------------------------------------------------------------------------------------
+
+
+class Plan:
+    """What an environment is made of.
+
+    Attributes:
+        source: Of what its simulation is made.
+        options: Its options.
+        render_modes: What its simulation can be rendered as.
+        bindings: The decision points that do not run their rule, with all that is known of them.
+        policies: By name: who answers the decisions of agents that are no agents of the environment.
+        possible_agents: The agents of the environment, in the order of the points; None where they are
+            only known when they decide.
+        sites: Where decision functions must be set while the environment is in use.
+    """
+
+    def __init__(self, source: Any, named: list[NamedPoint], options: Options, render_modes: list[str]) -> None:
+        self.source, self.options, self._named = source, options, named
+        self.render_modes = render_modes
+        if options.render_mode is not None and options.render_mode not in render_modes:
+            raise OptionValueError(
+                f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
+            )
+        agents = _name_agents(named)
+        by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
+        everything = [*named, *extra]
+        self.bindings: dict[DecisionPoint, Binding] = {}
+        active: list[Binding] = []
+        for point, agent in zip(everything, _name_agents(everything), strict=True):
+            policy = by_point.get(point.point)
+            if policy is RULE:
+                continue
+            binding = self.bindings[point.point] = Binding(point, agent, policy)
+            if policy is None and agent not in self.policies:
+                active.append(binding)
+        self.active = active
+        self.possible_agents: list[str] | None = None
+        if all(binding.agent is not None for binding in active):
+            self.possible_agents = [str(binding.agent) for binding in active]
+        self.sites: list[Site] = [point.site for point in everything if point.site is not None]
+        if not active:
+            raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
+
+    @classmethod
+    def draw_up(cls, source: Any, points: Any, options: Mapping[str, Any]) -> Plan:
+        """Make a plan of what users say.
+
+        Args:
+            source: A simulation, its class or a factory.
+            points: The active decision points, as ``generate_env`` takes them.
+            options: The options, by name.
+
+        Raises:
+            SimEnvError: Something in them cannot work; the leaf says what.
+        """
+        checked = Options().amended(options)
+        model = source
+        plain_factory = not isinstance(source, type) and not hasattr(source, "run")
+        if plain_factory or (points is None and getattr(source, "points", None) is None):
+            model = make_simulation(source)
+        modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
+        return cls(source, find_points(points, model), checked, list(modes))
+
+    @property
+    def name(self) -> str:
+        """What the simulation is called: the name of its class or factory."""
+        source = self.source
+        return getattr(source, "__name__", None) or type(source).__name__
+
+    def amended(self, options: Mapping[str, Any]) -> Plan:
+        """The same plan, but for the options that are given."""
+        if not options:
+            return self
+        return Plan(self.source, self._named, self.options.amended(options), self.render_modes)
+
+
+def _name_agents(named: list[NamedPoint]) -> list[str | None]:
+    """Name the agent of each point; None where a callable does it."""
+    given = [point.definition.agent for point in named]
+    owners: dict[str, str] = {}
+    for point, agent in zip(named, given, strict=True):
+        if isinstance(agent, str):
+            if agent in owners:
+                raise AgentError(f"{owners[agent]} and {point.point.name} have the same agent {agent!r}")
+            owners[agent] = point.point.name
+    names: list[str | None] = []
+    for point, agent in zip(named, given, strict=True):
+        number = 0
+        while agent is None and (name := f"{point.point.letters}_{number}") in owners:
+            number += 1
+        if agent is None:
+            agent, owners[name] = name, point.point.name
+        names.append(agent if isinstance(agent, str) else None)
+    return names
+
+
+def _assign(
+    policies: Mapping[Any, Any], named: list[NamedPoint], agents: list[str | None]
+) -> tuple[dict[DecisionPoint, Any], dict[str, Any], list[NamedPoint]]:
+    """Find out whom each policy answers for: a point (maybe one that was not named yet) or an agent."""
+    by_point: dict[DecisionPoint, Any] = {}
+    by_agent: dict[str, Any] = {}
+    extra: list[NamedPoint] = []
+    for key, value in policies.items():
+        policy = value if value is RULE else _two_arguments(value)
+        if isinstance(key, str) and key in agents:
+            by_agent[key] = policy
+            continue
+        point = next((p for p in named if key == p.point.name or unwrapped(key) is p.point.rule), None)
+        if point is None:
+            try:
+                point = find_point(key)
+            except SimEnvError as error:
+                if isinstance(key, str) and "." not in key and None in agents:
+                    by_agent[key] = policy  # an agent that a callable may name
+                    continue
+                names = sorted([a for a in agents if a] + [p.point.name for p in named])
+                raise UnknownPointError(
+                    f"policies names {key!r}, which is neither an agent nor a decision point ({error});"
+                    f" known are {', '.join(names)}"
+                ) from error
+            if not any(point.point is other.point for other in (*named, *extra)):
+                extra.append(point)
+        by_point[point.point] = policy
+    return by_point, by_agent, extra
+
+
+def _two_arguments(policy: Callable[..., Any]) -> Policy:
+    """Let a policy be called with observation and info, whether it takes the info or not."""
+    try:
+        parameters = list(inspect.signature(policy).parameters.values())
+    except (TypeError, ValueError):
+        parameters = []
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if len(positional) > 1 and (positional[1].default is positional[1].empty or positional[1].name == "info"):
+        return policy
+    return lambda observation, info: policy(observation)

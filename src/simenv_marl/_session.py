@@ -1,0 +1,154 @@
+"""An environment's simulation over all its episodes: made once, reset for each, closed.
+
+The session is what outlives an episode. It holds nothing of the environment, so that an environment which
+is abandoned in mid-episode goes at once and takes its session along.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+from gymnasium import spaces
+
+from ._driver import unattended
+from ._episode import Episode
+from ._plan import Plan
+from .errors import ClosedError, NotResetError, OptionValueError
+from .simulation import make_simulation, resetter
+
+
+class Session:
+    """A simulation of one environment's own.
+
+    Attributes:
+        plan: What the environment is made of.
+        simulation: The simulation.
+        seed: The seed of the latest episode.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Make the simulation, and set the decision functions that the plan asks for.
+
+        Raises:
+            SimulationError: There is no simulation in the plan.
+            PatchError: A function cannot be patched.
+        """
+        self.plan = plan
+        self.seed: int | None = None
+        self._episode: Episode | None = None
+        self._closed = False
+        self._held = False
+        self._hold_sites()
+        try:
+            with unattended():
+                self.simulation = make_simulation(plan.source)
+                self._reset = resetter(self.simulation)
+        except BaseException:
+            self._let_go_of_sites()
+            raise
+
+    def start(self, seed: int | None, options: dict[str, Any] | None, generator: np.random.Generator) -> Episode:
+        """End the episode that runs, reset the simulation, and run it to its first decision.
+
+        Args:
+            seed: The seed to reset it with; None: one is drawn.
+            options: What the environment's ``reset`` was given.
+            generator: What a seed is drawn from.
+
+        Raises:
+            NoDecisionError: The simulation ended without one.
+            BaseException: What the model raises.
+        """
+        if self._episode is not None:
+            self._episode.close()
+            self._episode = None
+        self._closed = False
+        self._hold_sites()
+        self.seed = int(generator.integers(2**31)) if seed is None else seed
+        try:
+            with unattended():
+                self._reset(self.seed, options)
+        except BaseException as error:
+            error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
+            raise
+        self._episode = episode = Episode(self.plan, self.simulation, self.seed)
+        return episode
+
+    def not_running(self) -> Exception:
+        """The error that says why there is no episode."""
+        if self._closed:
+            return ClosedError("the environment is closed; call reset() to use it again")
+        return NotResetError("there is no episode yet; call reset() first")
+
+    def render(self) -> Any:
+        """Render the simulation in the environment's render mode.
+
+        Raises:
+            OptionValueError: The environment was made without a render mode.
+        """
+        mode = self.plan.options.render_mode
+        if mode is None:
+            raise OptionValueError(
+                f"the environment has no render_mode; make it with one of {self.plan.render_modes or 'none'}"
+            )
+        with unattended():
+            return self.simulation.render(mode)
+
+    def close(self) -> None:
+        """Unwind the simulation and put back what was patched.
+
+        Raises:
+            BaseException: What the simulation raises while it unwinds.
+        """
+        episode, self._episode, self._closed = self._episode, None, True
+        try:
+            if episode is not None:
+                episode.close()
+        finally:
+            self._let_go_of_sites()
+
+    def abandon(self) -> None:
+        """The same, from a finalizer: raises nothing."""
+        if self._episode is not None:
+            self._episode.abandon()
+        self._let_go_of_sites()
+
+    def _hold_sites(self) -> None:
+        if self._held:
+            return
+        done = []
+        try:
+            for site in self.plan.sites:
+                site.hold()
+                done.append(site)
+        except BaseException:
+            for site in done:
+                site.let_go()
+            raise
+        self._held = True
+
+    def _let_go_of_sites(self) -> None:
+        if self._held:
+            self._held = False
+            for site in self.plan.sites:
+                site.let_go()
+
+
+def checked_seed(seed: Any) -> int | None:
+    """The seed of a ``reset`` as a python integer.
+
+    Raises:
+        OptionValueError: It is none.
+    """
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise OptionValueError(f"seed must be a non-negative integer or None, not {seed!r}")
+    return int(seed)
+
+
+def seed_space(space: spaces.Space[Any], seed: int, agent: str) -> None:
+    """Seed a space of an agent: for every agent differently, and for every order of joining alike."""
+    space.seed(int(np.random.SeedSequence([seed, crc32(agent.encode())]).generate_state(1)[0]))

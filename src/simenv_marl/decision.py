@@ -1,0 +1,444 @@
+"""Decision points: functions of a model that decide something, and how an environment may decide it.
+
+``make_step`` makes a ``Definition``. Applied to a function, the definition gives a *decision function*: it
+looks and behaves like the function, whose body is the *rule*, but asks the environment for its decision
+where the simulation that calls it runs behind one. What is asked is the ``DecisionPoint``: one for every
+rule, however many definitions there are of it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass
+from functools import update_wrapper
+from threading import get_ident
+from types import FunctionType, MethodType
+from typing import Any, Final
+from weakref import WeakValueDictionary
+
+from gymnasium import spaces
+
+from ._driver import RUNNING
+from .errors import DefinitionError, PatchError
+
+Mapped = Callable[..., Any]
+"""A mapping: called with the arguments of the decision call as they were passed."""
+
+
+# -- definitions ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Definition:
+    """How an environment sees and decides a decision point. Made by ``make_step``; immutable.
+
+    Applying it to a function, staticmethod, classmethod or method of a class gives the decision function.
+    The attributes are the arguments of ``make_step``.
+    """
+
+    _: KW_ONLY
+    observation_space: spaces.Space[Any]
+    observation_space_mapping: Mapped
+    action_space: spaces.Space[Any]
+    reward_mapping: Mapped
+    action_space_mapping: Callable[[Any], Any] | None
+    apply: Mapped | None
+    choices: Mapped | None
+    agent: str | Mapped | None
+    action_mask_mapping: Mapped | None
+
+    def __call__(self, function: Any) -> Any:
+        """Make the decision function.
+
+        Args:
+            function: The function that decides, as it stands in the model: a function, a staticmethod, a
+                classmethod, or any of these as an attribute of its class.
+
+        Returns:
+            The decision function, in the same binding as ``function``: what goes in as a staticmethod or
+            classmethod comes out as one.
+
+        Raises:
+            PatchError: ``function`` is none of these.
+        """
+        rule, binding = unbind(function)
+        known = point_of(rule)
+        point = known[0] if known else DecisionPoint(rule, bound=binding is not staticmethod)
+        wrapper = point.wrap(self)
+        point.definition = self
+        _REGISTRY[point.name] = point
+        return wrapper if binding is None else binding(wrapper)
+
+
+def make_step(
+    *,
+    observation_space: spaces.Space[Any],
+    observation_space_mapping: Mapped,
+    action_space: spaces.Space[Any],
+    action_space_mapping: Callable[[Any], Any] | Mapping[Any, Any] | None = None,
+    reward_mapping: Mapped,
+    apply: Mapped | None = None,
+    choices: Mapped | None = None,
+    agent: str | Mapped | None = None,
+    action_mask_mapping: Mapped | None = None,
+) -> Definition:
+    """Define a decision point (paper, section 3.3).
+
+    Args:
+        observation_space: The space of the agent's observations.
+        observation_space_mapping: Called with the arguments of the decision call as they were passed
+            (``self`` first for a method); returns the observation, which is cast to the space's dtype.
+        action_space: The space of the agent's actions.
+        action_space_mapping: What the action decides: a callable of the action, or a dict with an entry
+            for each action of a ``Discrete`` space. Its value is what the decision function returns.
+        reward_mapping: Called like ``observation_space_mapping``, at each decision of the agent and at its
+            end; returns the reward of the agent's action before.
+        apply: Instead of ``action_space_mapping``: called with the action and the call's arguments, in the
+            simulation and in place of the rule; what it returns is what the decision function returns.
+        choices: Instead of both: called with the call's arguments, returns the sequence of legal answers.
+            The action is an index into it; ``action_space`` is a ``Discrete`` (from 0) of the largest
+            length, and the mask follows by itself.
+        agent: The name of the agent that decides here, or a callable of the call's arguments that names
+            it (None: nobody, the rule decides). By default the function's letters in lower case and a
+            number, such as ``choosewateramount_0``.
+        action_mask_mapping: Called with the call's arguments, returns which actions of a ``Discrete`` or
+            ``MultiDiscrete`` are legal: 1 or 0 for each.
+
+    Returns:
+        The definition, which is a decorator for the function that decides.
+
+    Raises:
+        DefinitionError: The definition cannot work.
+    """
+    for name, space in (("observation_space", observation_space), ("action_space", action_space)):
+        if not isinstance(space, spaces.Space):
+            raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {space!r}")
+    required = {"observation_space_mapping": observation_space_mapping, "reward_mapping": reward_mapping}
+    optional = {"apply": apply, "choices": choices, "action_mask_mapping": action_mask_mapping}
+    for name, function in (*required.items(), *optional.items()):
+        if not callable(function) and (name in required or function is not None):
+            raise DefinitionError(f"make_step: {name} must be callable, not {function!r}")
+    answers = {"action_space_mapping": action_space_mapping, "apply": apply, "choices": choices}
+    given = [name for name, value in answers.items() if value is not None]
+    if len(given) != 1:
+        raise DefinitionError(
+            "make_step: give one of action_space_mapping, apply and choices, to say what an action decides;"
+            f" given: {', '.join(given) or 'none'}"
+        )
+    if isinstance(action_space_mapping, Mapping):
+        action_space_mapping = _look_up(action_space_mapping, action_space)
+    elif action_space_mapping is not None and not callable(action_space_mapping):
+        raise DefinitionError(
+            f"make_step: action_space_mapping must be a callable or a dict, not {action_space_mapping!r}"
+        )
+    if action_mask_mapping is not None and not isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+        raise DefinitionError(
+            f"make_step: action_mask_mapping needs a Discrete or MultiDiscrete action_space, not {action_space}"
+        )
+    if choices is not None:
+        if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
+            raise DefinitionError(
+                f"make_step: choices needs a Discrete action_space that starts at 0, not {action_space}"
+            )
+        if action_mask_mapping is not None:
+            raise DefinitionError("make_step: choices makes the mask itself; leave action_mask_mapping out")
+    if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
+        raise DefinitionError(f"make_step: agent must be a name or a callable, not {agent!r}")
+    return Definition(
+        observation_space=observation_space,
+        observation_space_mapping=observation_space_mapping,
+        action_space=action_space,
+        reward_mapping=reward_mapping,
+        action_space_mapping=action_space_mapping,
+        apply=apply,
+        choices=choices,
+        agent=agent,
+        action_mask_mapping=action_mask_mapping,
+    )
+
+
+def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[Any], Any]:
+    if not isinstance(space, spaces.Discrete):
+        raise DefinitionError(
+            f"make_step: a dict as action_space_mapping needs a Discrete action_space, not {space}"
+        )
+    actions = range(int(space.start), int(space.start + space.n))
+    missing = [action for action in actions if action not in answers]
+    surplus = [action for action in answers if action not in actions]
+    if missing or surplus:
+        raise DefinitionError(
+            f"make_step: the dict action_space_mapping must have just the actions of {space};"
+            f" missing: {missing}, not in the space: {surplus}"
+        )
+    return dict(answers).__getitem__
+
+
+# -- decision points ------------------------------------------------------------------------------
+
+_REGISTRY: WeakValueDictionary[str, DecisionPoint] = WeakValueDictionary()
+"""The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
+
+
+class DecisionPoint:
+    """One function of a model that decides something.
+
+    Attributes:
+        name: Its dotted name, ``package.module.Class.function``.
+        rule: The function itself, which decides where nobody else does.
+        definition: The latest definition, which the bare name means; None for a point that was named from
+            outside and is a decision point for some environments alone.
+        bound: Whether its first argument is what it is called on, which nobody passes by keyword.
+        kind: "function", "generator" or "coroutine": what a call of it returns.
+    """
+
+    __slots__ = ("__weakref__", "bound", "definition", "kind", "name", "rule")
+
+    def __init__(
+        self, rule: FunctionType, name: str | None = None, *, bound: bool, like: FunctionType | None = None
+    ) -> None:
+        """Make the point of a rule.
+
+        Args:
+            rule: The function that decides.
+            name: Its dotted name, where it is not the one that it was defined with.
+            bound: Whether, in a class, its first argument is what it is called on.
+            like: A function that tells what calls return, where the rule only passes them on to it.
+
+        Raises:
+            PatchError: An async generator function, which cannot return a decision.
+        """
+        self.rule = rule
+        self.name = name or f"{rule.__module__}.{rule.__qualname__}"
+        self.bound = bound and "." in self.name.removeprefix(f"{rule.__module__}.").rpartition("<locals>.")[2]
+        self.definition: Definition | None = None
+        like = like or rule
+        if inspect.isasyncgenfunction(like):
+            raise PatchError(f"{self.name} is an async generator function, which cannot return a decision")
+        if inspect.isgeneratorfunction(like):
+            self.kind = "generator"
+        elif inspect.iscoroutinefunction(like):
+            self.kind = "coroutine"
+        else:
+            self.kind = "function"
+
+    def __repr__(self) -> str:
+        return f"<DecisionPoint {self.name}>"
+
+    @property
+    def letters(self) -> str:
+        """The function's letters in lower case, of which its agent's default name is made."""
+        name = self.name.rpartition(".")[2].lower()
+        return "".join(letter for letter in name if "a" <= letter <= "z") or "agent"
+
+    def wrap(self, definition: Definition | None) -> FunctionType:
+        """Make a decision function of this point.
+
+        Args:
+            definition: What the decision function stands for where it is named as a point.
+        """
+        wrapper = _generate(self, definition)
+        update_wrapper(wrapper, self.rule)
+        return wrapper
+
+
+def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
+    """The point of a decision function and the definition that it was made with; None for anything else."""
+    # Looked up where nothing can copy it to: other decorators take over a function's attributes.
+    if isinstance(function, FunctionType) and function.__code__.co_filename.startswith("<decision function "):
+        return function.__globals__["point"], function.__globals__["definition"]
+    return None
+
+
+def unwrapped(function: Any) -> Any:
+    """The rule of a decision function; any other function as it is, without its binding."""
+    function = getattr(function, "__func__", function)
+    known = point_of(function)
+    return known[0].rule if known else function
+
+
+def registered(name: str) -> DecisionPoint | None:
+    """The decorated decision point of that dotted name."""
+    return _REGISTRY.get(name)
+
+
+def registered_names() -> list[str]:
+    """The dotted names of all decorated decision points, in the order of their decoration."""
+    return list(_REGISTRY)
+
+
+def unbind(function: Any) -> tuple[FunctionType, type | None]:
+    """Find the plain function under a binding.
+
+    Args:
+        function: A function, staticmethod or classmethod, or one of these as an attribute of its class.
+
+    Returns:
+        The function, and ``staticmethod`` or ``classmethod`` where it was bound so.
+
+    Raises:
+        PatchError: It is something else.
+    """
+    if isinstance(function, (staticmethod, classmethod)):
+        inner, binding = function.__func__, type(function)
+        if isinstance(inner, FunctionType):
+            return inner, binding
+    elif isinstance(function, MethodType):
+        if isinstance(function.__self__, type) and isinstance(function.__func__, FunctionType):
+            return function.__func__, classmethod
+        raise PatchError(
+            f"{function!r} is bound to one object; name the function of its class,"
+            f" {type(function.__self__).__name__}.{function.__name__}"
+        )
+    elif isinstance(function, FunctionType):
+        # A staticmethod that was fetched from its class is a plain function: see how the class holds it.
+        owner: Any = sys.modules.get(function.__module__)
+        path = function.__qualname__.split(".")
+        for name in path[:-1]:
+            owner = getattr(owner, name, None)
+        held = vars(owner).get(path[-1]) if isinstance(owner, type) else None
+        if isinstance(held, staticmethod) and held.__func__ is function:
+            return function, staticmethod
+        return function, None
+    raise PatchError(f"{function!r} cannot be a decision point: it is no function written in Python")
+
+
+# -- decision functions ---------------------------------------------------------------------------
+
+_ABSENT: Final = object()
+
+_CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
+
+# What a call costs where no simulation runs behind an environment is decided here. A method that takes
+# nothing but ``self`` costs two plain calls. Where arguments can be passed by keyword it costs three,
+# because mappings are to receive them as they were passed.
+_WITHOUT_ARGUMENTS = """
+{define} decide({names}):
+    if not RUNNING:
+        return {rule}
+    return {ask}
+"""
+_WITH_ARGUMENTS = """
+{define} decide({positional}, /, **kwargs):
+    if RUNNING or kwargs or {last} is ABSENT:
+        args = {passed}
+        if not RUNNING:
+            return {rule_as_passed}
+        if kwargs or len(args) < {required}:
+            bind(*args, **kwargs)
+        return {ask}
+    return {rule}
+"""
+_VARIADIC = """
+{define} decide(*args, **kwargs):
+    if not RUNNING:
+        return {rule_as_passed}
+    bind(*args, **kwargs)
+    return {ask}
+"""
+
+
+def _generate(point: DecisionPoint, definition: Definition | None) -> FunctionType:
+    """Write a decision function of a point, with parameters that fit the rule's."""
+    signature = inspect.signature(point.rule, follow_wrapped=False)
+    parameters = list(signature.parameters.values())
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    names = [f"_{number}" for number in range(len(positional))]
+    call = _CALL[point.kind].format
+    ask = "RUNNING.get(get_ident(), unattended)(point, {}, {})".format
+    values = {
+        "define": "async def" if point.kind == "coroutine" else "def",
+        "names": ", ".join(names),
+        "rule": call(f"rule({', '.join(names)})"),
+        "rule_as_passed": call("rule(*args, **kwargs)"),
+        "ask": call(ask("args", "kwargs")),
+    }
+    if not parameters or (
+        point.bound and len(parameters) == len(positional) == 1 and positional[0].default is positional[0].empty
+    ):
+        template = _WITHOUT_ARGUMENTS
+        values["ask"] = call(ask("(_0,)" if names else "()", "NOTHING"))
+    elif positional and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        template = _WITH_ARGUMENTS
+        required = sum(p.default is p.empty for p in positional)
+        if any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in parameters):
+            required = len(names) + 1  # a call without keywords is wrong
+        passed = "()"
+        for number, name in enumerate(names):
+            passed = f"({', '.join(names[: number + 1])},) if {name} is not ABSENT else {passed}"
+        values |= {
+            "positional": ", ".join(f"{name}=ABSENT" for name in names),
+            "passed": passed,
+            "last": names[-1],
+            "required": str(required),
+        }
+    else:
+        template = _VARIADIC
+    namespace: dict[str, Any] = {
+        "RUNNING": RUNNING,
+        "ABSENT": _ABSENT,
+        "NOTHING": {},  # shared by all calls: it is only ever unpacked
+        "bind": signature.bind,
+        "get_ident": get_ident,
+        "point": point,
+        "rule": point.rule,
+        "unattended": _run_rule,
+        "definition": definition,
+        "__name__": __name__,
+    }
+    exec(compile(template.format(**values), f"<decision function {point.name}>", "exec"), namespace)
+    function: FunctionType = namespace["decide"]
+    function.__code__ = function.__code__.replace(co_name=point.rule.__name__)  # what tracebacks show
+    return function
+
+
+def _run_rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    return point.rule(*args, **kwargs)
+
+
+# -- differences ----------------------------------------------------------------------------------
+
+EVALUATING: dict[int, dict[Any, Any]] = {}
+"""By thread: what the differences of the agent whose mapping is being evaluated there remember."""
+
+
+class Difference:
+    """A mapping that returns by how much another has changed. Made by ``difference``."""
+
+    used = False  # whether there is one in this process, and evaluations must say for whom they are
+
+    def __init__(self, function: Mapped) -> None:
+        Difference.used = True
+        self._function = function
+        update_wrapper(self, function)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        value = self._function(*args, **kwargs)
+        memory = EVALUATING.get(get_ident())
+        if memory is None:
+            return 0.0
+        before = memory.get(self, value)
+        memory[self] = value
+        return value - before
+
+
+def difference(function: Mapped) -> Difference:
+    """Make a mapping that returns by how much ``function(*arguments)`` has changed.
+
+    The change is counted since it was last asked for the same agent in the same episode; the first time it
+    is 0.0. It may be a mapping itself or be called by one, and so replaces the global that a reward such
+    as "the water used since then" would otherwise need (paper, supplement S2).
+
+    Args:
+        function: A callable of the arguments of the decision call, which returns a number.
+
+    Returns:
+        The mapping. Outside the evaluation of an environment's mapping it returns 0.0.
+
+    Raises:
+        DefinitionError: ``function`` is not callable.
+    """
+    if not callable(function):
+        raise DefinitionError(f"difference: {function!r} is not callable")
+    return Difference(function)

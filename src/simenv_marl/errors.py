@@ -1,0 +1,136 @@
+"""The tree of errors: one root, and leaves that are also the builtins that Python users expect.
+
+::
+
+    SimEnvError
+    |-- DefinitionError      (ValueError)    a definition that cannot work
+    |-- SimulationError      (TypeError)     something that is no simulation
+    |-- UnknownPointError    (LookupError)   a decision point that is not to be found
+    |-- PatchError           (TypeError)     a function that cannot be made a decision point
+    |-- AgentError           (ValueError)    names of agents that clash or are none
+    |-- UnknownAgentError    (LookupError)   an agent that the environment does not know
+    |-- ViewError            (ValueError)    a view that these decision points do not allow
+    |-- UnknownOptionError   (TypeError)     an option that does not exist
+    |-- OptionValueError     (ValueError)    an option that cannot have this value
+    |-- InvalidActionError   (ValueError)    an action that is not legal; nothing has moved
+    |-- ObservationError     (ValueError)    an observation that does not fit its space
+    |-- MaskError            (ValueError)    a mask that does not fit its action space
+    |-- RewardError          (ValueError)    a reward that is no finite number
+    |-- NoDecisionError      (RuntimeError)  an episode in which nothing was decided
+    |-- ResetNeededError     (RuntimeError)  there is no episode to go on with
+    |   |-- NotResetError                    ... because there was none yet
+    |   |-- EpisodeOverError                 ... because it has ended or failed
+    |   `-- ClosedError                      ... because the environment was closed
+    |-- ReentrancyError      (RuntimeError)  an environment stepped from inside itself
+    `-- WrongThreadError     (RuntimeError)  an environment used from another thread
+
+Every error is raised with its message alone, so that it survives pickling.
+"""
+
+__all__ = [
+    "AgentError",
+    "ClosedError",
+    "DefinitionError",
+    "EpisodeOverError",
+    "InvalidActionError",
+    "MaskError",
+    "NoDecisionError",
+    "NotResetError",
+    "ObservationError",
+    "OptionValueError",
+    "PatchError",
+    "ReentrancyError",
+    "ResetNeededError",
+    "RewardError",
+    "SimEnvError",
+    "SimulationError",
+    "UnknownAgentError",
+    "UnknownOptionError",
+    "UnknownPointError",
+    "ViewError",
+    "WrongThreadError",
+]
+
+
+class SimEnvError(Exception):
+    """Root of all errors that this library raises on its own account."""
+
+
+class DefinitionError(SimEnvError, ValueError):
+    """A definition of a decision point cannot work."""
+
+
+class SimulationError(SimEnvError, TypeError):
+    """What was given as a simulation is none."""
+
+
+class UnknownPointError(SimEnvError, LookupError):
+    """A decision point was named that is not to be found."""
+
+
+class PatchError(SimEnvError, TypeError):
+    """A function was named that cannot be made a decision point."""
+
+
+class AgentError(SimEnvError, ValueError):
+    """The names of agents clash, or what should name an agent is no string."""
+
+
+class UnknownAgentError(SimEnvError, LookupError):
+    """An agent was named that the environment does not know."""
+
+
+class ViewError(SimEnvError, ValueError):
+    """A view was asked for that the active decision points do not allow."""
+
+
+class UnknownOptionError(SimEnvError, TypeError):
+    """An option was given that does not exist."""
+
+
+class OptionValueError(SimEnvError, ValueError):
+    """An option was given a value that it cannot have."""
+
+
+class InvalidActionError(SimEnvError, ValueError):
+    """An action is not legal. The simulation has not moved; a legal action may follow."""
+
+
+class ObservationError(SimEnvError, ValueError):
+    """An observation does not fit its space."""
+
+
+class MaskError(SimEnvError, ValueError):
+    """An action mask, or a list of choices, does not fit the action space."""
+
+
+class RewardError(SimEnvError, ValueError):
+    """A reward is not one finite number."""
+
+
+class NoDecisionError(SimEnvError, RuntimeError):
+    """The simulation came to its end without asking for a decision."""
+
+
+class ResetNeededError(SimEnvError, RuntimeError):
+    """There is no episode to go on with; ``reset`` begins one."""
+
+
+class NotResetError(ResetNeededError):
+    """The environment was used before its first ``reset``."""
+
+
+class EpisodeOverError(ResetNeededError):
+    """The episode has ended, or an error has ended it."""
+
+
+class ClosedError(ResetNeededError):
+    """The environment was closed."""
+
+
+class ReentrancyError(SimEnvError, RuntimeError):
+    """An environment was stepped or reset while its own simulation was moving."""
+
+
+class WrongThreadError(SimEnvError, RuntimeError):
+    """An environment was used from a thread other than the one that has reset it."""

@@ -1,0 +1,130 @@
+"""What a simulation is to this library, and the two words that it and its user may say."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, Final, final
+
+from .errors import SimulationError
+
+
+@final
+class Sentinel:
+    """A value that is equal to itself alone, and stays itself through copies and pickles."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __repr__(self) -> str:
+        return f"simenv_marl.{self._name}"
+
+    def __reduce__(self) -> str:
+        return self._name
+
+
+RULE: Final = Sentinel("RULE")
+"""As an action: let the model's own rule decide (accepted by every view's ``step``)."""
+
+TRUNCATED: Final = Sentinel("TRUNCATED")
+"""As the result of ``run()``: the episode ended at a limit of time, not at an end of the task."""
+
+
+class SimulationInterface(ABC):
+    """A simulation that is in the lead of its own main loop (paper, section 3.3).
+
+    Deriving from this class is a convenience: any object with ``run`` and ``reset`` serves. What
+    a simulation may define beside the methods below:
+
+    - ``reset(self, seed=None)`` or ``reset(self, seed=None, options=None)`` instead of ``reset(self)``:
+      it then always gets an integer seed, and the ``options`` of the environment's ``reset``.
+    - ``points``: the decision points that environments use unless they are told otherwise (a dotted
+      name, a decision function, a list of these, or a dict from these to definitions).
+    - ``expected_calls(self, point)``: the argument tuples with which the decision point of that dotted
+      name is going to be called, so that agents can be observed before their first decision.
+    - ``render(self, mode)``: a picture of the present state, for a ``mode`` out of ``render_modes``.
+    """
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Return the simulation to the initial state of an episode."""
+
+    @abstractmethod
+    def run(self) -> Any:
+        """Run the main loop of one episode; its return ends the episode.
+
+        Returns:
+            ``TRUNCATED`` where the end is a limit of time; anything else is an end of the task.
+        """
+
+    def stop(self) -> None:  # noqa: B027 - leaving it out is allowed, and then nothing is to be done
+        """Ask the main loop to end; called before a simulation is unwound in mid-episode."""
+
+
+def make_simulation(source: Any) -> Any:
+    """Make one simulation of an environment's own.
+
+    Args:
+        source: An instance (which is copied), a class or a zero-argument factory.
+
+    Returns:
+        The new simulation.
+
+    Raises:
+        SimulationError: ``source`` is none of these, cannot be copied, or makes no simulation.
+    """
+    if not isinstance(source, type) and hasattr(source, "run"):
+        try:
+            simulation = copy.deepcopy(source)
+        except Exception as error:
+            raise SimulationError(
+                f"the simulation {source!r} cannot be copied ({type(error).__name__}: {error}); give its class"
+                " or a zero-argument factory instead of an instance"
+            ) from error
+    elif callable(source):
+        simulation = source()
+    else:
+        raise SimulationError(
+            f"{source!r} is no simulation: give an object with run() and reset(), its class, or a factory"
+        )
+    for name in ("run", "reset"):
+        if not callable(getattr(simulation, name, None)):
+            raise SimulationError(f"{simulation!r} has no method {name}(), which every simulation needs")
+    return simulation
+
+
+def resetter(simulation: Any) -> Callable[[int | None, dict[str, Any] | None], None]:
+    """Find out what the simulation's ``reset`` takes.
+
+    Args:
+        simulation: The simulation.
+
+    Returns:
+        A function of seed and options that resets the simulation with as much of them as it takes. Its
+        attribute of the signature is looked at once, here.
+    """
+    seeded, optioned = takes(simulation.reset, "seed"), takes(simulation.reset, "options")
+
+    def reset(seed: int | None, options: dict[str, Any] | None) -> None:
+        arguments: dict[str, Any] = {}
+        if seeded:
+            arguments["seed"] = seed
+        if optioned:
+            arguments["options"] = options
+        simulation.reset(**arguments)
+
+    return reset
+
+
+def takes(function: Callable[..., Any], name: str) -> bool:
+    """Whether a function can be called with a keyword argument of that name."""
+    try:
+        parameters = inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return False
+    parameter = parameters.get(name)
+    if parameter is not None:
+        return parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+    return any(p.kind is p.VAR_KEYWORD for p in parameters.values())

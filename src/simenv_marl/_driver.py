@@ -1,25 +1,29 @@
-"""Switching between a simulation's stack and its user's: who runs, and nothing else.
+"""Switching between a simulation's stack and its user's: who runs, and how a decision crosses over.
 
-A driver has three moves. On the user's side ``resume`` hands a reply to the simulation and returns what
-the simulation says next; ``throw`` raises ``SimulationExit`` in it instead. On the simulation's side
-``suspend`` says something to the user and returns the reply. What is said is the episode's business.
+On the user's side a driver has two moves: ``resume`` hands a reply to the simulation and returns what comes
+from it next, and ``throw`` raises ``SimulationExit`` in it instead. On the simulation's side its ``ask`` is
+what decision functions call: it hands the call over and carries out the reply. What crosses from the
+simulation is an *event*, a tuple of three: a decision (its binding, args, kwargs), or ``FINISHED`` or
+``FAILED`` (with what ``run`` has returned or raised, and None).
 
-While a simulation runs, ``RUNNING`` holds for its thread the function that decision functions ask. It is
-empty whenever no simulation runs behind an environment, so that a decision function which is called
-outside any environment finds that out by one test.
+While a simulation runs, ``RUNNING`` holds the ``ask`` of its driver for its thread. It is empty whenever no
+simulation runs behind an environment, so that a decision function which is called outside any environment
+finds that out by one test.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import copy_context
+from functools import partial
 from threading import get_ident
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from greenlet import getcurrent, greenlet
 
 from .errors import WrongThreadError
+from .simulation import RULE, Sentinel
 
 Ask = Callable[[Any, tuple[Any, ...], dict[str, Any]], Any]
 """Decides a call of a decision point: of the point, and of the call's arguments."""
@@ -32,95 +36,138 @@ class SimulationExit(BaseException):
     """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught."""
 
 
+class Binding(Protocol):
+    """What a driver needs of a decision point under an environment's definition.
+
+    Attributes:
+        deliver: Turns a reply and the call's arguments into what the call returns; None: the reply is that.
+    """
+
+    deliver: Callable[..., Any] | None
+
+
+FINISHED: Final = Sentinel("FINISHED")
+FAILED: Final = Sentinel("FAILED")
+
+Event = tuple[Any, Any, Any]
+
+
 class Driver(Protocol):
-    """What an episode needs of a driver."""
+    """What an episode needs of a driver.
 
-    def resume(self, reply: Any) -> Any:
-        """Let the simulation go on with a reply; return what it says next."""
+    Attributes:
+        resume: Lets the simulation go on with a reply; returns the event that comes from it next.
+        caller: On whose stack that may be called without ``enter`` before.
+    """
 
-    def suspend(self, event: Any) -> Any:
-        """In the simulation: say something to the user, wait, and return the reply."""
+    resume: Callable[[Any], Event]
+    caller: Any
 
-    def throw(self) -> Any:
-        """Raise ``SimulationExit`` in the suspended simulation; return what it says next."""
+    def enter(self) -> None:
+        """Make ready to be resumed from here.
+
+        Raises:
+            WrongThreadError: The simulation cannot be resumed from here.
+        """
+
+    def throw(self) -> Event:
+        """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
 
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from here."""
 
     def forget(self) -> None:
-        """Let go of all references into the episode."""
+        """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
 
 
 class GreenletDriver:
-    """Runs a simulation on a greenlet of the thread in which it is first resumed."""
+    """Runs a simulation on a greenlet of the thread in which it is made."""
 
-    __slots__ = ("_ask", "_body", "_caller", "_inside", "_switch_in", "_switch_out", "_thread")
+    __slots__ = ("_ask", "_bindings", "_body", "_inside", "_switch_out", "_thread", "caller", "resume")
 
-    def __init__(self, body: Callable[[Any], Any], ask: Ask) -> None:
-        """Prepare a greenlet.
+    def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Binding]) -> None:
+        """Prepare a greenlet; the first ``resume`` starts it.
 
         Args:
-            body: The simulation's side, called with the first reply; what it returns is the last thing that ``resume`` returns.
-            ask: What decision functions ask while the simulation runs.
+            run: The simulation's main loop.
+            bindings: The decision points that are handed over; all others run their rule.
         """
-        self._body = greenlet(body)
+        self._bindings = bindings
+        self._ask: Ask | None = self.ask
+        self._thread = get_ident()
+        self._body = greenlet(self._run)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
         self._body.gr_context = copy_context()
-        self._inside = self._body
-        self._switch_in = self._body.switch
-        self._ask = ask
-        self._caller: Any = getcurrent()
-        self._switch_out = self._caller.switch
-        self._thread = get_ident()
+        self._inside: Any = self._body
+        self.resume: Callable[[Any], Event] = partial(self._body.switch, run)
+        self.caller: Any = getcurrent()
+        self._switch_out = self.caller.switch
 
-    def resume(self, reply: Any) -> Any:
-        """Let the simulation go on with a reply; return what it says next."""
-        if getcurrent() is not self._caller:
-            self._called_from_elsewhere()
-        thread = self._thread
-        RUNNING[thread] = self._ask
+    def _run(self, run: Callable[[], Any], _: Any) -> Event:
+        self._inside = None  # the first decision sets ``resume`` to what resumes it
+        self._running()
         try:
-            return self._switch_in(reply)
+            return FINISHED, run(), None
+        except BaseException as error:
+            return FAILED, error, None
         finally:
-            del RUNNING[thread]
+            if self._ask is not None:
+                del RUNNING[self._thread]
 
-    def throw(self) -> Any:
-        """Raise ``SimulationExit`` in the suspended simulation; return what it says next."""
-        if getcurrent() is not self._caller:
-            self._called_from_elsewhere()
-        thread = self._thread
-        RUNNING[thread] = self._ask
+    def ask(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """In the simulation: decide a call of a decision point."""
+        binding = self._bindings.get(point)
+        if binding is None:
+            return point.rule(*args, **kwargs)
+        inside = getcurrent()
+        if inside is not self._inside:  # a model may switch stacks of its own: come back to the one that asks
+            self._inside, self.resume = inside, inside.switch
+        switch_out, thread, deliver = self._switch_out, self._thread, binding.deliver
+        del RUNNING[thread]
         try:
-            return self._inside.throw(SimulationExit())
-        finally:
-            del RUNNING[thread]
+            reply = switch_out(binding, args, kwargs)
+        except BaseException:
+            self._running()
+            raise
+        RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
+        if reply is RULE:
+            return point.rule(*args, **kwargs)
+        return reply if deliver is None else deliver(reply, *args, **kwargs)
 
-    def suspend(self, event: Any) -> Any:
-        """In the simulation: say something to the user, wait, and return the reply."""
-        current = getcurrent()
-        if current is not self._inside:
-            # The model switches stacks of its own: come back to the one that has asked.
-            self._inside = current
-            self._switch_in = current.switch
-        return self._switch_out(event)
+    def _running(self) -> None:
+        if self._ask is not None:
+            RUNNING[self._thread] = self._ask
+
+    def enter(self) -> None:
+        """Make ready to be resumed from here.
+
+        Raises:
+            WrongThreadError: The simulation lives in another thread.
+        """
+        caller = getcurrent()
+        if caller is self.caller:
+            return
+        if not self.reachable():
+            raise WrongThreadError(
+                "a simulation on a greenlet can only be stepped, reset and closed in mid-episode from the thread"
+                " that has begun the episode"
+            )
+        self.caller, self._switch_out = caller, caller.switch
+        self._body.parent = caller  # where the simulation's end arrives
+
+    def throw(self) -> Event:
+        """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
+        self.enter()
+        return self._inside.throw(SimulationExit())
 
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from here."""
         return self._thread == get_ident()
 
     def forget(self) -> None:
-        """Let go of all references into the episode."""
-        del self._ask, self._body, self._caller, self._inside, self._switch_in, self._switch_out
-
-    def _called_from_elsewhere(self) -> None:
-        if not self.reachable():
-            raise WrongThreadError(
-                "a simulation on a greenlet can only be stepped from the thread that has reset it;"
-                " step it there, or reset it here"
-            )
-        self._caller = getcurrent()
-        self._switch_out = self._caller.switch
-        self._body.parent = self._caller  # where the simulation's end arrives
+        """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
+        self._ask = None
+        del self._bindings, self._body, self._inside, self._switch_out, self.caller, self.resume
 
 
 @contextmanager

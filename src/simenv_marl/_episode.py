@@ -33,11 +33,12 @@ from typing import Any, Final
 from weakref import ref
 
 import numpy as np
+from greenlet import getcurrent
 
 from . import _spaces
-from ._driver import RUNNING, Driver, GreenletDriver, SimulationExit, unattended
+from ._driver import FAILED, FINISHED, RUNNING, Driver, GreenletDriver, SimulationExit, unattended
 from ._plan import Binding, Plan
-from .decision import EVALUATING, DecisionPoint, Difference
+from .decision import DIFFERENCES, EVALUATING
 from .errors import (
     AgentError,
     EpisodeOverError,
@@ -51,9 +52,6 @@ from .simulation import RULE, TRUNCATED
 
 UNWINDING_TRIES: Final = 8
 """How often a simulation that is to be unwound may decide or swallow before it is given up."""
-
-_FINISHED: Final = object()
-_FAILED: Final = object()
 
 _given_up: list[Driver] = []
 """Simulations that refused to unwind: dropping them would resume them at some random moment."""
@@ -151,48 +149,28 @@ class Episode:
         self.turns = 0
         self._answered: dict[str, Record] = {}  # those for whom policies answer
         self._latest: Record | None = None
-        self._decisions = 0
         self._plan, self._simulation, self._seed = plan, simulation, seed
-        self._bindings, self._max_turns = plan.bindings, plan.options.max_steps
-        self._thread = get_ident()
+        self._max_turns = plan.options.max_steps or -1  # never reached
+        self._remembering = bool(DIFFERENCES)
         for binding in plan.active:
             if binding.agent is not None:
                 self.agents[binding.agent] = Record(binding.agent, binding, None)
-        self._driver: Driver | None = GreenletDriver(self._simulate, self._ask)
-        self._go_on(None)
+        self._driver: Driver | None = GreenletDriver(simulation.run, plan.bindings)
+        with unattended():
+            self._go_on(self._driver, None)
+            try:
+                self._foresee()
+            except BaseException as error:
+                self._fail(error)
+                raise
         if self.pending is None:
             raise NoDecisionError(
                 f"{type(simulation).__name__}.run() came to its end without a decision of"
                 f" {', '.join(binding.point.name for binding in plan.active)}; does the simulation call the"
                 " decision functions as attributes of their class or module?"
             )
-        try:
-            with unattended():
-                self._foresee()
-        except BaseException as error:
-            self._fail(error)
-            raise
 
-    # -- on the simulation's stack ----------------------------------------------------------------
-
-    def _simulate(self, _: Any) -> tuple[Any, Any, None]:
-        try:
-            return _FINISHED, self._simulation.run(), None
-        except BaseException as error:
-            return _FAILED, error, None
-
-    def _ask(self, point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        binding = self._bindings.get(point)
-        if binding is None:
-            return point.rule(*args, **kwargs)
-        reply = self._driver.suspend((binding, args, kwargs))  # type: ignore[union-attr]
-        if reply is RULE:
-            return point.rule(*args, **kwargs)
-        if binding.deliver is not None:
-            return binding.deliver(reply, *args, **kwargs)
-        return reply
-
-    # -- on the user's stack ----------------------------------------------------------------------
+    # -- decisions --------------------------------------------------------------------------------
 
     def turn(self, action: Any) -> None:
         """Answer the pending decision and run to the next one that the user is to answer, or to the end.
@@ -205,15 +183,33 @@ class Episode:
             EpisodeOverError: No decision is pending.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        record = self.pending
-        if record is None:
+        record, driver = self.pending, self._driver
+        if record is None or driver is None:
             raise self.nothing_pending()
-        reply = action if action is RULE else self._reply(record, action)
+        if RUNNING and get_ident() in RUNNING:
+            # Inside another environment's simulation, and what runs on our side is none of its decisions.
+            with unattended():
+                self.turn(action)
+            return
+        if getcurrent() is not driver.caller:
+            driver.enter()
+        binding = record.binding
+        try:
+            if type(action) is int and binding.first <= action < binding.end and record.mask is None:
+                convert = binding.convert
+                reply = convert(action)
+            elif action is RULE:
+                reply = action
+            else:
+                reply = binding.reply(action, record.agent, record.mask, record.choices)
+        except Exception as error:
+            self._annotate(error)
+            raise
         self.pending = None
         self.turns += 1
-        if record.binding.agent is None:
+        if binding.agent is None:
             record.loosen()
-        self._go_on(reply)
+        self._go_on(driver, reply)
 
     def nothing_pending(self) -> Exception:
         """The error that says why no action can be taken now."""
@@ -221,70 +217,47 @@ class Episode:
             return EpisodeOverError("the episode is over; call reset() to begin the next one")
         return ReentrancyError("the environment was used from inside its own simulation or mappings")
 
-    def _reply(self, record: Record, action: Any) -> Any:
-        """Turn the user's action into a reply. Nothing has moved yet, and nothing moves if this fails."""
-        outer = RUNNING.pop(self._thread, None) if RUNNING else None
-        try:
-            return record.binding.reply(action, record.agent, record.mask, record.choices)
-        except Exception as error:
-            self._annotate(error)
-            raise
-        finally:
-            if outer is not None:
-                RUNNING[self._thread] = outer
-
-    def _go_on(self, reply: Any) -> None:
+    def _go_on(self, driver: Driver, reply: Any) -> None:
         """Let the simulation go on with a reply, until a decision is pending or the episode is over."""
-        # Inside another environment's simulation, what runs on our side is none of its decisions.
-        outer = RUNNING.pop(self._thread, None) if RUNNING else None
-        driver = self._driver
-        assert driver is not None
         try:
-            while self.pending is None and not self.over:
-                event = driver.resume(reply)
-                if type(event[0]) is Binding:
-                    reply = self._decide(*event)
-                    event = None  # a reference here would keep alive what the model lets go
+            while True:
+                # No reference to the event may stand here while the simulation moves: it would keep alive
+                # what the model lets go.
+                binding = args = kwargs = None
+                resume = driver.resume
+                binding, args, kwargs = resume(reply)
+                if type(binding) is not Binding:
+                    self._end(binding, args)
+                    return
+                agent = binding.agent
+                if agent is None:
+                    agent = binding.name_agent(*args, **kwargs)
+                    if agent is None:
+                        reply = RULE
+                        continue
+                record = self.agents.get(agent) if type(agent) is str else None
+                if record is None or record.binding is not binding:
+                    record = self._meet(agent, binding)
+                self._latest = record
+                if record.policy is not None:
+                    reply = self._consult(record, args, kwargs)
+                    continue
+                record._args, record._kwargs = args, kwargs
+                if self.turns == self._max_turns:
+                    self._finish(truncated=True)
+                    return
+                if self._remembering:
+                    with _remembering(record):
+                        self._settle(record, args, kwargs)
                 else:
-                    kind, value, event = event
-                    self._end(kind, value)
+                    self._settle(record, args, kwargs)
+                self.pending = record
+                return
         except BaseException as error:
-            if driver.reachable():
-                self._fail(error)
-            else:  # another thread's: it has not moved
-                self.pending = self._latest
-                self.turns -= 1
+            self._fail(error)
             raise
         finally:
-            event = value = None
-            if outer is not None:
-                RUNNING[self._thread] = outer
-
-    def _decide(self, binding: Binding, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """See to a decision that has arisen: make it pending, or return the reply to it."""
-        agent = binding.agent
-        if agent is None:
-            agent = binding.name_agent(*args, **kwargs)  # type: ignore[misc]
-            if agent is None:
-                return RULE
-        record = self.agents.get(agent)
-        if record is None or record.binding is not binding:
-            record = self._meet(agent, binding)
-        self._latest = record
-        self._decisions += 1
-        if record.policy is not None:
-            return self._consult(record, args, kwargs)
-        record._args, record._kwargs = args, kwargs
-        if self.turns == self._max_turns:
-            self._finish(truncated=True)
-            return None
-        if Difference.used:
-            with _remembering(record):
-                self._settle(record, args, kwargs)
-        else:
-            self._settle(record, args, kwargs)
-        self.pending = record
-        return None
+            binding = args = kwargs = None
 
     def _meet(self, agent: Any, binding: Binding) -> Record:
         """Find or make the record of an agent that is not known as one of the environment's own here."""
@@ -317,19 +290,21 @@ class Episode:
 
     def _settle(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
         """Reward the agent's action before, then observe what it decides on now, or what it ended with."""
+        # Functions are fetched from attributes before they are called, because calling them there is slower.
         binding = record.binding
+        reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
         if record.decided:
-            reward = binding.reward(*args, **kwargs)
+            reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
             if type(reward) is not float:
                 reward = _number(reward)
             if not isfinite(reward):
                 raise RewardError(f"the reward of {record.agent!r} is {reward}, which is not finite")
             record.reward = reward
         elif not last:
-            binding.reward(*args, **kwargs)  # nothing was done yet that could be rewarded
+            reward_mapping(*args, **kwargs)  # nothing was done yet that could be rewarded
             record.decided = True
         if binding.legal is None:
-            record.observation = binding.cast(binding.observe(*args, **kwargs))
+            record.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
             record.info = {}
         else:
             self._observe(record, args, kwargs, last=last)
@@ -371,7 +346,7 @@ class Episode:
     def _end(self, kind: Any, value: Any) -> None:
         """The simulation's ``run`` has returned or failed."""
         self._let_go_of_driver()
-        if kind is _FAILED:
+        if kind is FAILED:
             try:
                 raise value
             finally:
@@ -402,7 +377,7 @@ class Episode:
         if record is None:
             where = "before the first decision"
         else:
-            where = f"decision {self._decisions} of the episode, of {record.agent!r} at {record.binding.point.name}"
+            where = f"decision {self.turns + 1}, of {record.agent!r} at {record.binding.point.name}"
         error.add_note(f"simenv_marl: {where}; seed {self._seed}")
 
     def close(self) -> None:
@@ -447,9 +422,9 @@ class Episode:
                 problems.append(error)
             for _ in range(UNWINDING_TRIES):
                 kind, value, _ = driver.throw()
-                if kind is _FAILED and not _is_exit(value):
+                if kind is FAILED and not _is_exit(value):
                     problems.append(value)
-                if kind is _FAILED or kind is _FINISHED:
+                if kind is FAILED or kind is FINISHED:
                     self._let_go_of_driver()
                     return problems
         _given_up.append(driver)

@@ -102,13 +102,17 @@ class Binding:
         policy: Who answers all its decisions; None: its agents' own policies, or the environment's user.
         observe, reward: The mappings.
         cast: Casts observations to their space.
-        legal: Returns the mask of the call, or the choices; None where all actions are always legal.
+        legal: Returns the mask of a call, and the choices if it has any; None where all actions are always
+            legal.
+        convert: Turns a checked action into the reply to the simulation.
         deliver: In the simulation, turns the reply into what a call of the decision function returns; None
             where the reply is that.
+        check: Checks an action against its space.
+        first, end: The first action of a ``Discrete``, and the one after its last; 0 and 0 for other spaces.
     """
 
     __slots__ = (
-        "_allows", "_check", "_convert", "_mask_in_observation", "agent", "cast", "definition", "deliver",
+        "_mask_in_observation", "agent", "cast", "check", "convert", "definition", "deliver", "end", "first",
         "legal", "name_agent", "observe", "point", "policy", "reward",
     )  # fmt: skip
 
@@ -122,16 +126,19 @@ class Binding:
         self.observe = definition.observation_space_mapping
         self.reward = definition.reward_mapping
         self.cast = _spaces.observation_cast(definition.observation_space)
-        self._check = _spaces.action_check(definition.action_space)
-        self._convert = definition.action_space_mapping
+        self.check = _spaces.action_check(definition.action_space)
+        self.convert = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
-        space = definition.observation_space
+        space, actions = definition.observation_space, definition.action_space
         self._mask_in_observation = isinstance(space, spaces.Dict) and _spaces.MASK in space.spaces
+        self.first = self.end = 0
+        if isinstance(actions, spaces.Discrete):
+            self.first, self.end = int(actions.start), int(actions.start + actions.n)
         self.legal: Callable[..., tuple[Any, Any]] | None = None
         if definition.action_mask_mapping is not None:
-            self.legal = partial(_masked, definition.action_mask_mapping, _spaces.mask_cast(definition.action_space))
+            self.legal = partial(_masked, definition.action_mask_mapping, _spaces.mask_cast(actions))
         elif definition.choices is not None:
-            self.legal = partial(_chosen, definition.choices, int(definition.action_space.n), named.point.name)
+            self.legal = partial(_chosen, definition.choices, self.end, named.point.name)
 
     def observation(self, args: tuple[Any, ...], kwargs: dict[str, Any], mask: Any) -> Any:
         """The observation of a call whose legal actions are known."""
@@ -152,17 +159,20 @@ class Binding:
         Raises:
             InvalidActionError: The action is not legal.
         """
-        legal = self._check(action)
+        legal = self.check(action)
         if legal is ILLEGAL:
             raise InvalidActionError(
                 f"the action {action!r} of {agent!r} is not in its action space {self.definition.action_space}"
             )
-        if mask is not None:
-            if not _spaces.mask_allows(self.definition.action_space, mask, legal):
-                raise InvalidActionError(f"the action {action!r} of {agent!r} is masked; its mask is {mask!r}")
-            if choices is not None:
-                return choices[legal]
-        return legal if self._convert is None else self._convert(legal)
+        if mask is not None and not _spaces.mask_allows(self.definition.action_space, mask, legal):
+            raise InvalidActionError(f"the action {action!r} of {agent!r} is masked; its mask is {mask!r}")
+        if choices is not None:
+            return choices[legal]
+        return self.convert(legal)
+
+
+def _same(action: Any) -> Any:
+    return action
 
 
 def _masked(mapping: Callable[..., Any], cast: Callable[[Any], Any], args: Any, kwargs: Any) -> tuple[Any, None]:

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from types import FunctionType, ModuleType
-from typing import Any
+from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
 from .decision import DecisionPoint, Definition, point_of, registered, registered_names, unbind
@@ -88,7 +88,7 @@ def find_point(key: Any, definition: Any = None) -> NamedPoint:
         raise DefinitionError(f"the definition of {_title(key)} must come from make_step, not {definition!r}")
     if isinstance(key, str):
         return _find_name(key, definition)
-    function, binding = unbind(key)
+    function, _ = unbind(key)
     known = point_of(function)
     if known is not None:
         point, own = known
@@ -229,7 +229,7 @@ class Site:
     There is one for each place, shared by all environments, however long any of them needs it.
     """
 
-    _all: WeakValueDictionary[tuple[Any, str], Site] = WeakValueDictionary()
+    _all: ClassVar[WeakValueDictionary[tuple[Any, str], Site]] = WeakValueDictionary()
 
     def __init__(self, name: str, owner: Any, attribute: str) -> None:
         held = _held(owner, attribute)

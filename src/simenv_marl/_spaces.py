@@ -85,8 +85,7 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
         raise ObservationError(f"the observation {value!r} is no array for {space}: {error}") from error
     if array.shape != space.shape:
         raise ObservationError(
-            f"the observation has shape {array.shape}, its space {space} has shape {space.shape};"
-            f" it was {value!r}"
+            f"the observation has shape {array.shape}, its space {space} has shape {space.shape}; it was {value!r}"
         )
     if array.dtype.kind not in "biuf":
         raise ObservationError(f"the observation {value!r} has dtype {array.dtype}, which is no number")

@@ -16,7 +16,7 @@ from functools import update_wrapper
 from threading import get_ident
 from types import FunctionType, MethodType
 from typing import Any, Final
-from weakref import WeakValueDictionary
+from weakref import WeakSet, WeakValueDictionary
 
 from gymnasium import spaces
 
@@ -161,9 +161,7 @@ def make_step(
 
 def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[Any], Any]:
     if not isinstance(space, spaces.Discrete):
-        raise DefinitionError(
-            f"make_step: a dict as action_space_mapping needs a Discrete action_space, not {space}"
-        )
+        raise DefinitionError(f"make_step: a dict as action_space_mapping needs a Discrete action_space, not {space}")
     actions = range(int(space.start), int(space.start + space.n))
     missing = [action for action in actions if action not in answers]
     surplus = [action for action in answers if action not in actions]
@@ -402,18 +400,20 @@ def _run_rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any
 EVALUATING: dict[int, dict[Any, Any]] = {}
 """By thread: what the differences of the agent whose mapping is being evaluated there remember."""
 
+DIFFERENCES: WeakSet[Difference] = WeakSet()
+"""All differences. Where there is none, nobody needs to say whose mapping is being evaluated."""
+
 
 class Difference:
     """A mapping that returns by how much another has changed. Made by ``difference``."""
 
-    used = False  # whether there is one in this process, and evaluations must say for whom they are
-
     def __init__(self, function: Mapped) -> None:
-        Difference.used = True
+        DIFFERENCES.add(self)
         self._function = function
         update_wrapper(self, function)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """The change of the function's value at these arguments."""
         value = self._function(*args, **kwargs)
         memory = EVALUATING.get(get_ident())
         if memory is None:

@@ -43,14 +43,14 @@ def generate_env(
     base: Any = VIEWS[view]
     base.check(plan)
 
-    def __init__(self: Any, **changes: Any) -> None:
+    def initialise(self: Any, **changes: Any) -> None:
         base.__init__(self, plan.amended(changes))
 
     return type(
         f"{plan.name}Env",
         (base,),
         {
-            "__init__": __init__,
+            "__init__": initialise,
             "__doc__": f"The {view} view of {plan.name}: {', '.join(b.point.name for b in plan.active)}.",
             "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
             "metadata": base.metadata_of(plan),

@@ -158,7 +158,8 @@ class GreenletDriver:
     def throw(self) -> Event:
         """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
         self.enter()
-        return self._inside.throw(SimulationExit())
+        event: Event = self._inside.throw(SimulationExit())
+        return event
 
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from here."""

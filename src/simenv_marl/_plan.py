@@ -121,7 +121,7 @@ class Binding:
         self.point: DecisionPoint = named.point
         self.definition: Definition = definition
         self.agent = agent
-        self.name_agent = definition.agent if agent is None else None
+        self.name_agent: Any = definition.agent if agent is None else None
         self.policy = policy
         self.observe = definition.observation_space_mapping
         self.reward = definition.reward_mapping

@@ -317,7 +317,7 @@ def _places_of(function: Any) -> list[tuple[Any, str]]:
     ]
 
 
-def _next_in_line(owner: type, attribute: str, function: FunctionType, binding: type | None) -> FunctionType:
+def _next_in_line(owner: type, attribute: str, function: FunctionType, binding: type | None) -> Any:
     """Make the rule of an inherited function: what the class would find without the patch, whenever it is called.
 
     What is found is looked up at each call, so that a patch of the base class is not passed over.

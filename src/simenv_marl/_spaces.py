@@ -126,7 +126,7 @@ def _dict_cast(space: spaces.Dict) -> Cast:
     return cast
 
 
-def _tuple_cast(space: spaces.Tuple) -> Cast:
+def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
     casts = tuple(observation_cast(part) for part in space.spaces)
 
     def cast(value: Any) -> tuple[Any, ...]:

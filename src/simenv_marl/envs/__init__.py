@@ -10,6 +10,8 @@ from ..errors import OptionValueError
 from .aec import SimulationAECEnv
 from .single import SimulationEnv
 
+__all__ = ["VIEWS", "SimulationAECEnv", "SimulationEnv", "aec_env", "generate_env", "single_env"]
+
 VIEWS: Final[dict[str, type[SimulationAECEnv] | type[SimulationEnv]]] = {
     "aec": SimulationAECEnv,
     "single": SimulationEnv,

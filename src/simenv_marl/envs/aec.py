@@ -52,6 +52,7 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
         self.render_mode = plan.options.render_mode
         if plan.possible_agents is not None:
             self.possible_agents = list(plan.possible_agents)
+        self._episode: Episode | None
         self._by_agent = {binding.agent: binding for binding in plan.active}
         self._np_random: np.random.Generator | None = None
         self._observation_spaces: dict[str, spaces.Space[Any]] = {}
@@ -238,7 +239,7 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
     # -- PettingZoo's books -----------------------------------------------------------------------
 
     def _clear(self) -> None:
-        self._episode: Episode | None = None
+        self._episode = None
         self.agents: list[str] = []
         self.rewards: dict[str, float] = {}
         self._cumulative_rewards: dict[str, float] = {}
@@ -289,7 +290,7 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
             )
         agent = self.agents.pop()
         for book in (self.rewards, self._cumulative_rewards, self.terminations, self.truncations, self.infos):
-            del book[agent]  # type: ignore[attr-defined]
+            del book[agent]
         if not self._rewards_are_old:
             self.rewards = dict.fromkeys(self.agents, 0.0)
             self._rewards_are_old = True

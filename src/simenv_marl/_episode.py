@@ -147,6 +147,7 @@ class Episode:
         self.agents: dict[str, Record] = {}
         self.over = self.terminated = self.truncated = False
         self.turns = 0
+        self._swift: dict[Any, Record] = {}  # by binding: agents for which nothing but the mappings is to be done
         self._answered: dict[str, Record] = {}  # those for whom policies answer
         self._latest: Record | None = None
         self._plan, self._simulation, self._seed = plan, simulation, seed
@@ -157,8 +158,10 @@ class Episode:
                 self.agents[binding.agent] = Record(binding.agent, binding, None)
         self._driver: Driver | None = GreenletDriver(simulation.run, plan.bindings)
         with unattended():
-            self._go_on(self._driver, None)
             try:
+                reply = None
+                while self.pending is None and not self.over:
+                    reply = self._take(*self._driver.resume(reply))
                 self._foresee()
             except BaseException as error:
                 self._fail(error)
@@ -206,10 +209,39 @@ class Episode:
             self._annotate(error)
             raise
         self.pending = None
-        self.turns += 1
+        self.turns = turns = self.turns + 1
         if binding.agent is None:
             record.loosen()
-        self._go_on(driver, reply)
+        try:
+            while True:
+                # Functions are fetched from attributes before they are called: calling them there is slower.
+                resume = driver.resume
+                binding, args, kwargs = resume(reply)
+                record = self._swift.get(binding)
+                if record is not None and not kwargs and turns != self._max_turns:
+                    # The same as ``_take`` and ``_settle``, for what most decisions are.
+                    self._latest = record
+                    record._args, record._kwargs = args, kwargs
+                    reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
+                    reward = reward_mapping(*args)
+                    if type(reward) is not float:
+                        reward = _number(reward)
+                    if not isfinite(reward):
+                        raise _not_finite(record, reward)
+                    record.reward = reward
+                    record.observation = cast(observe(*args))
+                    record.info = {}
+                    self.pending = record
+                    return
+                reply = self._take(binding, args, kwargs)
+                if self.pending is not None or self.over:
+                    return
+                binding = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
+        except BaseException as error:
+            self._fail(error)
+            raise
+        finally:
+            binding = args = kwargs = None
 
     def nothing_pending(self) -> Exception:
         """The error that says why no action can be taken now."""
@@ -217,47 +249,35 @@ class Episode:
             return EpisodeOverError("the episode is over; call reset() to begin the next one")
         return ReentrancyError("the environment was used from inside its own simulation or mappings")
 
-    def _go_on(self, driver: Driver, reply: Any) -> None:
-        """Let the simulation go on with a reply, until a decision is pending or the episode is over."""
-        try:
-            while True:
-                # No reference to the event may stand here while the simulation moves: it would keep alive
-                # what the model lets go.
-                binding = args = kwargs = None
-                resume = driver.resume
-                binding, args, kwargs = resume(reply)
-                if type(binding) is not Binding:
-                    self._end(binding, args)
-                    return
-                agent = binding.agent
-                if agent is None:
-                    agent = binding.name_agent(*args, **kwargs)
-                    if agent is None:
-                        reply = RULE
-                        continue
-                record = self.agents.get(agent) if type(agent) is str else None
-                if record is None or record.binding is not binding:
-                    record = self._meet(agent, binding)
-                self._latest = record
-                if record.policy is not None:
-                    reply = self._consult(record, args, kwargs)
-                    continue
-                record._args, record._kwargs = args, kwargs
-                if self.turns == self._max_turns:
-                    self._finish(truncated=True)
-                    return
-                if self._remembering:
-                    with _remembering(record):
-                        self._settle(record, args, kwargs)
-                else:
-                    self._settle(record, args, kwargs)
-                self.pending = record
-                return
-        except BaseException as error:
-            self._fail(error)
-            raise
-        finally:
-            binding = args = kwargs = None
+    def _take(self, binding: Any, args: Any, kwargs: Any) -> Any:
+        """See to an event: make its decision pending, or return the reply to it, or end the episode."""
+        if type(binding) is not Binding:
+            self._end(binding, args)
+            return None
+        agent = binding.agent
+        if agent is None:
+            agent = binding.name_agent(*args, **kwargs)
+            if agent is None:
+                return RULE
+        record = self.agents.get(agent) if type(agent) is str else None
+        if record is None or record.binding is not binding:
+            record = self._meet(agent, binding)
+        self._latest = record
+        if record.policy is not None:
+            return self._consult(record, args, kwargs)
+        record._args, record._kwargs = args, kwargs
+        if self.turns == self._max_turns:
+            self._finish(truncated=True)
+            return None
+        if self._remembering:
+            with _remembering(record):
+                self._settle(record, args, kwargs)
+        else:
+            self._settle(record, args, kwargs)
+            if binding.agent is not None and binding.legal is None and not kwargs:
+                self._swift[binding] = record
+        self.pending = record
+        return None
 
     def _meet(self, agent: Any, binding: Binding) -> Record:
         """Find or make the record of an agent that is not known as one of the environment's own here."""
@@ -290,7 +310,6 @@ class Episode:
 
     def _settle(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
         """Reward the agent's action before, then observe what it decides on now, or what it ended with."""
-        # Functions are fetched from attributes before they are called, because calling them there is slower.
         binding = record.binding
         reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
         if record.decided:
@@ -298,7 +317,7 @@ class Episode:
             if type(reward) is not float:
                 reward = _number(reward)
             if not isfinite(reward):
-                raise RewardError(f"the reward of {record.agent!r} is {reward}, which is not finite")
+                raise _not_finite(record, reward)
             record.reward = reward
         elif not last:
             reward_mapping(*args, **kwargs)  # nothing was done yet that could be rewarded
@@ -463,6 +482,10 @@ def _number(reward: Any) -> float:
         return float(reward.item() if isinstance(reward, np.ndarray) else reward)
     except (TypeError, ValueError):
         raise RewardError(f"the reward {reward!r} is not one number") from None
+
+
+def _not_finite(record: Record, reward: float) -> RewardError:
+    return RewardError(f"the reward of {record.agent!r} is {reward}, which is not finite")
 
 
 def _is_exit(error: BaseException | None) -> bool:

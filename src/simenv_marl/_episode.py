@@ -27,7 +27,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from math import isfinite
 from threading import get_ident
 from typing import Any, Final
 from weakref import ref
@@ -196,7 +195,7 @@ class Episode:
             return
         if getcurrent() is not driver.caller:
             driver.enter()
-        binding = record.binding
+        binding: Any = record.binding
         try:
             if type(action) is int and binding.first <= action < binding.end and record.mask is None:
                 convert = binding.convert
@@ -218,18 +217,20 @@ class Episode:
                 resume = driver.resume
                 binding, args, kwargs = resume(reply)
                 record = self._swift.get(binding)
-                if record is not None and not kwargs and turns != self._max_turns:
-                    # The same as ``_take`` and ``_settle``, for what most decisions are.
+                if record is not None and turns != self._max_turns:
+                    # What ``_take`` and ``_settle`` do, for the calls of most models: of one argument, with
+                    # nothing but the mappings to be seen to.
                     self._latest = record
                     record._args, record._kwargs = args, kwargs
+                    (first,) = args
                     reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
-                    reward = reward_mapping(*args)
+                    reward = reward_mapping(first)
                     if type(reward) is not float:
                         reward = _number(reward)
-                    if not isfinite(reward):
+                    if reward - reward != 0.0:
                         raise _not_finite(record, reward)
                     record.reward = reward
-                    record.observation = cast(observe(*args))
+                    record.observation = cast(observe(first))
                     record.info = {}
                     self.pending = record
                     return
@@ -238,10 +239,9 @@ class Episode:
                     return
                 binding = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
         except BaseException as error:
+            binding = args = kwargs = first = None  # else the error would keep them alive
             self._fail(error)
             raise
-        finally:
-            binding = args = kwargs = None
 
     def nothing_pending(self) -> Exception:
         """The error that says why no action can be taken now."""
@@ -274,7 +274,7 @@ class Episode:
                 self._settle(record, args, kwargs)
         else:
             self._settle(record, args, kwargs)
-            if binding.agent is not None and binding.legal is None and not kwargs:
+            if binding.agent is not None and binding.legal is None and binding.point.alone:
                 self._swift[binding] = record
         self.pending = record
         return None
@@ -316,7 +316,7 @@ class Episode:
             reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
             if type(reward) is not float:
                 reward = _number(reward)
-            if not isfinite(reward):
+            if reward - reward != 0.0:
                 raise _not_finite(record, reward)
             record.reward = reward
         elif not last:

@@ -6,6 +6,7 @@ is abandoned in mid-episode goes at once and takes its session along.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 from zlib import crc32
 
@@ -83,16 +84,14 @@ class Session:
         return NotResetError("there is no episode yet; call reset() first")
 
     def render(self) -> Any:
-        """Render the simulation in the environment's render mode.
-
-        Raises:
-            OptionValueError: The environment was made without a render mode.
-        """
+        """Render the simulation in the environment's render mode; None, with a warning, where it has none."""
         mode = self.plan.options.render_mode
         if mode is None:
-            raise OptionValueError(
-                f"the environment has no render_mode; make it with one of {self.plan.render_modes or 'none'}"
+            warnings.warn(
+                f"render() without a render_mode shows nothing; the simulation's are {self.plan.render_modes}",
+                stacklevel=3,
             )
+            return None
         with unattended():
             return self.simulation.render(mode)
 

@@ -187,11 +187,12 @@ class DecisionPoint:
         rule: The function itself, which decides where nobody else does.
         definition: The latest definition, which the bare name means; None for a point that was named from
             outside and is a decision point for some environments alone.
+        alone: Whether every call has one argument, which is what it is called on.
         bound: Whether its first argument is what it is called on, which nobody passes by keyword.
         kind: "function", "generator" or "coroutine": what a call of it returns.
     """
 
-    __slots__ = ("__weakref__", "bound", "definition", "kind", "name", "rule")
+    __slots__ = ("__weakref__", "alone", "bound", "definition", "kind", "name", "rule")
 
     def __init__(
         self, rule: FunctionType, name: str | None = None, *, bound: bool, like: FunctionType | None = None
@@ -212,6 +213,8 @@ class DecisionPoint:
         self.bound = bound and "." in self.name.removeprefix(f"{rule.__module__}.").rpartition("<locals>.")[2]
         self.definition: Definition | None = None
         like = like or rule
+        parameters = list(inspect.signature(rule, follow_wrapped=False).parameters.values())
+        self.alone = self.bound and len(parameters) == 1 and _is_required(parameters[0])
         if inspect.isasyncgenfunction(like):
             raise PatchError(f"{self.name} is an async generator function, which cannot return a decision")
         if inspect.isgeneratorfunction(like):
@@ -352,9 +355,7 @@ def _generate(point: DecisionPoint, definition: Definition | None) -> FunctionTy
         "rule_as_passed": call("rule(*args, **kwargs)"),
         "ask": call(ask("args", "kwargs")),
     }
-    if not parameters or (
-        point.bound and len(parameters) == len(positional) == 1 and positional[0].default is positional[0].empty
-    ):
+    if point.alone or not parameters:
         template = _WITHOUT_ARGUMENTS
         values["ask"] = call(ask("(_0,)" if names else "()", "NOTHING"))
     elif positional and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
@@ -389,6 +390,11 @@ def _generate(point: DecisionPoint, definition: Definition | None) -> FunctionTy
     function: FunctionType = namespace["decide"]
     function.__code__ = function.__code__.replace(co_name=point.rule.__name__)  # what tracebacks show
     return function
+
+
+def _is_required(parameter: inspect.Parameter) -> bool:
+    positional = parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+    return positional and parameter.default is parameter.empty
 
 
 def _run_rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

@@ -1,0 +1,6 @@
+def plain_days():
+    return 1.0
+
+
+def environment_days():
+    return 1.0

@@ -1,0 +1,219 @@
+"""What the environments of this library are measured against: environments written by hand.
+
+The AEC environment has the bookkeeping of PettingZoo's documented template, the single one the parts of
+Gymnasium's (``_get_obs``, ``_get_info``); ``BareEnv`` has not even these. All of them are no-op simulations
+with an observation of four float32 and a reward of 1.0, which never end.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import AECEnv
+from pettingzoo.utils.agent_selector import AgentSelector
+
+OBSERVATION_SPACE = spaces.Box(-1.0, 1.0, (4,), np.float32)
+ACTION_SPACE = spaces.Discrete(2)
+
+
+class State:
+    """All there is in a no-op simulation."""
+
+    def __init__(self) -> None:
+        self.values = np.array([0.1, 0.2, 0.3, 0.4], np.float32)
+
+    def observe(self) -> NDArray[np.float32]:
+        return np.array(self.values)
+
+    def act(self, action: int) -> None:
+        """Do what an action says, which is nothing."""
+
+
+class TemplateAECEnv(AECEnv[str, Any, Any]):
+    """A no-op environment with the bookkeeping of PettingZoo's template."""
+
+    metadata = {"name": "template_v0", "render_modes": []}  # noqa: RUF012 - as the template has it
+
+    def __init__(self, agents: int = 2, rounds: int = 10**12) -> None:
+        super().__init__()
+        self.possible_agents = [f"agent_{number}" for number in range(agents)]
+        self.rounds = rounds
+        self.model = State()
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        return OBSERVATION_SPACE
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        return ACTION_SPACE
+
+    def observe(self, agent: str) -> NDArray[np.float32]:
+        return np.array(self.observations[agent])
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        self.agents = self.possible_agents[:]
+        self.rewards = dict.fromkeys(self.agents, 0.0)
+        self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
+        self.terminations = dict.fromkeys(self.agents, False)
+        self.truncations = dict.fromkeys(self.agents, False)
+        self.infos = {agent: {} for agent in self.agents}
+        self.state = dict.fromkeys(self.agents)  # type: ignore[assignment]
+        self.observations = dict.fromkeys(self.agents, self.model.values)
+        self.moves = 0
+        self._selector = AgentSelector(self.agents)
+        self.agent_selection = self._selector.next()
+
+    def step(self, action: Any) -> None:
+        agent = self.agent_selection
+        if self.terminations[agent] or self.truncations[agent]:
+            self._was_dead_step(action)
+            return
+        self._cumulative_rewards[agent] = 0.0
+        self.state[agent] = action  # type: ignore[index]
+        if self._selector.is_last():
+            for name in self.agents:
+                self.rewards[name] = 1.0
+            self.moves += 1
+            self.truncations = {name: self.moves >= self.rounds for name in self.agents}
+            for name in self.agents:
+                self.observations[name] = self.model.values
+        else:
+            self._clear_rewards()
+        self.agent_selection = self._selector.next()
+        self._accumulate_rewards()
+
+    def render(self) -> None:
+        """Nothing to be seen."""
+
+    def close(self) -> None:
+        """Nothing to be closed."""
+
+
+class TemplateEnv(gym.Env[Any, Any]):
+    """A no-op environment with the parts of Gymnasium's template."""
+
+    observation_space = OBSERVATION_SPACE
+    action_space = ACTION_SPACE
+
+    def __init__(self) -> None:
+        self.model = State()
+
+    def _get_obs(self) -> NDArray[np.float32]:
+        return self.model.observe()
+
+    def _get_info(self) -> dict[str, Any]:
+        return {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._get_obs(), self._get_info()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.model.act(action)
+        terminated = False
+        reward = 0.0 if terminated else 1.0
+        observation = self._get_obs()
+        info = self._get_info()
+        return observation, reward, terminated, False, info
+
+
+class BareEnv(TemplateEnv):
+    """The least that a Gymnasium environment can do."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.array(self.model.values), 1.0, False, False, {}
+
+
+# -- other ways to leave a simulation in the lead --------------------------------------------------
+
+
+class GeneratorEnv(TemplateEnv):
+    """The simulation is a generator that yields at its decisions: quick, but every frame above must, too."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self.simulation = self._run()
+        return next(self.simulation), {}
+
+    def _run(self) -> Iterator[Any]:
+        while True:
+            yield self.model.observe()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return self.simulation.send(action), 1.0, False, False, {}  # type: ignore[attr-defined]
+
+
+class ThreadEnv(TemplateEnv):
+    """The simulation runs in a thread and takes turns with its user."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self.over = False
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+        self._wait_for_simulation()
+        return self.observation, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.action = action
+        self._wake_simulation()
+        self._wait_for_simulation()
+        return self.observation, 1.0, False, False, {}
+
+    def _run(self) -> None:
+        while not self.over:
+            self.observation = self.model.observe()
+            self._wake_user()
+            self._wait_for_user()
+
+    def close(self) -> None:
+        self.over = True
+        self._wake_simulation()
+        self.thread.join()
+
+
+class EventEnv(ThreadEnv):
+    """Takes turns by two events, as the original does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.decided, self.arisen = threading.Event(), threading.Event()
+
+    def _wake_simulation(self) -> None:
+        self.decided.set()
+
+    def _wait_for_simulation(self) -> None:
+        self.arisen.wait()
+        self.arisen.clear()
+
+    def _wake_user(self) -> None:
+        self.arisen.set()
+
+    def _wait_for_user(self) -> None:
+        self.decided.wait()
+        self.decided.clear()
+
+
+class LockEnv(ThreadEnv):
+    """Takes turns by two locks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.decided, self.arisen = threading.Lock(), threading.Lock()
+        self.decided.acquire()
+        self.arisen.acquire()
+
+    def _wake_simulation(self) -> None:
+        self.decided.release()
+
+    def _wait_for_simulation(self) -> None:
+        self.arisen.acquire()
+
+    def _wake_user(self) -> None:
+        self.arisen.release()
+
+    def _wait_for_user(self) -> None:
+        self.decided.acquire()

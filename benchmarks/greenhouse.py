@@ -1,6 +1,104 @@
-def plain_days():
-    return 1.0
+"""The greenhouse of the examples with and without an environment: the same mappings, the same days."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from examples.greenhouse_coop.env import (
+    DAYS,
+    GreenhouseSim,
+    WateringEnv,
+    exchange_air,
+    observe,
+    raw_env,
+    reward,
+    to_litres,
+)
+from examples.greenhouse_coop.model import Greenhouse
+
+from benchmarks.measure import Contender
+
+WATER = np.array([0.065], np.float32)
+"""An action that keeps the plants alive for the whole episode, so that all of its days are alike."""
+
+AIR = np.array([0.2], np.float32)
 
 
-def environment_days():
-    return 1.0
+class PlainWatering(Greenhouse):
+    """Evaluates the waterer's mappings where an environment would, and decides by itself."""
+
+    def choose_water_amount(self) -> float:
+        reward(self)
+        observe(self)
+        return to_litres(WATER)
+
+
+class PlainCoop(PlainWatering):
+    """The same for both agents."""
+
+    def update_air_exchange(self) -> None:
+        reward(self)
+        observe(self)
+        exchange_air(AIR, self)
+
+
+class PlainSimulation(GreenhouseSim):
+    """The simulation's own loop over such a greenhouse."""
+
+    def __init__(self, model: type[Greenhouse]) -> None:
+        super().__init__()
+        self.model = model
+
+    def reset(self, seed: int | None = None) -> None:
+        super().reset(seed)
+        self.greenhouse = self.model(seed)
+
+
+def plain_days(model: type[Greenhouse]) -> Contender:
+    """Make a contender that runs an episode without an environment: microseconds per day."""
+    simulation = PlainSimulation(model)
+
+    def run() -> float:
+        simulation.reset(1)
+        start = time.perf_counter()
+        simulation.run()
+        return (time.perf_counter() - start) / DAYS * 1e6
+
+    return run
+
+
+def single_days() -> Contender:
+    """Make a contender that runs the same episode through the waterer's single environment."""
+    env: Any = WateringEnv()
+
+    def run() -> float:
+        env.reset(seed=1)
+        step = env.step
+        start = time.perf_counter()
+        truncated = False
+        while not truncated:
+            truncated = step(WATER)[3]
+        return (time.perf_counter() - start) / DAYS * 1e6
+
+    return run
+
+
+def aec_days() -> Contender:
+    """Make a contender that runs the same episode through the AEC environment of both agents."""
+    env: Any = raw_env()
+    actions = {"waterer_0": WATER, "ventilator_0": AIR}
+
+    def run() -> float:
+        env.reset(seed=1)
+        last, step = env.last, env.step
+        start = time.perf_counter()
+        for agent in env.agent_iter():
+            _, _, terminated, truncated, _ = last()
+            step(None if terminated or truncated else actions[agent])
+        elapsed = time.perf_counter() - start
+        assert env.simulation.greenhouse.day == DAYS
+        return elapsed / DAYS * 1e6
+
+    return run

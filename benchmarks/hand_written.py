@@ -79,7 +79,7 @@ class TemplateAECEnv(AECEnv[str, Any, Any]):
             for name in self.agents:
                 self.rewards[name] = 1.0
             self.moves += 1
-            self.truncations = {name: self.moves >= self.rounds for name in self.agents}
+            self.truncations = dict.fromkeys(self.agents, self.moves >= self.rounds)
             for name in self.agents:
                 self.observations[name] = self.model.values
         else:

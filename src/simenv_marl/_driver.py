@@ -32,6 +32,10 @@ RUNNING: dict[int, Ask] = {}
 """By thread: whom decision functions ask there. Touched by drivers and ``unattended`` alone."""
 
 
+EVALUATING: dict[int, dict[Any, Any]] = {}
+"""By thread: what differences remember for the agent whose mapping is being evaluated there."""
+
+
 class SimulationExit(BaseException):
     """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught."""
 
@@ -171,13 +175,24 @@ class GreenletDriver:
         del self._bindings, self._body, self._inside, self._switch_out, self.caller, self.resume
 
 
+def attended() -> bool:
+    """Whether a simulation, or a mapping, runs around us in this thread."""
+    thread = get_ident()
+    return thread in RUNNING or thread in EVALUATING
+
+
 @contextmanager
 def unattended() -> Iterator[None]:
-    """Let decision functions run their rule in this thread, whatever simulation runs around us."""
+    """Keep apart what runs in this thread from the simulation or mapping that runs around it.
+
+    Decision functions run their rule, and differences are asked for nobody, until an episode says otherwise.
+    """
     thread = get_ident()
-    outer = RUNNING.pop(thread, None)
+    ask, memory = RUNNING.pop(thread, None), EVALUATING.pop(thread, None)
     try:
         yield
     finally:
-        if outer is not None:
-            RUNNING[thread] = outer
+        if ask is not None:
+            RUNNING[thread] = ask
+        if memory is not None:
+            EVALUATING[thread] = memory

@@ -25,8 +25,6 @@ Views read the records of agents; none of them computes an observation or a rewa
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from threading import get_ident
 from typing import Any, Final
 from weakref import ref
@@ -35,9 +33,19 @@ import numpy as np
 from greenlet import getcurrent
 
 from . import _spaces
-from ._driver import FAILED, FINISHED, RUNNING, Driver, GreenletDriver, SimulationExit, unattended
+from ._driver import (
+    EVALUATING,
+    FAILED,
+    FINISHED,
+    RUNNING,
+    Driver,
+    GreenletDriver,
+    SimulationExit,
+    attended,
+    unattended,
+)
 from ._plan import Binding, Plan
-from .decision import DIFFERENCES, EVALUATING
+from .decision import DIFFERENCES
 from .errors import (
     AgentError,
     EpisodeOverError,
@@ -188,8 +196,7 @@ class Episode:
         record, driver = self.pending, self._driver
         if record is None or driver is None:
             raise self.nothing_pending()
-        if RUNNING and get_ident() in RUNNING:
-            # Inside another environment's simulation, and what runs on our side is none of its decisions.
+        if (RUNNING or EVALUATING) and attended():  # inside another environment's simulation
             with unattended():
                 self.turn(action)
             return
@@ -222,6 +229,8 @@ class Episode:
                     # nothing but the mappings to be seen to.
                     self._latest = record
                     record._args, record._kwargs = args, kwargs
+                    if self._remembering:
+                        EVALUATING[get_ident()] = record.memory
                     (first,) = args
                     reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
                     reward = reward_mapping(first)
@@ -231,6 +240,8 @@ class Episode:
                         raise _not_finite(record, reward)
                     record.reward = reward
                     record.observation = cast(observe(first))
+                    if self._remembering:
+                        del EVALUATING[get_ident()]
                     record.info = {}
                     self.pending = record
                     return
@@ -269,13 +280,9 @@ class Episode:
         if self.turns == self._max_turns:
             self._finish(truncated=True)
             return None
-        if self._remembering:
-            with _remembering(record):
-                self._settle(record, args, kwargs)
-        else:
-            self._settle(record, args, kwargs)
-            if binding.agent is not None and binding.legal is None and binding.point.alone:
-                self._swift[binding] = record
+        self._settle(record, args, kwargs)
+        if binding.agent is not None and binding.legal is None and binding.point.alone:
+            self._swift[binding] = record
         self.pending = record
         return None
 
@@ -299,8 +306,7 @@ class Episode:
         """Have a policy answer."""
         if record.policy is RULE:
             return RULE
-        with _remembering(record):
-            self._observe(record, args, kwargs)
+        self._observe(record, args, kwargs)
         action = record.policy(record.observation, record.info)
         if action is RULE:
             return RULE
@@ -312,6 +318,7 @@ class Episode:
         """Reward the agent's action before, then observe what it decides on now, or what it ended with."""
         binding = record.binding
         reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
+        EVALUATING[get_ident()] = record.memory
         if record.decided:
             reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
             if type(reward) is not float:
@@ -324,12 +331,14 @@ class Episode:
             record.decided = True
         if binding.legal is None:
             record.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
+            del EVALUATING[get_ident()]
             record.info = {}
         else:
             self._observe(record, args, kwargs, last=last)
 
     def _observe(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
         binding = record.binding
+        EVALUATING[get_ident()] = record.memory
         mask = choices = None
         info: dict[str, Any] = {}
         if binding.legal is not None:
@@ -341,6 +350,7 @@ class Episode:
                 mask = _spaces.open_mask(binding.definition.action_space)  # nothing is asked any more
             info[_spaces.MASK] = _spaces.duplicate(mask)
         record.observation = binding.observation(args, kwargs, mask)
+        del EVALUATING[get_ident()]
         record.mask, record.choices, record.info = mask, choices, info
 
     def _foresee(self) -> None:
@@ -355,8 +365,7 @@ class Episode:
                 if record is None or record.binding is not binding or record.decided:
                     continue
                 record._args, record._kwargs = tuple(args), {}
-                with _remembering(record):
-                    self._observe(record, tuple(args), {})
+                self._observe(record, tuple(args), {})
                 if binding.agent is None:
                     record.loosen()
 
@@ -379,14 +388,14 @@ class Episode:
             if arguments is None:  # it was never seen, or the model has let it go
                 record.reward, record.info = 0.0, {}
                 continue
-            with _remembering(record):
-                self._settle(record, *arguments, last=True)
+            self._settle(record, *arguments, last=True)
             record.forget()
         self.over, self.truncated, self.terminated = True, truncated, not truncated
 
     def _fail(self, error: BaseException) -> None:
         """End the episode for an error, which says where it came from."""
         self._annotate(error)
+        EVALUATING.pop(get_ident(), None)  # an error in a mapping has left it there
         self.pending, self.over = None, True
         for problem in self._unwind():
             error.add_note(f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
@@ -460,21 +469,6 @@ class Episode:
         if self._driver is not None:
             self._driver.forget()
             self._driver = None
-
-
-@contextmanager
-def _remembering(record: Record) -> Iterator[None]:
-    """Let differences know for whom they are asked."""
-    thread = get_ident()
-    outer = EVALUATING.get(thread)
-    EVALUATING[thread] = record.memory
-    try:
-        yield
-    finally:
-        if outer is None:
-            del EVALUATING[thread]
-        else:
-            EVALUATING[thread] = outer
 
 
 def _number(reward: Any) -> float:

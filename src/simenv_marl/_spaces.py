@@ -228,14 +228,19 @@ def _box_check(space: spaces.Box) -> Check:
     scalar, small = len(lows) == 1, len(lows) <= _SMALL
     kinds = "iu" if dtype.kind in "iu" else "iuf"
 
+    ndarray, first_low, first_high = np.ndarray, lows[0] if scalar else 0.0, highs[0] if scalar else -1.0
+
     def legal(array: NDArray[Any]) -> bool:
-        if small:
-            values = array.ravel().tolist()
-            return all(low <= value <= high for low, value, high in zip(lows, values, highs, strict=True))
-        return bool(((array >= space.low) & (array <= space.high)).all())
+        if not small:
+            return bool(((array >= space.low) & (array <= space.high)).all())
+        return all(low <= value <= high for low, value, high in zip(lows, array.ravel().tolist(), highs, strict=True))
 
     def check(action: Any) -> Any:
-        if type(action) is float and scalar and kinds == "iuf" and lows[0] <= action <= highs[0]:
+        if type(action) is ndarray and action.dtype is dtype and action.shape == shape:
+            if scalar:
+                return action.copy() if first_low <= action.item() <= first_high else ILLEGAL
+            return action.copy() if legal(action) else ILLEGAL
+        if type(action) is float and kinds == "iuf" and first_low <= action <= first_high:
             return action
         try:
             array = np.asarray(action)

@@ -20,7 +20,7 @@ from weakref import WeakSet, WeakValueDictionary
 
 from gymnasium import spaces
 
-from ._driver import RUNNING
+from ._driver import EVALUATING, RUNNING
 from .errors import DefinitionError, PatchError
 
 Mapped = Callable[..., Any]
@@ -402,9 +402,6 @@ def _run_rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any
 
 
 # -- differences ----------------------------------------------------------------------------------
-
-EVALUATING: dict[int, dict[Any, Any]] = {}
-"""By thread: what the differences of the agent whose mapping is being evaluated there remember."""
 
 DIFFERENCES: WeakSet[Difference] = WeakSet()
 """All differences. Where there is none, nobody needs to say whose mapping is being evaluated."""

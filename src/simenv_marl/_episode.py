@@ -204,7 +204,7 @@ class Episode:
             driver.enter()
         binding: Any = record.binding
         try:
-            if type(action) is int and binding.first <= action < binding.end and record.mask is None:
+            if type(action) is int and binding.first <= action < binding.end:
                 convert = binding.convert
                 reply = convert(action)
             elif action is RULE:

@@ -108,7 +108,7 @@ class Binding:
         deliver: In the simulation, turns the reply into what a call of the decision function returns; None
             where the reply is that.
         check: Checks an action against its space.
-        first, end: The first action of a ``Discrete``, and the one after its last; 0 and 0 for other spaces.
+        first, end: Which python integers are legal actions, whatever the call: from the first to before the end.
     """
 
     __slots__ = (
@@ -129,16 +129,17 @@ class Binding:
         self.check = _spaces.action_check(definition.action_space)
         self.convert = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
-        space, actions = definition.observation_space, definition.action_space
+        space = definition.observation_space
+        actions: Any = definition.action_space
         self._mask_in_observation = isinstance(space, spaces.Dict) and _spaces.MASK in space.spaces
-        self.first = self.end = 0
-        if isinstance(actions, spaces.Discrete):
-            self.first, self.end = int(actions.start), int(actions.start + actions.n)
         self.legal: Callable[..., tuple[Any, Any]] | None = None
         if definition.action_mask_mapping is not None:
             self.legal = partial(_masked, definition.action_mask_mapping, _spaces.mask_cast(actions))
         elif definition.choices is not None:
-            self.legal = partial(_chosen, definition.choices, self.end, named.point.name)
+            self.legal = partial(_chosen, definition.choices, int(actions.n), named.point.name)
+        self.first = self.end = 0
+        if isinstance(actions, spaces.Discrete) and self.legal is None:
+            self.first, self.end = int(actions.start), int(actions.start + actions.n)
 
     def observation(self, args: tuple[Any, ...], kwargs: dict[str, Any], mask: Any) -> Any:
         """The observation of a call whose legal actions are known."""

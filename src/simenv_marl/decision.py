@@ -11,6 +11,7 @@ from __future__ import annotations
 import inspect
 import sys
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
 from threading import get_ident
@@ -18,6 +19,7 @@ from types import FunctionType, MethodType
 from typing import Any, Final
 from weakref import WeakSet, WeakValueDictionary
 
+import numpy as np
 from gymnasium import spaces
 
 from ._driver import EVALUATING, RUNNING
@@ -64,8 +66,7 @@ class Definition:
             PatchError: ``function`` is none of these.
         """
         rule, binding = unbind(function)
-        known = point_of(rule)
-        point = known[0] if known else DecisionPoint(rule, bound=binding is not staticmethod)
+        point = DecisionPoint.of(unwrapped(rule), bound=binding is not staticmethod)
         wrapper = point.wrap(self)
         point.definition = self
         _REGISTRY[point.name] = point
@@ -178,6 +179,9 @@ def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[
 _REGISTRY: WeakValueDictionary[str, DecisionPoint] = WeakValueDictionary()
 """The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
 
+_BY_RULE: WeakValueDictionary[int, DecisionPoint] = WeakValueDictionary()
+"""The point of every rule, by the rule's identity. A point holds its rule, so that none outlives it."""
+
 
 class DecisionPoint:
     """One function of a model that decides something.
@@ -223,6 +227,18 @@ class DecisionPoint:
             self.kind = "coroutine"
         else:
             self.kind = "function"
+
+        _BY_RULE[id(rule)] = self
+
+    @classmethod
+    def of(cls, rule: FunctionType, name: str | None = None, *, bound: bool) -> DecisionPoint:
+        """The point of a rule, which is made where there is none yet.
+
+        Args:
+            rule: The function that decides.
+            name, bound: As when a point is made.
+        """
+        return _BY_RULE.get(id(rule)) or cls(rule, name, bound=bound)
 
     def __repr__(self) -> str:
         return f"<DecisionPoint {self.name}>"
@@ -422,7 +438,7 @@ class Difference:
         if memory is None:
             return 0.0
         before = memory.get(self, value)
-        memory[self] = value
+        memory[self] = copy(value) if isinstance(value, np.ndarray) else value  # which may change in place
         return value - before
 
 

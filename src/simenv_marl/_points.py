@@ -161,9 +161,11 @@ def _title(key: Any) -> str:
 def _resolve(name: str) -> tuple[Any, str]:
     """Find the class or module in which a dotted name ends, importing what must be imported."""
     parts = name.split(".")
+    if len(parts) < 2 or not all(parts):
+        raise _unknown(name, "a dotted name is needed, such as package.module.Class.function")
     module, rest = _longest_module(parts)
-    if module is None or not rest or not all(parts):
-        raise _unknown(name, f"there is no module {parts[0]!r}" if module is None else "it names no function")
+    if module is None:
+        raise _unknown(name, f"there is no module {parts[0]!r}")
     owner: Any = module
     for part in rest[:-1]:
         try:
@@ -276,7 +278,8 @@ class Site:
             PatchError: The place refuses, or something else has been set there meanwhile.
         """
         if self._users == 0:
-            if _held(self._owner, self._attribute) is not self._held:
+            there = vars(self._owner).get(self._attribute)
+            if there is not (None if self._inherited else self._held):
                 raise PatchError(f"{self._name} has been replaced since it was named as a decision point")
             self._set(self._held, self._wrapper)
         self._users += 1

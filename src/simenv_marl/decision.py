@@ -236,7 +236,8 @@ class DecisionPoint:
 
         Args:
             rule: The function that decides.
-            name, bound: As when a point is made.
+            name: As when a point is made.
+            bound: As when a point is made.
         """
         return _BY_RULE.get(id(rule)) or cls(rule, name, bound=bound)
 

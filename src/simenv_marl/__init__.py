@@ -9,6 +9,7 @@ The layers, each importing only from those above it::
     decision      make_step: definitions, decision points, decision functions
     _points       what ``points=`` names, and patches for what nobody has decorated
     _plan         what an environment is made of, checked before anything runs
+    _record       what an episode knows of one agent; rewards and observations
     _episode      what happens when: decisions, rewards, observations, ends, errors
     _session      a simulation over all episodes of one environment
     envs          views: an episode read as a PettingZoo or Gymnasium environment

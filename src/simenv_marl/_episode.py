@@ -27,12 +27,9 @@ from __future__ import annotations
 import warnings
 from threading import get_ident
 from typing import Any, Final
-from weakref import ref
 
-import numpy as np
 from greenlet import getcurrent
 
-from . import _spaces
 from ._driver import (
     EVALUATING,
     FAILED,
@@ -45,14 +42,13 @@ from ._driver import (
     unattended,
 )
 from ._plan import Binding, Plan
+from ._record import Record, not_finite, number
 from .decision import DIFFERENCES
 from .errors import (
     AgentError,
     EpisodeOverError,
-    MaskError,
     NoDecisionError,
     ReentrancyError,
-    RewardError,
     WrongThreadError,
 )
 from .simulation import RULE, TRUNCATED
@@ -62,68 +58,6 @@ UNWINDING_TRIES: Final = 8
 
 _given_up: list[Driver] = []
 """Simulations that refused to unwind: dropping them would resume them at some random moment."""
-
-
-class Record:
-    """What an episode knows of one agent.
-
-    Attributes:
-        agent: Its name.
-        binding: The decision point where it decides.
-        policy: Who answers for it; None: the environment's user.
-        decided: Whether it has decided in this episode.
-        observation: Its latest observation, cast to its space; None before it was ever observed.
-        reward: The reward of its action before, as of its latest decision or its end.
-        info: The info of its latest decision, a dict of its own.
-        mask, choices: The legal actions of its pending decision, where its point restricts them.
-        memory: What differences remember for it.
-    """
-
-    __slots__ = (
-        "_args", "_kwargs", "_weakly", "agent", "binding", "choices", "decided", "info", "mask", "memory",
-        "observation", "policy", "reward",
-    )  # fmt: skip
-
-    def __init__(self, agent: str, binding: Binding, policy: Any) -> None:
-        self.agent = agent
-        self.binding = binding
-        self.policy = policy
-        self.decided = False
-        self.observation: Any = None
-        self.reward = 0.0
-        self.info: dict[str, Any] = {}
-        self.mask: Any = None
-        self.choices: Any = None
-        self.memory: dict[Any, Any] = {}
-        self._args: tuple[Any, ...] | None = None
-        self._kwargs: dict[str, Any] = {}
-        self._weakly: Any = None
-
-    def loosen(self) -> None:
-        """Keep the first argument weakly from now on, so that the model can let go of an entity."""
-        args = self._args
-        if args:
-            first = args[0]
-            if self._weakly is None or self._weakly() is not first:
-                try:
-                    self._weakly = ref(first)
-                except TypeError:  # cannot be held weakly
-                    self._weakly = None
-                    return
-            self._args = (self._weakly, *args[1:])
-
-    def arguments(self) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
-        """The arguments of the latest decision; None where there are none any more."""
-        args = self._args
-        if args and self._weakly is not None and args[0] is self._weakly:
-            first = self._weakly()
-            return None if first is None else ((first, *args[1:]), self._kwargs)
-        return None if args is None else (args, self._kwargs)
-
-    def forget(self) -> None:
-        """Let go of the arguments; the agent has no more to observe."""
-        self._args = self._weakly = None
-        self._kwargs = {}
 
 
 class Episode:
@@ -225,7 +159,7 @@ class Episode:
                 binding, args, kwargs = resume(reply)
                 record = self._swift.get(binding)
                 if record is not None and turns != self._max_turns:
-                    # What ``_take`` and ``_settle`` do, for the calls of most models: of one argument, with
+                    # What ``_take`` and ``Record.settle`` do, for the calls of most models: of one argument, with
                     # nothing but the mappings to be seen to.
                     self._latest = record
                     record._args, record._kwargs = args, kwargs
@@ -235,9 +169,9 @@ class Episode:
                     reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
                     reward = reward_mapping(first)
                     if type(reward) is not float:
-                        reward = _number(reward)
+                        reward = number(reward)
                     if reward - reward != 0.0:
-                        raise _not_finite(record, reward)
+                        raise not_finite(record, reward)
                     record.reward = reward
                     record.observation = cast(observe(first))
                     if self._remembering:
@@ -280,7 +214,7 @@ class Episode:
         if self.turns == self._max_turns:
             self._finish(truncated=True)
             return None
-        self._settle(record, args, kwargs)
+        record.settle(args, kwargs)
         if binding.agent is not None and binding.legal is None and binding.point.alone:
             self._swift[binding] = record
         self.pending = record
@@ -306,52 +240,11 @@ class Episode:
         """Have a policy answer."""
         if record.policy is RULE:
             return RULE
-        self._observe(record, args, kwargs)
+        record.observe(args, kwargs)
         action = record.policy(record.observation, record.info)
         if action is RULE:
             return RULE
         return record.binding.reply(action, record.agent, record.mask, record.choices)
-
-    # -- rewards and observations -----------------------------------------------------------------
-
-    def _settle(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
-        """Reward the agent's action before, then observe what it decides on now, or what it ended with."""
-        binding = record.binding
-        reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
-        EVALUATING[get_ident()] = record.memory
-        if record.decided:
-            reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-            if type(reward) is not float:
-                reward = _number(reward)
-            if reward - reward != 0.0:
-                raise _not_finite(record, reward)
-            record.reward = reward
-        elif not last:
-            reward_mapping(*args, **kwargs)  # nothing was done yet that could be rewarded
-            record.decided = True
-        if binding.legal is None:
-            record.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
-            del EVALUATING[get_ident()]
-            record.info = {}
-        else:
-            self._observe(record, args, kwargs, last=last)
-
-    def _observe(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
-        binding = record.binding
-        EVALUATING[get_ident()] = record.memory
-        mask = choices = None
-        info: dict[str, Any] = {}
-        if binding.legal is not None:
-            try:
-                mask, choices = binding.legal(args, kwargs)
-            except MaskError:
-                if not last:
-                    raise
-                mask = _spaces.open_mask(binding.definition.action_space)  # nothing is asked any more
-            info[_spaces.MASK] = _spaces.duplicate(mask)
-        record.observation = binding.observation(args, kwargs, mask)
-        del EVALUATING[get_ident()]
-        record.mask, record.choices, record.info = mask, choices, info
 
     def _foresee(self) -> None:
         """Observe agents before their first decision, where the simulation knows the calls to come."""
@@ -365,7 +258,7 @@ class Episode:
                 if record is None or record.binding is not binding or record.decided:
                     continue
                 record._args, record._kwargs = tuple(args), {}
-                self._observe(record, tuple(args), {})
+                record.observe(tuple(args), {})
                 if binding.agent is None:
                     record.loosen()
 
@@ -388,7 +281,7 @@ class Episode:
             if arguments is None:  # it was never seen, or the model has let it go
                 record.reward, record.info = 0.0, {}
                 continue
-            self._settle(record, *arguments, last=True)
+            record.settle(*arguments, last=True)
             record.forget()
         self.over, self.truncated, self.terminated = True, truncated, not truncated
 
@@ -469,17 +362,6 @@ class Episode:
         if self._driver is not None:
             self._driver.forget()
             self._driver = None
-
-
-def _number(reward: Any) -> float:
-    try:
-        return float(reward.item() if isinstance(reward, np.ndarray) else reward)
-    except (TypeError, ValueError):
-        raise RewardError(f"the reward {reward!r} is not one number") from None
-
-
-def _not_finite(record: Record, reward: float) -> RewardError:
-    return RewardError(f"the reward of {record.agent!r} is {reward}, which is not finite")
 
 
 def _is_exit(error: BaseException | None) -> bool:

@@ -11,8 +11,9 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from pettingzoo import AECEnv
 
-from .._episode import Episode, Record
+from .._episode import Episode
 from .._plan import Plan
+from .._record import Record
 from .._session import Session, checked_seed, seed_space
 from .._spaces import blank, duplicate
 from ..errors import InvalidActionError, UnknownAgentError

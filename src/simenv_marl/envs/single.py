@@ -8,8 +8,9 @@ from typing import Any
 
 import gymnasium as gym
 
-from .._episode import Episode, Record
+from .._episode import Episode
 from .._plan import Plan
+from .._record import Record
 from .._session import Session, checked_seed, seed_space
 from ..errors import ViewError
 

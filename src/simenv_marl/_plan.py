@@ -328,7 +328,7 @@ def _assign(
             try:
                 point = find_point(key)
             except SimEnvError as error:
-                if isinstance(key, str) and "." not in key and None in agents:
+                if isinstance(key, str) and isinstance(error, UnknownPointError) and None in agents:
                     by_agent[key] = policy  # an agent that a callable may name
                     continue
                 names = sorted([a for a in agents if a] + [p.point.name for p in named])

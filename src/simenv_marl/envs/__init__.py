@@ -40,7 +40,7 @@ def generate_env(
     plan = Plan.draw_up(simulation, points, options)
     if view is None:
         view = "single" if plan.possible_agents is not None and len(plan.possible_agents) == 1 else "aec"
-    if view not in VIEWS:
+    if not isinstance(view, str) or view not in VIEWS:
         raise OptionValueError(f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {view!r}")
     base: Any = VIEWS[view]
     base.check(plan)

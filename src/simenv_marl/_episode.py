@@ -152,6 +152,8 @@ class Episode:
         self.turns = turns = self.turns + 1
         if binding.agent is None:
             record.loosen()
+        if record.choices is not None:
+            record.choices = None
         try:
             while True:
                 # Functions are fetched from attributes before they are called: calling them there is slower.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Real
 from threading import get_ident
 from typing import Any
 from weakref import ref
@@ -133,10 +134,13 @@ def number(reward: Any) -> float:
     Raises:
         RewardError: It is not one number.
     """
+    value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
+    if not isinstance(value, (Real, np.bool_)):
+        raise RewardError(f"the reward {reward!r} is not one number")
     try:
-        return float(reward.item() if isinstance(reward, np.ndarray) else reward)
-    except (TypeError, ValueError):
-        raise RewardError(f"the reward {reward!r} is not one number") from None
+        return float(value)
+    except OverflowError:
+        raise RewardError(f"the reward {reward!r} is too large for a float") from None
 
 
 def not_finite(record: Record, reward: float) -> RewardError:

@@ -1,0 +1,41 @@
+"""Configuration of the documentation; ``make docs`` builds it into ``docs/_build``."""
+
+from docutils import nodes
+
+from simenv_marl import __version__
+
+project = "simenv_marl"
+release = __version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+myst_enable_extensions = ["deflist"]
+myst_heading_anchors = 3
+
+add_module_names = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
+napoleon_attr_annotations = False
+napoleon_numpy_docstring = False
+python_use_unqualified_type_names = True
+
+html_theme = "furo"
+html_title = f"simenv_marl {release}"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
+html_copy_source = False
+html_theme_options = {"top_of_page_buttons": []}
+
+
+def _trim(app, doctree):
+    """Drop the empty lines that doctest needs at the end of examples."""
+    for block in doctree.findall(nodes.literal_block):
+        text = block.astext().rstrip()
+        block.rawsource = text
+        block[:] = [nodes.Text(text)]
+
+
+def setup(app):
+    """Called by Sphinx."""
+    app.connect("doctree-read", _trim)

@@ -86,13 +86,36 @@ def find_point(key: Any, definition: Any = None) -> NamedPoint:
     """
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(f"the definition of {_title(key)} must come from make_step, not {definition!r}")
+    point, own, site = locate(key)
+    definition = definition or own or point.definition
+    if definition is None:
+        raise DefinitionError(
+            f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="
+            f"{{{point.name!r}: make_step(...)}}"
+        )
+    return NamedPoint(point, definition, site)
+
+
+def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
+    """Find the point of a function, whether it has a definition or not.
+
+    Args:
+        key: A dotted name, or a function.
+
+    Returns:
+        The point; the definition that the function itself was decorated with; its site, if it needs one.
+
+    Raises:
+        UnknownPointError: The name leads to nothing.
+        PatchError: It leads to something that cannot be patched.
+    """
     if isinstance(key, str):
-        return _find_name(key, definition)
+        point = registered(key)
+        return (point, None, Site.of(point)) if point is not None else _look_at(key, *_resolve(key))
     function, _ = unbind(key)
     known = point_of(function)
     if known is not None:
-        point, own = known
-        return _named(point, definition or own or point.definition)
+        return (*known, Site.of(known[0]))
     name = f"{function.__module__}.{function.__qualname__}"
     owner: Any
     if "<locals>" in name:
@@ -101,41 +124,25 @@ def find_point(key: Any, definition: Any = None) -> NamedPoint:
         owner, attribute = _resolve(name)
     if unbind(_held(owner, attribute))[0] is not function:
         raise PatchError(f"{function!r} is not what is found under its name {name}; name it where it is found")
-    return _at_site(name, owner, attribute, definition)
+    return _look_at(name, owner, attribute)
 
 
-def _find_name(name: str, definition: Definition | None) -> NamedPoint:
-    point = registered(name)
-    if point is not None:
-        return _named(point, definition or point.definition)
-    owner, attribute = _resolve(name)
-    return _at_site(name, owner, attribute, definition)
-
-
-def _at_site(name: str, owner: Any, attribute: str, definition: Definition | None) -> NamedPoint:
+def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
     held = _held(owner, attribute)
     known = point_of(held.__func__ if isinstance(held, (staticmethod, classmethod)) else held)
     if known is not None and attribute in vars(owner):
-        point, own = known
-        return _named(point, definition or own or point.definition)
-    if known is not None:  # decorated in a base class
-        definition = definition or known[1] or known[0].definition
+        return (*known, Site.of(known[0]))
     site = Site.at(name, owner, attribute)
-    if definition is None:
-        raise DefinitionError(
-            f"{name} is no decision point: decorate it with make_step, or give its definition in points="
-            f"{{{name!r}: make_step(...)}}"
-        )
-    return NamedPoint(site.point, definition, site)
+    return site.point, (known[1] or known[0].definition) if known else None, site  # decorated in a base class
 
 
-def _named(point: DecisionPoint, definition: Definition | None) -> NamedPoint:
-    site = Site.of(point)
-    if definition is None:
-        raise DefinitionError(
-            f"{point.name} has no definition of its own here: give one in points={{{point.name!r}: make_step(...)}}"
-        )
-    return NamedPoint(point, definition, site)
+def owner_class(point: DecisionPoint) -> type | None:
+    """The class that a point is a method of; None where it is none, or is not to be found by its name."""
+    try:
+        owner, _ = _resolve(point.name)
+    except (UnknownPointError, PatchError):
+        return None
+    return owner if isinstance(owner, type) else None
 
 
 def _all_registered() -> list[str]:

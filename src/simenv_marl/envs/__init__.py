@@ -39,7 +39,7 @@ def generate_env(
     """
     plan = Plan.draw_up(simulation, points, options)
     if view is None:
-        view = "single" if plan.possible_agents is not None and len(plan.possible_agents) == 1 else "aec"
+        view = "single" if len(plan.active) == 1 and plan.active[0].agent is not None else "aec"
     if not isinstance(view, str) or view not in VIEWS:
         raise OptionValueError(f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {view!r}")
     base: Any = VIEWS[view]

@@ -49,8 +49,7 @@ class SimulationEnv(gym.Env[Any, Any]):
         Raises:
             ViewError: It does not.
         """
-        agents = plan.possible_agents
-        if agents is None or len(agents) != 1:
+        if len(plan.active) != 1 or plan.active[0].agent is None:
             points = ", ".join(binding.point.name for binding in plan.active)
             raise ViewError(
                 "the single view needs one active decision point, whose agent has a name of its own; active are"

@@ -280,7 +280,8 @@ class Episode:
         action = record.policy(record.observation, record.info)
         if action is RULE:
             return RULE
-        return record.binding.reply(action, record.agent, record.mask, record.choices)
+        choices, record.choices = record.choices, None
+        return record.binding.reply(action, record.agent, record.mask, choices)
 
     # -- rounds -----------------------------------------------------------------------------------
 

@@ -201,12 +201,13 @@ class Removal:
         deliver: None; the call always runs the function.
     """
 
-    __slots__ = ("deliver", "of", "point")
+    __slots__ = ("of", "point")
+
+    deliver = None
 
     def __init__(self, point: DecisionPoint) -> None:
         self.point = point
         self.of: list[tuple[Binding, Callable[..., Any] | None, type | None]] = []
-        self.deliver = None
 
     def agents(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Iterator[tuple[Binding, Any]]:
         """The agents that a call ends, with their bindings."""
@@ -315,9 +316,7 @@ class Plan:
                 point, _, site = locate(name)
                 removal = self.bindings.setdefault(point, Removal(point))
                 if not isinstance(removal, Removal):
-                    raise DefinitionError(
-                        f"{name} cannot both be decided by an agent and, as removed_by says, end one"
-                    )
+                    raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
                 removal.of.append((binding, agent, owner_class(binding.point)))
                 if site is not None and site not in self.sites:
                     self.sites.append(site)

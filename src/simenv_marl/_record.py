@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from numbers import Real
 from threading import get_ident
 from typing import Any
 from weakref import ref
@@ -35,8 +36,8 @@ class Record:
     """
 
     __slots__ = (
-        "_args", "_kwargs", "_now", "_time", "_weakly", "acted", "agent", "binding", "choices", "clock", "decided", "ended", "followed_up", "info", "mask", "memory",
-        "observation", "policy", "reward",
+        "_args", "_kwargs", "_now", "_time", "_weakly", "acted", "agent", "binding", "choices", "clock", "decided",
+        "ended", "followed_up", "info", "mask", "memory", "observation", "policy", "reward",
     )  # fmt: skip
 
     def __init__(self, agent: str, binding: Binding, policy: Any, clock: Callable[[], float] | None) -> None:
@@ -47,7 +48,7 @@ class Record:
         self.decided = self.acted = self.ended = False
         self._time: float | None = None
         self._now: float | None = None
-        self.followed_up = binding.agent is None or clock is not None
+        self.followed_up = binding.agent is None or clock is not None or binding.definition.choices is not None
         self.observation: Any = None
         self.reward = 0.0
         self.info: dict[str, Any] = {}
@@ -60,7 +61,7 @@ class Record:
 
     def follow_up(self) -> None:
         """See to what is to be done when its decision is answered, if ``followed_up``."""
-        self._time = self._now
+        self._time, self.choices = self._now, None
         if self.binding.agent is None:
             self.loosen()
 
@@ -176,10 +177,13 @@ def number(reward: Any) -> float:
     Raises:
         RewardError: It is not one number.
     """
+    value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
+    if not isinstance(value, (Real, np.bool_)):
+        raise RewardError(f"the reward {reward!r} is not one number")
     try:
-        return float(reward.item() if isinstance(reward, np.ndarray) else reward)
-    except (TypeError, ValueError):
-        raise RewardError(f"the reward {reward!r} is not one number") from None
+        return float(value)
+    except OverflowError:
+        raise RewardError(f"the reward {reward!r} is too large for a float") from None
 
 
 def not_finite(record: Record, reward: float) -> RewardError:

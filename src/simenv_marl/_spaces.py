@@ -101,12 +101,13 @@ def _discrete_cast(space: spaces.Discrete) -> Cast:
     def cast(value: Any) -> Any:
         if type(value) is kind:
             return value
-        try:
-            number = kind(value)
-            if number == value:
-                return number
-        except (TypeError, ValueError, OverflowError):
-            pass
+        if np.ndim(value) == 0:
+            try:
+                number = kind(value)
+                if number == value:
+                    return number
+            except (TypeError, ValueError, OverflowError):
+                pass
         raise ObservationError(f"the observation {value!r} is no integer for {space}")
 
     return cast
@@ -184,8 +185,8 @@ def blank(space: spaces.Space[Any]) -> Any:
 def action_check(space: spaces.Space[Any]) -> Check:
     """Make the function that checks actions against a space.
 
-    Integers for a ``Discrete`` come out as python integers, arrays for a ``Box`` as copies in the space's
-    dtype, and a scalar for a one-element ``Box`` as it went in.
+    Integers for a ``Discrete`` come out as python integers, a scalar for a one-element ``Box`` as it went in,
+    and all else as copies, for a ``Box`` in its dtype.
 
     Args:
         space: The action space, of any kind.
@@ -200,7 +201,7 @@ def action_check(space: spaces.Space[Any]) -> Check:
 
     def check(action: Any) -> Any:
         try:
-            return action if space.contains(action) else ILLEGAL
+            return duplicate(action) if space.contains(action) else ILLEGAL
         except Exception:  # a space may choke on what is none of its elements
             return ILLEGAL
 
@@ -214,7 +215,7 @@ def _discrete_check(space: spaces.Discrete) -> Check:
         if type(action) is not int:
             if isinstance(action, np.ndarray) and action.shape == ():
                 action = action[()]
-            if not isinstance(action, (int, np.integer)):
+            if not isinstance(action, (int, np.integer, np.bool_)):
                 return ILLEGAL
             action = int(action)
         return action if low <= action < high else ILLEGAL

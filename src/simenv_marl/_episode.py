@@ -103,10 +103,11 @@ class Episode:
         self._latest: Record | None = None
         self._plan, self._simulation, self._seed = plan, simulation, seed
         self._max_turns = plan.options.max_steps or -1  # never reached
+        self._failed_in_model = False
         self._remembering = bool(DIFFERENCES)
         self._rounds = rounds
         self._clock = getattr(simulation, "time", None)
-        for agent, binding in plan.roster.items():
+        for agent, binding in () if plan.unanswered else plan.roster.items():
             self.agents[agent] = Record(agent, binding, None, self._clock)
         self._driver: Driver | None = GreenletDriver(simulation.run, plan.bindings)
         with unattended():
@@ -121,7 +122,7 @@ class Episode:
             except BaseException as error:
                 self._fail(error)
                 raise
-        if self.pending is None:
+        if self.pending is None and not plan.unanswered:
             raise NoDecisionError(
                 f"{type(simulation).__name__}.run() came to its end without a decision of"
                 f" {', '.join(binding.point.name for binding in plan.active)}; does the simulation call the"
@@ -215,8 +216,9 @@ class Episode:
         if type(binding) is not Binding:
             if type(binding) is Removal:
                 return self._release(binding, args, kwargs)
-            self._end(binding, args)
-            return None
+            result = [args]
+            args = None  # this frame must not hold an error that is about to have it in its traceback
+            return self._end(binding, result)
         agent = binding.agent
         if agent is None:
             agent = binding.name_agent(*args, **kwargs)
@@ -253,7 +255,9 @@ class Episode:
                     " a name of its own, and removed_by= name what really ends it"
                 )
             policy = binding.policy or self._plan.policies.get(agent)
-            if policy is None and self._plan.complete:
+            if policy is None and self._plan.unanswered:
+                policy = RULE
+            elif policy is None and self._plan.complete:
                 policy = self._undeclared(agent, binding)
             record = Record(agent, binding, policy, self._clock)
             (self.agents if policy is None else self._answered)[agent] = record
@@ -282,6 +286,10 @@ class Episode:
             return RULE
         choices, record.choices = record.choices, None
         return record.binding.reply(action, record.agent, record.mask, choices)
+
+    def record(self, agent: str) -> Record | None:
+        """What is known of an agent of the environment, whether it lives or is gone."""
+        return self.agents.get(agent) or self.gone.get(agent)
 
     # -- rounds -----------------------------------------------------------------------------------
 
@@ -400,14 +408,16 @@ class Episode:
 
     # -- ends -------------------------------------------------------------------------------------
 
-    def _end(self, kind: Any, value: Any) -> None:
+    def _end(self, kind: Any, result: list[Any]) -> None:
         """The simulation's ``run`` has returned or failed."""
         self._let_go_of_driver()
+        value = result.pop()
         if kind is FAILED:
+            self._failed_in_model = True
             try:
                 raise value
             finally:
-                del value  # else the error, its traceback and this frame would hold each other
+                del value
         self._finish(truncated=value is TRUNCATED)
 
     def _release(self, removal: Removal, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
@@ -451,7 +461,9 @@ class Episode:
         if record is None:
             where = "before the first decision"
         else:
-            where = f"decision {self.turns + 1}, of {record.agent!r} at {record.binding.point.name}"
+            number = self.turns if self._failed_in_model else self.turns + 1
+            where = "in the model, after" if self._failed_in_model else "at"
+            where += f" decision {number}, of {record.agent!r} at {record.binding.point.name}"
         error.add_note(f"simenv_marl: {where}; seed {self._seed}")
 
     def close(self) -> None:

@@ -56,6 +56,7 @@ class Options:
             decision point (dotted name or decision function), to a callable of the observation, or of the
             observation and the info, that returns an action. ``RULE`` in place of the callable stands for the
             model's own rule.
+        flatten: Whether the joint view has one vector in place of dicts.
         state_space: The space of the environment's ``state()``; None: whatever the simulation's is.
         render_mode: What ``render`` returns; one of the simulation's ``render_modes``.
     """
@@ -65,6 +66,7 @@ class Options:
     undeclared: str = "error"
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
+    flatten: bool = False
     state_space: spaces.Space[Any] | None = None
     render_mode: str | None = None
 
@@ -274,10 +276,19 @@ class Plan:
         policies: By name: who answers the decisions of agents that are no agents of the environment.
         roster: By name: the agents that are known beforehand, in the order of the points.
         complete: Whether no others may join.
+        unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
         sites: Where decision functions must be set while the environment is in use.
     """
 
-    def __init__(self, source: Any, named: list[NamedPoint], options: Options, render_modes: list[str]) -> None:
+    def __init__(
+        self,
+        source: Any,
+        named: list[NamedPoint],
+        options: Options,
+        render_modes: list[str],
+        *,
+        unanswered: bool = False,
+    ) -> None:
         self.source, self.options, self._named = source, options, named
         self.render_modes = render_modes
         if options.render_mode is not None and options.render_mode not in render_modes:
@@ -299,7 +310,8 @@ class Plan:
         self.active = active
         self.sites: list[Site] = [point.site for point in everything if point.site is not None]
         self._find_removals()
-        if not active:
+        self.unanswered = unanswered
+        if not active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
         self.roster, self.complete = _call_the_roll(active, options.possible_agents)
         self.roster = {name: binding for name, binding in self.roster.items() if name not in self.policies}
@@ -322,13 +334,14 @@ class Plan:
                     self.sites.append(site)
 
     @classmethod
-    def draw_up(cls, source: Any, points: Any, options: Mapping[str, Any]) -> Plan:
+    def draw_up(cls, source: Any, points: Any, options: Mapping[str, Any], *, unanswered: bool = False) -> Plan:
         """Make a plan of what users say.
 
         Args:
             source: A simulation, its class or a factory.
             points: The active decision points, as ``generate_env`` takes them.
             options: The options, by name.
+            unanswered: Whether there is no environment's user.
 
         Raises:
             SimEnvError: Something in them cannot work; the leaf says what.
@@ -339,7 +352,21 @@ class Plan:
         if plain_factory or (points is None and getattr(source, "points", None) is None):
             model = make_simulation(source)
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
-        return cls(source, find_points(points, model), checked, list(modes))
+        named = [] if unanswered and points == () else find_points(points, model)
+        return cls(source, named, checked, list(modes), unanswered=unanswered)
+
+    def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
+        """The same plan, with another definition of a point."""
+        named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
+        return Plan(self.source, named, self.options, self.render_modes)
+
+    def declared(self, roster: Mapping[str, Binding]) -> Plan:
+        """The same plan, with a roster of agents that has been found out."""
+        names: dict[str, list[str]] = {b.point.name: [] for b in self.active if b.agent is None}
+        for agent, binding in roster.items():
+            if binding.agent is None:
+                names[binding.point.name].append(agent)
+        return self.amended({"possible_agents": names})
 
     @property
     def name(self) -> str:

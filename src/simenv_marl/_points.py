@@ -110,21 +110,41 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
         PatchError: It leads to something that cannot be patched.
     """
     if isinstance(key, str):
-        point = registered(key)
-        return (point, None, Site.of(point)) if point is not None else _look_at(key, *_resolve(key))
+        return _locate_name(key)
     function, _ = unbind(key)
     known = point_of(function)
     if known is not None:
         return (*known, Site.of(known[0]))
     name = f"{function.__module__}.{function.__qualname__}"
     owner: Any
-    if "<locals>" in name:
-        owner, attribute = _owner_of_local(function), function.__name__
-    else:
+    try:
         owner, attribute = _resolve(name)
-    if unbind(_held(owner, attribute))[0] is not function:
-        raise PatchError(f"{function!r} is not what is found under its name {name}; name it where it is found")
+        found = unbind(_held(owner, attribute))[0] is function
+    except (UnknownPointError, PatchError):
+        found = False
+    if not found:  # the function is at hand, though not by its name
+        owner, attribute = _owner_at_hand(function), function.__name__
     return _look_at(name, owner, attribute)
+
+
+def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
+    point = registered(name)
+    try:
+        owner, attribute = _resolve(name)
+    except (UnknownPointError, PatchError):
+        if point is None:
+            raise
+        return point, None, Site.of(point)  # decorated inside a function, or not yet where it will be found
+    found = _look_at(name, owner, attribute) if point is None or _is_decided(owner, attribute) else None
+    if found is None or found[0] is point:
+        assert point is not None
+        return point, None, Site.of(point)
+    return found[0], found[0].definition or found[1], found[2]
+
+
+def _is_decided(owner: Any, attribute: str) -> bool:
+    held = _held(owner, attribute)
+    return point_of(held.__func__ if isinstance(held, (staticmethod, classmethod)) else held) is not None
 
 
 def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
@@ -209,15 +229,16 @@ def _unknown(name: str, why: str) -> UnknownPointError:
     return UnknownPointError(f"the decision point {name!r} is not to be found: {why}{hint}")
 
 
-def _owner_of_local(function: FunctionType) -> type:
-    """Find the class that holds a function which was defined inside another function."""
+def _owner_at_hand(function: FunctionType) -> type:
+    """Find the class that holds a function which is not found by its name, as inside another function."""
     for namespace in gc.get_referrers(function):
         if isinstance(namespace, dict) and namespace.get(function.__name__) is function:
             for owner in gc.get_referrers(namespace):
                 if isinstance(owner, type) and vars(owner).get(function.__name__) is function:
                     return owner
     raise PatchError(
-        f"{function.__qualname__} is local to a function and cannot be found by its name; decorate it with make_step"
+        f"{function.__module__}.{function.__qualname__} is not what is found under that name, nor in any class;"
+        " name it where it is found, or decorate it with make_step"
     )
 
 

@@ -64,8 +64,8 @@ class Definition:
                 classmethod, or any of these as an attribute of its class.
 
         Returns:
-            The decision function, in the same binding as ``function``: what goes in as a staticmethod or
-            classmethod comes out as one.
+            The decision function, bound as ``function`` was; what goes in as a staticmethod or classmethod
+            comes out as one.
 
         Raises:
             PatchError: ``function`` is none of these.

@@ -12,13 +12,27 @@ The layers, each importing only from those above it::
     _record       what an episode knows of one agent; rewards and observations
     _episode      what happens when: decisions, rewards, observations, ends, errors
     _session      a simulation over all episodes of one environment
+    policies      policies back in the model's own loop
     envs          views: an episode read as a PettingZoo or Gymnasium environment
+    registration  into the registries of Gymnasium and PettingZoo
 """
 
 from . import errors
 from .decision import Definition, difference, make_step
-from .envs import SimulationAECEnv, SimulationEnv, aec_env, generate_env, single_env
+from .envs import (
+    SimulationAECEnv,
+    SimulationEnv,
+    SimulationJointEnv,
+    SimulationParallelEnv,
+    aec_env,
+    generate_env,
+    joint_env,
+    parallel_env,
+    single_env,
+)
 from .errors import *  # noqa: F403 - the whole tree is public
+from .policies import simulate
+from .registration import register_simulation
 from .simulation import RULE, TRUNCATED, SimulationInterface
 
 __version__ = "0.1.0"
@@ -30,11 +44,17 @@ __all__ = [
     "SimulationAECEnv",
     "SimulationEnv",
     "SimulationInterface",
+    "SimulationJointEnv",
+    "SimulationParallelEnv",
     "aec_env",
     "difference",
     "errors",
     "generate_env",
+    "joint_env",
     "make_step",
+    "parallel_env",
+    "register_simulation",
+    "simulate",
     "single_env",
 ]
 __all__ += errors.__all__

@@ -40,14 +40,12 @@ class SimulationExit(BaseException):
     """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught."""
 
 
-class Binding(Protocol):
-    """What a driver needs of a decision point under an environment's definition.
+class Bound(Protocol):
+    """What a driver needs of a function under an environment's definition."""
 
-    Attributes:
-        deliver: Turns a reply and the call's arguments into what the call returns; None: the reply is that.
-    """
-
-    deliver: Callable[..., Any] | None
+    @property
+    def deliver(self) -> Callable[..., Any] | None:
+        """Turns a reply and the call's arguments into what the call returns; None: the reply is that."""
 
 
 FINISHED: Final = Sentinel("FINISHED")
@@ -89,7 +87,7 @@ class GreenletDriver:
 
     __slots__ = ("_ask", "_bindings", "_body", "_inside", "_switch_out", "_thread", "caller", "resume")
 
-    def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Binding]) -> None:
+    def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Bound]) -> None:
         """Prepare a greenlet; the first ``resume`` starts it.
 
         Args:

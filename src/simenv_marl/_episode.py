@@ -25,6 +25,7 @@ Views read the records of agents; none of them computes an observation or a rewa
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from threading import get_ident
 from typing import Any, Final
 
@@ -41,7 +42,7 @@ from ._driver import (
     attended,
     unattended,
 )
-from ._plan import Binding, Plan
+from ._plan import Binding, Plan, Removal
 from ._record import Record, not_finite, number
 from .decision import DIFFERENCES
 from .errors import (
@@ -49,12 +50,15 @@ from .errors import (
     EpisodeOverError,
     NoDecisionError,
     ReentrancyError,
+    UnknownAgentError,
     WrongThreadError,
 )
-from .simulation import RULE, TRUNCATED
+from .simulation import RULE, TRUNCATED, Sentinel
 
 UNWINDING_TRIES: Final = 8
 """How often a simulation that is to be unwound may decide or swallow before it is given up."""
+
+MISSING: Final = Sentinel("MISSING")
 
 _given_up: list[Driver] = []
 """Simulations that refused to unwind: dropping them would resume them at some random moment."""
@@ -66,19 +70,23 @@ class Episode:
     Attributes:
         pending: The agent whose decision waits for an answer; None while the simulation moves and when the
             episode is over.
-        agents: The agents of the environment, by name, in the order in which they joined.
+        agents: The live agents of the environment, by name, in the order in which they joined.
+        gone: Those whose episode has ended before the simulation's.
+        parting: Those of them of whom the latest turn or round has taken leave.
         over: Whether the episode is over.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
         turns: How many actions the environment's user has given.
     """
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None) -> None:
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None, *, rounds: bool = False) -> None:
         """Begin an episode of a simulation that has been reset: run it to its first decision.
 
         Args:
             plan: What the environment is made of.
             simulation: The simulation.
             seed: What it was reset with, for those who read an error's notes.
+            rounds: Whether agents are rewarded and observed all together, at the end of ``play``, and not
+                each at its own decisions, at the end of ``turn``.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
@@ -86,6 +94,8 @@ class Episode:
         """
         self.pending: Record | None = None
         self.agents: dict[str, Record] = {}
+        self.gone: dict[str, Record] = {}
+        self.parting: list[Record] = []
         self.over = self.terminated = self.truncated = False
         self.turns = 0
         self._swift: dict[Any, Record] = {}  # by binding: agents for which nothing but the mappings is to be done
@@ -93,21 +103,26 @@ class Episode:
         self._latest: Record | None = None
         self._plan, self._simulation, self._seed = plan, simulation, seed
         self._max_turns = plan.options.max_steps or -1  # never reached
+        self._failed_in_model = False
         self._remembering = bool(DIFFERENCES)
-        for binding in plan.active:
-            if binding.agent is not None:
-                self.agents[binding.agent] = Record(binding.agent, binding, None)
+        self._rounds = rounds
+        self._clock = getattr(simulation, "time", None)
+        for agent, binding in () if plan.unanswered else plan.roster.items():
+            self.agents[agent] = Record(agent, binding, None, self._clock)
         self._driver: Driver | None = GreenletDriver(simulation.run, plan.bindings)
         with unattended():
             try:
                 reply = None
                 while self.pending is None and not self.over:
                     reply = self._take(*self._driver.resume(reply))
-                self._foresee()
+                if not self.over:
+                    self._foresee()
+                    if rounds:
+                        self._settle_all()
             except BaseException as error:
                 self._fail(error)
                 raise
-        if self.pending is None:
+        if self.pending is None and not plan.unanswered:
             raise NoDecisionError(
                 f"{type(simulation).__name__}.run() came to its end without a decision of"
                 f" {', '.join(binding.point.name for binding in plan.active)}; does the simulation call the"
@@ -150,10 +165,10 @@ class Episode:
             raise
         self.pending = None
         self.turns = turns = self.turns + 1
-        if binding.agent is None:
-            record.loosen()
-        if record.choices is not None:
-            record.choices = None
+        if record.followed_up:
+            record.follow_up()
+        if self.parting:
+            self.parting = []
         try:
             while True:
                 # Functions are fetched from attributes before they are called: calling them there is slower.
@@ -199,8 +214,11 @@ class Episode:
     def _take(self, binding: Any, args: Any, kwargs: Any) -> Any:
         """See to an event: make its decision pending, or return the reply to it, or end the episode."""
         if type(binding) is not Binding:
-            self._end(binding, args)
-            return None
+            if type(binding) is Removal:
+                return self._release(binding, args, kwargs)
+            result = [args]
+            args = None  # this frame must not hold an error that is about to have it in its traceback
+            return self._end(binding, result)
         agent = binding.agent
         if agent is None:
             agent = binding.name_agent(*args, **kwargs)
@@ -212,13 +230,16 @@ class Episode:
         self._latest = record
         if record.policy is not None:
             return self._consult(record, args, kwargs)
-        record._args, record._kwargs = args, kwargs
-        if self.turns == self._max_turns:
+        record.hold(args, kwargs)
+        if self._rounds:
+            record.restrict(args, kwargs)
+        elif self.turns == self._max_turns:
             self._finish(truncated=True)
             return None
-        record.settle(args, kwargs)
-        if binding.agent is not None and binding.legal is None and binding.point.alone:
-            self._swift[binding] = record
+        else:
+            record.settle(args, kwargs)
+            if not record.followed_up and binding.legal is None and binding.point.alone:
+                self._swift[binding] = record
         self.pending = record
         return None
 
@@ -228,8 +249,17 @@ class Episode:
             raise AgentError(f"agent= of {binding.point.name} must name a string or None, not {agent!r}")
         record = self._answered.get(agent) or self.agents.get(agent)
         if record is None:
+            if agent in self.gone:
+                raise AgentError(
+                    f"the agent {agent!r} decides at {binding.point.name} after its end; let agent= give each entity"
+                    " a name of its own, and removed_by= name what really ends it"
+                )
             policy = binding.policy or self._plan.policies.get(agent)
-            record = Record(agent, binding, policy)
+            if policy is None and self._plan.unanswered:
+                policy = RULE
+            elif policy is None and self._plan.complete:
+                policy = self._undeclared(agent, binding)
+            record = Record(agent, binding, policy, self._clock)
             (self.agents if policy is None else self._answered)[agent] = record
         elif record.binding is not binding:
             raise AgentError(
@@ -237,6 +267,14 @@ class Episode:
                 " an agent has one decision point: give each point's agents names of their own"
             )
         return record
+
+    def _undeclared(self, agent: str, binding: Binding) -> Any:
+        if self._plan.options.undeclared == "rule":
+            return RULE
+        raise AgentError(
+            f"the agent {agent!r}, which decides at {binding.point.name}, is not declared in possible_agents; declare"
+            ' it, or let its rule decide with undeclared="rule"'
+        )
 
     def _consult(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Have a policy answer."""
@@ -246,45 +284,168 @@ class Episode:
         action = record.policy(record.observation, record.info)
         if action is RULE:
             return RULE
-        return record.binding.reply(action, record.agent, record.mask, record.choices)
+        choices, record.choices = record.choices, None
+        return record.binding.reply(action, record.agent, record.mask, choices)
+
+    def record(self, agent: str) -> Record | None:
+        """What is known of an agent of the environment, whether it lives or is gone."""
+        return self.agents.get(agent) or self.gone.get(agent)
+
+    # -- rounds -----------------------------------------------------------------------------------
+
+    def play(self, actions: Mapping[str, Any]) -> None:
+        """Answer decisions with actions, each once, up to the first whose action is missing; or to the end.
+
+        Then all live agents are rewarded and observed.
+
+        Args:
+            actions: By agent: an action, or ``RULE``.
+
+        Raises:
+            UnknownAgentError: An action is for nobody who lives. Nothing has moved.
+            InvalidActionError: An action is not legal. Nothing has moved. One that only becomes illegal by
+                its turn counts as missing.
+            EpisodeOverError: No decision is pending.
+            BaseException: Whatever the model, a mapping or a policy raises.
+        """
+        record, driver = self.pending, self._driver
+        if record is None or driver is None:
+            raise self.nothing_pending()
+        if (RUNNING or EVALUATING) and attended():
+            with unattended():
+                self.play(actions)
+            return
+        driver.enter()
+        left = self._checked(actions, record)
+        self.turns += 1
+        self.parting = []
+        for other in self.agents.values():
+            other.acted = False
+        try:
+            while record is not None and (reply := self._round_reply(record, left)) is not MISSING:
+                self.pending, record = None, None
+                while self.pending is None and not self.over:
+                    resume = driver.resume
+                    reply = self._take(*resume(reply))
+                record = self.pending
+            if self.over:
+                return
+            self._foresee()
+            if self.turns == self._max_turns:
+                self._finish(truncated=True)
+            else:
+                self._settle_all()
+        except BaseException as error:
+            self._fail(error)
+            raise
+
+    def _checked(self, actions: Mapping[str, Any], pending: Record) -> dict[str, Any]:
+        """The actions, checked as far as they can be before anything moves."""
+        checked = {}
+        for agent, action in actions.items():
+            record = self.agents.get(agent)
+            if record is None:
+                raise UnknownAgentError(f"there is an action for {agent!r}, which is no live agent: {self._names()}")
+            mask = pending.mask if record is pending else None
+            checked[agent] = action if action is RULE else record.binding.checked(action, agent, mask)
+        return checked
+
+    def _round_reply(self, record: Record, left: dict[str, Any]) -> Any:
+        """The reply to a decision of a round, ``MISSING`` if there is no legal action for it any more."""
+        action = left.get(record.agent, MISSING)
+        if action is MISSING:
+            return MISSING
+        binding = record.binding
+        if action is not RULE:
+            if record.mask is not None and not binding.allowed(action, record.mask):
+                return MISSING
+            action = binding.convert(action) if record.choices is None else record.choices[action]
+        del left[record.agent]
+        record.acted = True
+        if not record.decided:  # seen for the first time, and acting at once
+            arguments = record.arguments()
+            assert arguments is not None
+            record.join(*arguments)
+        if record.followed_up:
+            record.follow_up()
+        return action
+
+    def _settle_all(self) -> None:
+        """Reward and observe all live agents, as far as the calls are known on which they decide."""
+        for record in self.agents.values():
+            arguments = record.arguments()
+            if arguments is None:
+                record.reward, record.info = 0.0, {}
+            else:
+                record.settle(*arguments)
 
     def _foresee(self) -> None:
-        """Observe agents before their first decision, where the simulation knows the calls to come."""
+        """Get to know agents before they decide, where the simulation knows the calls to come."""
         expected = getattr(self._simulation, "expected_calls", None)
         if expected is None:
             return
         for binding in self._plan.active:
-            for args in expected(binding.point.name):
-                agent = binding.agent if binding.name_agent is None else binding.name_agent(*args)
-                record = self.agents.get(agent) if isinstance(agent, str) else None
-                if record is None or record.binding is not binding or record.decided:
+            for call in expected(binding.point.name):
+                args = tuple(call)
+                agent = binding.agent or binding.name_agent(*args)
+                if agent is None or agent in self.gone or agent in self._answered:
                     continue
-                record._args, record._kwargs = tuple(args), {}
-                record.observe(tuple(args), {})
-                if binding.agent is None:
-                    record.loosen()
+                record = self.agents.get(agent)
+                if record is None or record.binding is not binding:
+                    record = self._meet(agent, binding)
+                if record is self.pending or record.policy is not None:
+                    continue
+                if self._rounds or not record.decided:
+                    record.hold(args, {})
+                    if not self._rounds:
+                        record.observe(args, {})
+                    if binding.agent is None:
+                        record.loosen()
+
+    def _names(self) -> str:
+        names = list(self.agents)
+        return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
 
     # -- ends -------------------------------------------------------------------------------------
 
-    def _end(self, kind: Any, value: Any) -> None:
+    def _end(self, kind: Any, result: list[Any]) -> None:
         """The simulation's ``run`` has returned or failed."""
         self._let_go_of_driver()
+        value = result.pop()
         if kind is FAILED:
+            self._failed_in_model = True
             try:
                 raise value
             finally:
-                del value  # else the error, its traceback and this frame would hold each other
+                del value
         self._finish(truncated=value is TRUNCATED)
 
-    def _finish(self, *, truncated: bool) -> None:
-        """End the episode of every agent: its last reward, its last observation."""
-        for record in self.agents.values():
-            arguments = record.arguments()
-            if arguments is None:  # it was never seen, or the model has let it go
-                record.reward, record.info = 0.0, {}
+    def _release(self, removal: Removal, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """End the episode of the agents that the model is about to remove, while they are still whole."""
+        for binding, agent in removal.agents(args, kwargs):
+            record = self.agents.get(agent)
+            if record is None or record.binding is not binding:
                 continue
+            self._conclude(record)
+            record.ended = True
+            self._swift.pop(binding, None)
+            self.gone[agent] = self.agents.pop(agent)
+            self.parting.append(record)
+        return RULE
+
+    def _conclude(self, record: Record) -> None:
+        """Give an agent its last reward and its last observation."""
+        arguments = record.arguments()
+        if arguments is None:  # it was never seen, or the model has let it go
+            record.reward, record.info = 0.0, {}
+        else:
             record.settle(*arguments, last=True)
-            record.forget()
+        record.forget()
+
+    def _finish(self, *, truncated: bool) -> None:
+        """End the episode of every agent."""
+        for record in self.agents.values():
+            self._conclude(record)
         self.over, self.truncated, self.terminated = True, truncated, not truncated
 
     def _fail(self, error: BaseException) -> None:
@@ -300,7 +461,9 @@ class Episode:
         if record is None:
             where = "before the first decision"
         else:
-            where = f"decision {self.turns + 1}, of {record.agent!r} at {record.binding.point.name}"
+            number = self.turns if self._failed_in_model else self.turns + 1
+            where = "in the model, after" if self._failed_in_model else "at"
+            where += f" decision {number}, of {record.agent!r} at {record.binding.point.name}"
         error.add_note(f"simenv_marl: {where}; seed {self._seed}")
 
     def close(self) -> None:

@@ -7,7 +7,7 @@ options. It holds no state of any episode, so that one plan serves any number of
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from functools import partial
@@ -17,11 +17,12 @@ import numpy as np
 from gymnasium import spaces
 
 from . import _spaces
-from ._points import NamedPoint, Site, find_point, find_points
+from ._points import NamedPoint, Site, find_point, find_points, locate, owner_class
 from ._spaces import ILLEGAL
 from .decision import DecisionPoint, Definition, unwrapped
 from .errors import (
     AgentError,
+    DefinitionError,
     InvalidActionError,
     MaskError,
     OptionValueError,
@@ -47,22 +48,35 @@ class Options:
 
     Attributes:
         driver: What switches between the simulation and its user: "greenlet".
+        possible_agents: The roster, where agents are named by a callable: their names, or a dict from
+            decision point to names. Declared agents are there from ``reset`` on.
+        undeclared: What a decision of an agent outside the roster becomes: "error", or "rule".
         max_steps: After how many calls of ``step`` with an action an episode is truncated; None: never.
         policies: Who decides without being an agent of the environment: from the name of an agent, or from a
             decision point (dotted name or decision function), to a callable of the observation, or of the
             observation and the info, that returns an action. ``RULE`` in place of the callable stands for the
             model's own rule.
+        flatten: Whether the joint view has one vector in place of dicts.
+        state_space: The space of the environment's ``state()``; None: whatever the simulation's is.
         render_mode: What ``render`` returns; one of the simulation's ``render_modes``.
     """
 
     driver: str = "greenlet"
+    possible_agents: Any = None
+    undeclared: str = "error"
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
+    flatten: bool = False
+    state_space: spaces.Space[Any] | None = None
     render_mode: str | None = None
 
     def __post_init__(self) -> None:
         if self.driver != "greenlet":
             raise OptionValueError(f'driver must be "greenlet", not {self.driver!r}')
+        if self.undeclared not in ("error", "rule"):
+            raise OptionValueError(f'undeclared must be "error" or "rule", not {self.undeclared!r}')
+        if self.state_space is not None and not isinstance(self.state_space, spaces.Space):
+            raise OptionValueError(f"state_space must be a gymnasium space, not {self.state_space!r}")
         steps = self.max_steps
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
             raise OptionValueError(f"max_steps must be a positive integer or None, not {steps!r}")
@@ -160,16 +174,50 @@ class Binding:
         Raises:
             InvalidActionError: The action is not legal.
         """
+        legal = self.checked(action, agent, mask)
+        return self.convert(legal) if choices is None else choices[legal]
+
+    def checked(self, action: Any, agent: str, mask: Any) -> Any:
+        """Check an action: the first half of ``reply``."""
         legal = self.check(action)
         if legal is ILLEGAL:
             raise InvalidActionError(
                 f"the action {action!r} of {agent!r} is not in its action space {self.definition.action_space}"
             )
-        if mask is not None and not _spaces.mask_allows(self.definition.action_space, mask, legal):
+        if mask is not None and not self.allowed(legal, mask):
             raise InvalidActionError(f"the action {action!r} of {agent!r} is masked; its mask is {mask!r}")
-        if choices is not None:
-            return choices[legal]
-        return self.convert(legal)
+        return legal
+
+    def allowed(self, legal: Any, mask: Any) -> bool:
+        """Whether a mask allows an action that is in the space."""
+        return _spaces.mask_allows(self.definition.action_space, mask, legal)
+
+
+class Removal:
+    """A function of the model whose calls end the episode of agents.
+
+    Attributes:
+        point: The function.
+        of: The bindings whose agents it ends; for each a callable of the call's arguments that names the
+            agent, or None; and then the class whose instances are such agents, if it is known.
+        deliver: None; the call always runs the function.
+    """
+
+    __slots__ = ("of", "point")
+
+    deliver = None
+
+    def __init__(self, point: DecisionPoint) -> None:
+        self.point = point
+        self.of: list[tuple[Binding, Callable[..., Any] | None, type | None]] = []
+
+    def agents(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Iterator[tuple[Binding, Any]]:
+        """The agents that a call ends, with their bindings."""
+        for binding, name, owner in self.of:
+            if name is not None:
+                yield binding, name(*args, **kwargs)
+            elif args and (owner is None or isinstance(args[0], owner)):
+                yield binding, binding.agent or binding.name_agent(args[0])
 
 
 def _same(action: Any) -> Any:
@@ -226,12 +274,21 @@ class Plan:
         render_modes: What its simulation can be rendered as.
         bindings: The decision points that do not run their rule, with all that is known of them.
         policies: By name: who answers the decisions of agents that are no agents of the environment.
-        possible_agents: The agents of the environment, in the order of the points; None where they are
-            only known when they decide.
+        roster: By name: the agents that are known beforehand, in the order of the points.
+        complete: Whether no others may join.
+        unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
         sites: Where decision functions must be set while the environment is in use.
     """
 
-    def __init__(self, source: Any, named: list[NamedPoint], options: Options, render_modes: list[str]) -> None:
+    def __init__(
+        self,
+        source: Any,
+        named: list[NamedPoint],
+        options: Options,
+        render_modes: list[str],
+        *,
+        unanswered: bool = False,
+    ) -> None:
         self.source, self.options, self._named = source, options, named
         self.render_modes = render_modes
         if options.render_mode is not None and options.render_mode not in render_modes:
@@ -241,7 +298,7 @@ class Plan:
         agents = _name_agents(named)
         by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
         everything = [*named, *extra]
-        self.bindings: dict[DecisionPoint, Binding] = {}
+        self.bindings: dict[DecisionPoint, Binding | Removal] = {}
         active: list[Binding] = []
         for point, agent in zip(everything, _name_agents(everything), strict=True):
             policy = by_point.get(point.point)
@@ -251,21 +308,40 @@ class Plan:
             if policy is None and agent not in self.policies:
                 active.append(binding)
         self.active = active
-        self.possible_agents: list[str] | None = None
-        if all(binding.agent is not None for binding in active):
-            self.possible_agents = [str(binding.agent) for binding in active]
         self.sites: list[Site] = [point.site for point in everything if point.site is not None]
-        if not active:
+        self._find_removals()
+        self.unanswered = unanswered
+        if not active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
+        self.roster, self.complete = _call_the_roll(active, options.possible_agents)
+        self.roster = {name: binding for name, binding in self.roster.items() if name not in self.policies}
+
+    @property
+    def possible_agents(self) -> list[str] | None:
+        """The names of all agents that there may be; None where they are only known when they decide."""
+        return list(self.roster) if self.complete else None
+
+    def _find_removals(self) -> None:
+        for binding in list(self.bindings.values()):
+            assert isinstance(binding, Binding)
+            for name, agent in binding.definition.removed_by.items():
+                point, _, site = locate(name)
+                removal = self.bindings.setdefault(point, Removal(point))
+                if not isinstance(removal, Removal):
+                    raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
+                removal.of.append((binding, agent, owner_class(binding.point)))
+                if site is not None and site not in self.sites:
+                    self.sites.append(site)
 
     @classmethod
-    def draw_up(cls, source: Any, points: Any, options: Mapping[str, Any]) -> Plan:
+    def draw_up(cls, source: Any, points: Any, options: Mapping[str, Any], *, unanswered: bool = False) -> Plan:
         """Make a plan of what users say.
 
         Args:
             source: A simulation, its class or a factory.
             points: The active decision points, as ``generate_env`` takes them.
             options: The options, by name.
+            unanswered: Whether there is no environment's user.
 
         Raises:
             SimEnvError: Something in them cannot work; the leaf says what.
@@ -276,7 +352,21 @@ class Plan:
         if plain_factory or (points is None and getattr(source, "points", None) is None):
             model = make_simulation(source)
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
-        return cls(source, find_points(points, model), checked, list(modes))
+        named = [] if unanswered and points == () else find_points(points, model)
+        return cls(source, named, checked, list(modes), unanswered=unanswered)
+
+    def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
+        """The same plan, with another definition of a point."""
+        named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
+        return Plan(self.source, named, self.options, self.render_modes)
+
+    def declared(self, roster: Mapping[str, Binding]) -> Plan:
+        """The same plan, with a roster of agents that has been found out."""
+        names: dict[str, list[str]] = {b.point.name: [] for b in self.active if b.agent is None}
+        for agent, binding in roster.items():
+            if binding.agent is None:
+                names[binding.point.name].append(agent)
+        return self.amended({"possible_agents": names})
 
     @property
     def name(self) -> str:
@@ -309,6 +399,36 @@ def _name_agents(named: list[NamedPoint]) -> list[str | None]:
             agent, owners[name] = name, point.point.name
         names.append(agent if isinstance(agent, str) else None)
     return names
+
+
+def _call_the_roll(active: list[Binding], declared: Any) -> tuple[dict[str, Binding], bool]:
+    """Find out which agents are known beforehand, and whether these are all."""
+    named = [binding for binding in active if binding.agent is None]
+    names: dict[Binding, list[Any]] = {}
+    if isinstance(declared, Mapping):
+        for key, value in declared.items():
+            point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
+            if point is None:
+                raise OptionValueError(
+                    f"possible_agents names {key!r}, which is no active decision point whose agents are named by a"
+                    f" callable; those are {[b.point.name for b in named]}"
+                )
+            names[point] = list(value)
+    elif declared is not None:
+        others = [name for name in declared if name not in [b.agent for b in active]]
+        if len(named) > 1 or (others and not named):
+            raise OptionValueError(
+                "possible_agents must be a dict from decision point to names where"
+                f" {len(named)} points name their agents by a callable"
+            )
+        names = dict.fromkeys(named, others)
+    roster: dict[str, Binding] = {}
+    for binding in active:
+        for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
+            if not isinstance(name, str) or name in roster:
+                raise AgentError(f"possible_agents must be names, and each but once, not {name!r}")
+            roster[name] = binding
+    return roster, not named or declared is not None
 
 
 def _assign(

@@ -86,56 +86,83 @@ def find_point(key: Any, definition: Any = None) -> NamedPoint:
     """
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(f"the definition of {_title(key)} must come from make_step, not {definition!r}")
+    point, own, site = locate(key)
+    definition = definition or own or point.definition
+    if definition is None:
+        raise DefinitionError(
+            f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="
+            f"{{{point.name!r}: make_step(...)}}"
+        )
+    return NamedPoint(point, definition, site)
+
+
+def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
+    """Find the point of a function, whether it has a definition or not.
+
+    Args:
+        key: A dotted name, or a function.
+
+    Returns:
+        The point; the definition that the function itself was decorated with; its site, if it needs one.
+
+    Raises:
+        UnknownPointError: The name leads to nothing.
+        PatchError: It leads to something that cannot be patched.
+    """
     if isinstance(key, str):
-        return _find_name(key, definition)
+        return _locate_name(key)
     function, _ = unbind(key)
     known = point_of(function)
     if known is not None:
-        point, own = known
-        return _named(point, definition or own or point.definition)
+        return (*known, Site.of(known[0]))
     name = f"{function.__module__}.{function.__qualname__}"
     owner: Any
-    if "<locals>" in name:
-        owner, attribute = _owner_of_local(function), function.__name__
-    else:
+    try:
         owner, attribute = _resolve(name)
-    if unbind(_held(owner, attribute))[0] is not function:
-        raise PatchError(f"{function!r} is not what is found under its name {name}; name it where it is found")
-    return _at_site(name, owner, attribute, definition)
+        found = unbind(_held(owner, attribute))[0] is function
+    except (UnknownPointError, PatchError):
+        found = False
+    if not found:  # the function is at hand, though not by its name
+        owner, attribute = _owner_at_hand(function), function.__name__
+    return _look_at(name, owner, attribute)
 
 
-def _find_name(name: str, definition: Definition | None) -> NamedPoint:
+def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
     point = registered(name)
-    if point is not None:
-        return _named(point, definition or point.definition)
-    owner, attribute = _resolve(name)
-    return _at_site(name, owner, attribute, definition)
+    try:
+        owner, attribute = _resolve(name)
+    except (UnknownPointError, PatchError):
+        if point is None:
+            raise
+        return point, None, Site.of(point)  # decorated inside a function, or not yet where it will be found
+    found = _look_at(name, owner, attribute) if point is None or _is_decided(owner, attribute) else None
+    if found is None or found[0] is point:
+        assert point is not None
+        return point, None, Site.of(point)
+    return found[0], found[0].definition or found[1], found[2]
 
 
-def _at_site(name: str, owner: Any, attribute: str, definition: Definition | None) -> NamedPoint:
+def _is_decided(owner: Any, attribute: str) -> bool:
+    held = _held(owner, attribute)
+    return point_of(held.__func__ if isinstance(held, (staticmethod, classmethod)) else held) is not None
+
+
+def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
     held = _held(owner, attribute)
     known = point_of(held.__func__ if isinstance(held, (staticmethod, classmethod)) else held)
     if known is not None and attribute in vars(owner):
-        point, own = known
-        return _named(point, definition or own or point.definition)
-    if known is not None:  # decorated in a base class
-        definition = definition or known[1] or known[0].definition
+        return (*known, Site.of(known[0]))
     site = Site.at(name, owner, attribute)
-    if definition is None:
-        raise DefinitionError(
-            f"{name} is no decision point: decorate it with make_step, or give its definition in points="
-            f"{{{name!r}: make_step(...)}}"
-        )
-    return NamedPoint(site.point, definition, site)
+    return site.point, (known[1] or known[0].definition) if known else None, site  # decorated in a base class
 
 
-def _named(point: DecisionPoint, definition: Definition | None) -> NamedPoint:
-    site = Site.of(point)
-    if definition is None:
-        raise DefinitionError(
-            f"{point.name} has no definition of its own here: give one in points={{{point.name!r}: make_step(...)}}"
-        )
-    return NamedPoint(point, definition, site)
+def owner_class(point: DecisionPoint) -> type | None:
+    """The class that a point is a method of; None where it is none, or is not to be found by its name."""
+    try:
+        owner, _ = _resolve(point.name)
+    except (UnknownPointError, PatchError):
+        return None
+    return owner if isinstance(owner, type) else None
 
 
 def _all_registered() -> list[str]:
@@ -202,15 +229,16 @@ def _unknown(name: str, why: str) -> UnknownPointError:
     return UnknownPointError(f"the decision point {name!r} is not to be found: {why}{hint}")
 
 
-def _owner_of_local(function: FunctionType) -> type:
-    """Find the class that holds a function which was defined inside another function."""
+def _owner_at_hand(function: FunctionType) -> type:
+    """Find the class that holds a function which is not found by its name, as inside another function."""
     for namespace in gc.get_referrers(function):
         if isinstance(namespace, dict) and namespace.get(function.__name__) is function:
             for owner in gc.get_referrers(namespace):
                 if isinstance(owner, type) and vars(owner).get(function.__name__) is function:
                     return owner
     raise PatchError(
-        f"{function.__qualname__} is local to a function and cannot be found by its name; decorate it with make_step"
+        f"{function.__module__}.{function.__qualname__} is not what is found under that name, nor in any class;"
+        " name it where it is found, or decorate it with make_step"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from numbers import Real
 from threading import get_ident
 from typing import Any
@@ -19,10 +20,14 @@ class Record:
     """What an episode knows of one agent.
 
     Attributes:
+        clock: Returns the simulation's time; None where it has none.
         agent: Its name.
         binding: The decision point where it decides.
         policy: Who answers for it; None: the environment's user.
-        decided: Whether it has decided in this episode.
+        decided: Whether a reward has been asked for it in this episode: the first one is dropped.
+        acted: Whether an action of its user was used in the latest round.
+        ended: Whether its episode has ended before the simulation's.
+        followed_up: Whether something is to be done when its decision is answered.
         observation: Its latest observation, cast to its space; None before it was ever observed.
         reward: The reward of its action before, as of its latest decision or its end.
         info: The info of its latest decision, a dict of its own.
@@ -31,15 +36,19 @@ class Record:
     """
 
     __slots__ = (
-        "_args", "_kwargs", "_weakly", "agent", "binding", "choices", "decided", "info", "mask", "memory",
-        "observation", "policy", "reward",
+        "_args", "_kwargs", "_now", "_time", "_weakly", "acted", "agent", "binding", "choices", "clock", "decided",
+        "ended", "followed_up", "info", "mask", "memory", "observation", "policy", "reward",
     )  # fmt: skip
 
-    def __init__(self, agent: str, binding: Binding, policy: Any) -> None:
+    def __init__(self, agent: str, binding: Binding, policy: Any, clock: Callable[[], float] | None) -> None:
         self.agent = agent
         self.binding = binding
         self.policy = policy
-        self.decided = False
+        self.clock = clock
+        self.decided = self.acted = self.ended = False
+        self._time: float | None = None
+        self._now: float | None = None
+        self.followed_up = binding.agent is None or clock is not None or binding.definition.choices is not None
         self.observation: Any = None
         self.reward = 0.0
         self.info: dict[str, Any] = {}
@@ -49,6 +58,12 @@ class Record:
         self._args: tuple[Any, ...] | None = None
         self._kwargs: dict[str, Any] = {}
         self._weakly: Any = None
+
+    def follow_up(self) -> None:
+        """See to what is to be done when its decision is answered, if ``followed_up``."""
+        self._time, self.choices = self._now, None
+        if self.binding.agent is None:
+            self.loosen()
 
     def loosen(self) -> None:
         """Keep the first argument weakly from now on, so that the model can let go of an entity."""
@@ -71,6 +86,15 @@ class Record:
             return None if first is None else ((first, *args[1:]), self._kwargs)
         return None if args is None else (args, self._kwargs)
 
+    def hold(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Keep the arguments of a decision."""
+        self._args, self._kwargs = args, kwargs
+
+    def first(self) -> Any:
+        """The first argument of the latest decision; None where there is none any more."""
+        arguments = self.arguments()
+        return arguments[0][0] if arguments and arguments[0] else None
+
     def forget(self) -> None:
         """Let go of the arguments; the agent has no more to observe."""
         self._args = self._weakly = None
@@ -90,42 +114,61 @@ class Record:
             MaskError: The mask does not fit the action space.
         """
         binding = self.binding
-        reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
-        EVALUATING[get_ident()] = self.memory
         if self.decided:
+            EVALUATING[get_ident()] = self.memory
+            reward_mapping = binding.reward
             reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
+            del EVALUATING[get_ident()]
             if type(reward) is not float:
                 reward = number(reward)
             if reward - reward != 0.0:
                 raise not_finite(self, reward)
             self.reward = reward
         elif not last:
-            reward_mapping(*args, **kwargs)  # nothing was done yet that could be rewarded
-            self.decided = True
-        if binding.legal is None:
-            self.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
-            del EVALUATING[get_ident()]
-            self.info = {}
-        else:
-            self.observe(args, kwargs, last=last)
+            self.join(args, kwargs)
+        self.observe(args, kwargs, last=last)
+
+    def join(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Ask for the first reward, which is dropped: nothing was done yet that could be rewarded."""
+        EVALUATING[get_ident()] = self.memory
+        self.binding.reward(*args, **kwargs)
+        del EVALUATING[get_ident()]
+        self.decided = True
 
     def observe(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
-        """Find out the legal actions, and observe. The arguments are those of ``settle``."""
+        """Find out the legal actions and the time, and observe. The arguments are those of ``settle``."""
         binding = self.binding
         EVALUATING[get_ident()] = self.memory
-        mask = choices = None
-        info: dict[str, Any] = {}
-        if binding.legal is not None:
-            try:
-                mask, choices = binding.legal(args, kwargs)
-            except MaskError:
-                if not last:
-                    raise
-                mask = _spaces.open_mask(binding.definition.action_space)  # nothing is asked any more
-            info[_spaces.MASK] = _spaces.duplicate(mask)
-        self.observation = binding.observation(args, kwargs, mask)
+        if binding.legal is None and self.clock is None:
+            cast, observe = binding.cast, binding.observe
+            self.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
+            self.info = {}
+        else:
+            self.info = info = {}
+            self.restrict(args, kwargs, last=last)
+            if self.mask is not None:
+                info[_spaces.MASK] = _spaces.duplicate(self.mask)
+            if self.clock is not None:
+                info |= self._passed(self.clock())
+            self.observation = binding.observation(args, kwargs, self.mask)
         del EVALUATING[get_ident()]
-        self.mask, self.choices, self.info = mask, choices, info
+
+    def restrict(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
+        """Find out the legal actions. The arguments are those of ``settle``."""
+        if self.binding.legal is None:
+            return
+        try:
+            self.mask, self.choices = self.binding.legal(args, kwargs)
+        except MaskError:
+            if not last:
+                raise
+            # Nothing is asked any more, and so nothing needs to be legal.
+            self.mask, self.choices = _spaces.open_mask(self.binding.definition.action_space), None
+
+    def _passed(self, time: Any) -> dict[str, float]:
+        """The simulation's time, and how much of it has gone by since the agent's decision before."""
+        self._now = now = float(time)
+        return {"time": now, "elapsed": 0.0 if self._time is None else now - self._time}
 
 
 def number(reward: Any) -> float:

@@ -50,13 +50,21 @@ class Session:
             self._let_go_of_sites()
             raise
 
-    def start(self, seed: int | None, options: dict[str, Any] | None, generator: np.random.Generator) -> Episode:
+    def start(
+        self,
+        seed: int | None,
+        options: dict[str, Any] | None,
+        generator: np.random.Generator,
+        *,
+        rounds: bool = False,
+    ) -> Episode:
         """End the episode that runs, reset the simulation, and run it to its first decision.
 
         Args:
             seed: The seed to reset it with; None: one is drawn.
             options: What the environment's ``reset`` was given.
             generator: What a seed is drawn from.
+            rounds: Whether the episode is played in rounds or in turns.
 
         Raises:
             NoDecisionError: The simulation ended without one.
@@ -74,7 +82,7 @@ class Session:
         except BaseException as error:
             error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
-        self._episode = episode = Episode(self.plan, self.simulation, self.seed)
+        self._episode = episode = Episode(self.plan, self.simulation, self.seed, rounds=rounds)
         return episode
 
     def not_running(self) -> Exception:

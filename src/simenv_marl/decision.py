@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
@@ -50,6 +50,11 @@ class Definition:
     choices: Mapped | None
     agent: str | Mapped | None
     action_mask_mapping: Mapped | None
+    removed_by: Mapping[str, Mapped | None]
+    goal_space: spaces.Space[Any] | None
+    achieved_goal_mapping: Mapped | None
+    desired_goal_mapping: Mapped | None
+    compute_reward: Callable[[Any, Any, Any], Any] | None
 
     def __call__(self, function: Any) -> Any:
         """Make the decision function.
@@ -59,8 +64,8 @@ class Definition:
                 classmethod, or any of these as an attribute of its class.
 
         Returns:
-            The decision function, in the same binding as ``function``: what goes in as a staticmethod or
-            classmethod comes out as one.
+            The decision function, bound as ``function`` was; what goes in as a staticmethod or classmethod
+            comes out as one.
 
         Raises:
             PatchError: ``function`` is none of these.
@@ -84,6 +89,11 @@ def make_step(
     choices: Mapped | None = None,
     agent: str | Mapped | None = None,
     action_mask_mapping: Mapped | None = None,
+    removed_by: str | Iterable[str] | Mapping[str, Mapped | None] = (),
+    goal_space: spaces.Space[Any] | None = None,
+    achieved_goal_mapping: Mapped | None = None,
+    desired_goal_mapping: Mapped | None = None,
+    compute_reward: Callable[[Any, Any, Any], Any] | None = None,
 ) -> Definition:
     """Define a decision point (paper, section 3.3).
 
@@ -106,6 +116,15 @@ def make_step(
             number, such as ``choosewateramount_0``.
         action_mask_mapping: Called with the call's arguments, returns which actions of a ``Discrete`` or
             ``MultiDiscrete`` are legal: 1 or 0 for each.
+        removed_by: The model's functions whose calls end an agent's episode: a dotted name, several, or a
+            dict from such a name to a callable of that call's arguments that names the agent. Without one
+            it is the agent that ``agent`` names for the call's first argument.
+        goal_space: The space of goals; with it, and the three below, the single view is goal-based.
+        achieved_goal_mapping: Called like ``observation_space_mapping``; returns the goal that was achieved.
+        desired_goal_mapping: Called likewise; returns the goal that is desired.
+        compute_reward: Called with achieved goals, desired goals and infos, of one step or stacked of many
+            (shape ``(n, *goal_space.shape)``); returns the reward of each, for learners that replay episodes
+            with other goals.
 
     Returns:
         The definition, which is a decorator for the function that decides.
@@ -117,7 +136,12 @@ def make_step(
         if not isinstance(space, spaces.Space):
             raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {space!r}")
     required = {"observation_space_mapping": observation_space_mapping, "reward_mapping": reward_mapping}
-    optional = {"apply": apply, "choices": choices, "action_mask_mapping": action_mask_mapping}
+    goals = {
+        "achieved_goal_mapping": achieved_goal_mapping,
+        "desired_goal_mapping": desired_goal_mapping,
+        "compute_reward": compute_reward,
+    }
+    optional = {"apply": apply, "choices": choices, "action_mask_mapping": action_mask_mapping, **goals}
     for name, function in (*required.items(), *optional.items()):
         if not callable(function) and (name in required or function is not None):
             raise DefinitionError(f"make_step: {name} must be callable, not {function!r}")
@@ -147,6 +171,11 @@ def make_step(
             raise DefinitionError("make_step: choices makes the mask itself; leave action_mask_mapping out")
     if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
         raise DefinitionError(f"make_step: agent must be a name or a callable, not {agent!r}")
+    if goal_space is not None and not isinstance(goal_space, spaces.Space):
+        raise DefinitionError(f"make_step: goal_space must be a gymnasium space, not {goal_space!r}")
+    missing = [name for name, value in {"goal_space": goal_space, **goals}.items() if value is None]
+    if 0 < len(missing) < 4:
+        raise DefinitionError(f"make_step: a goal needs all of its parts; missing: {', '.join(missing)}")
     return Definition(
         observation_space=observation_space,
         observation_space_mapping=observation_space_mapping,
@@ -157,7 +186,22 @@ def make_step(
         choices=choices,
         agent=agent,
         action_mask_mapping=action_mask_mapping,
+        removed_by=_removals(removed_by),
+        goal_space=goal_space,
+        **goals,
     )
+
+
+def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
+    if isinstance(removed_by, str):
+        removed_by = [removed_by]
+    named = removed_by if isinstance(removed_by, Mapping) else dict.fromkeys(removed_by)
+    for name, agent in named.items():
+        if not isinstance(name, str) or not (agent is None or callable(agent)):
+            raise DefinitionError(
+                f"make_step: removed_by goes from dotted names to callables that name an agent, not {name!r}: {agent!r}"
+            )
+    return dict(named)
 
 
 def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[Any], Any]:

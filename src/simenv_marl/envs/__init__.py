@@ -8,19 +8,49 @@ from typing import Any, Final
 from .._plan import Plan
 from ..errors import OptionValueError
 from .aec import SimulationAECEnv
-from .single import SimulationEnv
+from .joint import SimulationJointEnv
+from .parallel import SimulationParallelEnv
+from .single import SimulationEnv, single_view
 
-__all__ = ["VIEWS", "SimulationAECEnv", "SimulationEnv", "aec_env", "generate_env", "single_env"]
+__all__ = [
+    "VIEWS",
+    "SimulationAECEnv",
+    "SimulationEnv",
+    "SimulationJointEnv",
+    "SimulationParallelEnv",
+    "aec_env",
+    "generate_env",
+    "joint_env",
+    "parallel_env",
+    "single_env",
+]
 
-VIEWS: Final[dict[str, type[SimulationAECEnv] | type[SimulationEnv]]] = {
-    "aec": SimulationAECEnv,
-    "single": SimulationEnv,
-}
+VIEWS: Final = ("aec", "parallel", "single", "joint")
 
 
-def generate_env(
-    simulation: Any, points: Any = None, *, view: str | None = None, **options: Any
-) -> type[SimulationAECEnv] | type[SimulationEnv]:
+def view_class(plan: Plan, view: str | None) -> Any:
+    """The class of a view of a plan.
+
+    Args:
+        plan: The plan.
+        view: One of ``VIEWS``. None: single where one point with one agent is active, AEC otherwise.
+
+    Raises:
+        OptionValueError: There is no such view.
+        ViewError: The plan does not allow it.
+    """
+    if view is None:
+        view = "single" if len(plan.active) == 1 and plan.active[0].agent is not None else "aec"
+    if view == "single":
+        return single_view(plan)
+    found: dict[Any, Any] = {"aec": SimulationAECEnv, "parallel": SimulationParallelEnv, "joint": SimulationJointEnv}
+    if not isinstance(view, str) or view not in found:
+        raise OptionValueError(f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {view!r}")
+    found[view].check(plan)
+    return found[view]
+
+
+def generate_env(simulation: Any, points: Any = None, *, view: str | None = None, **options: Any) -> Any:
     """Make an environment class of a simulation (paper, section 3.3).
 
     Args:
@@ -28,7 +58,8 @@ def generate_env(
         points: The active decision points: a dotted name, a decision function, a list of these, or a dict
             from dotted name or function to its definition, which leaves the model undecorated. None: the
             simulation's attribute ``points``, else all decorated points of the one package that has any.
-        view: "aec" or "single". None: single where one point with one agent is active, AEC otherwise.
+        view: "aec", "parallel", "single" or "joint". None: single where one point with one agent is active,
+            AEC otherwise.
         **options: As ``aec_env`` takes them.
 
     Returns:
@@ -38,12 +69,7 @@ def generate_env(
         SimEnvError: Something in it cannot work; the leaf says what.
     """
     plan = Plan.draw_up(simulation, points, options)
-    if view is None:
-        view = "single" if plan.possible_agents is not None and len(plan.possible_agents) == 1 else "aec"
-    if not isinstance(view, str) or view not in VIEWS:
-        raise OptionValueError(f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {view!r}")
-    base: Any = VIEWS[view]
-    base.check(plan)
+    base = view_class(plan, view)
 
     def initialise(self: Any, **changes: Any) -> None:
         base.__init__(self, plan.amended(changes))
@@ -53,7 +79,7 @@ def generate_env(
         (base,),
         {
             "__init__": initialise,
-            "__doc__": f"The {view} view of {plan.name}: {', '.join(b.point.name for b in plan.active)}.",
+            "__doc__": f"A view of {plan.name}: {', '.join(b.point.name for b in plan.active)}.",
             "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
             "metadata": base.metadata_of(plan),
         },
@@ -61,12 +87,13 @@ def generate_env(
 
 
 def aec_env(simulation: Any, points: Any = None, **options: Any) -> SimulationAECEnv:
-    """Make a PettingZoo AEC environment, in which each active decision point is an agent.
+    """Make a PettingZoo AEC environment, in which decision points are agents.
 
     Args:
         simulation: A simulation (which is copied), its class, or a zero-argument factory.
         points: The active decision points, as ``generate_env`` takes them.
-        **options: ``driver``, ``max_steps``, ``policies``, ``render_mode``: see ``Options``.
+        **options: ``driver``, ``max_steps``, ``policies``, ``possible_agents``, ``undeclared``,
+            ``state_space``, ``render_mode``: see the page on options.
 
     Raises:
         SimEnvError: Something in it cannot work; the leaf says what.
@@ -74,16 +101,49 @@ def aec_env(simulation: Any, points: Any = None, **options: Any) -> SimulationAE
     return SimulationAECEnv(Plan.draw_up(simulation, points, options))
 
 
-def single_env(simulation: Any, points: Any = None, **options: Any) -> SimulationEnv:
-    """Make a Gymnasium environment of the one agent that is active.
+def parallel_env(simulation: Any, points: Any = None, **options: Any) -> SimulationParallelEnv:
+    """Make a PettingZoo parallel environment, in which decision points are agents.
 
     Args:
         simulation: A simulation (which is copied), its class, or a zero-argument factory.
         points: The active decision points, as ``generate_env`` takes them.
-        **options: ``driver``, ``max_steps``, ``policies``, ``render_mode``: see ``Options``.
+        **options: As ``aec_env`` takes them.
+
+    Raises:
+        SimEnvError: Something in it cannot work; the leaf says what.
+    """
+    return SimulationParallelEnv(Plan.draw_up(simulation, points, options))
+
+
+def single_env(simulation: Any, points: Any = None, **options: Any) -> SimulationEnv:
+    """Make a Gymnasium environment of the one agent that is active.
+
+    Where its decision point has a goal, the environment is goal-based: its observations are dicts of
+    ``observation``, ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
+
+    Args:
+        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        points: The active decision points, as ``generate_env`` takes them.
+        **options: As ``aec_env`` takes them.
 
     Raises:
         ViewError: Not just one agent is active.
         SimEnvError: Something else in it cannot work; the leaf says what.
     """
-    return SimulationEnv(Plan.draw_up(simulation, points, options))
+    plan = Plan.draw_up(simulation, points, options)
+    return single_view(plan)(plan)
+
+
+def joint_env(simulation: Any, points: Any = None, **options: Any) -> SimulationJointEnv:
+    """Make a Gymnasium environment whose one agent takes all decisions.
+
+    Args:
+        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        points: The active decision points, as ``generate_env`` takes them.
+        **options: ``flatten=True`` for one vector in place of dicts; else as ``aec_env`` takes them.
+
+    Raises:
+        ViewError: No agent is known beforehand, or the spaces cannot be flattened.
+        SimEnvError: Something else in it cannot work; the leaf says what.
+    """
+    return SimulationJointEnv(Plan.draw_up(simulation, points, options))

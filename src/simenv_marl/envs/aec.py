@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import copy
-import weakref
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
-from gymnasium.utils import seeding
 from pettingzoo import AECEnv
 
 from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
-from .._session import Session, checked_seed, seed_space
-from .._spaces import blank, duplicate
-from ..errors import InvalidActionError, UnknownAgentError
+from .._session import checked_seed
+from ..errors import InvalidActionError
 from ..simulation import RULE
+from ._view import AgentsView
 
 
-class SimulationAECEnv(AECEnv[str, Any, Any]):
+class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     """A simulation as a PettingZoo AEC environment. Made by ``aec_env`` and ``generate_env``.
 
     ``possible_agents`` exists only where all agents are known beforehand. Every step takes the same time,
@@ -29,15 +25,14 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
 
     Attributes:
         agents: The agents that have not yet taken leave of the episode.
-        agent_selection: The agent whose decision is pending; once the episode has ended, the one that is
-            to take its ``None`` step.
+        agent_selection: The agent whose decision is pending; where agents have ended, the one that is to take
+            its ``None`` step.
         rewards: The rewards that the latest step has brought, python floats.
         terminations, truncations: By agent, python bools.
         infos: By agent, the info of its latest decision. ``infos[agent]["action_mask"]``, np.int8, is there
-            where the decision point restricts its actions.
+            where the decision point restricts its actions; ``"time"`` and ``"elapsed"`` where the simulation
+            has a clock.
     """
-
-    render_mode: str | None
 
     def __init__(self, plan: Plan) -> None:
         """Make the environment of a plan.
@@ -45,34 +40,8 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
         Raises:
             SimEnvError: Something in the plan cannot work.
         """
-        super().__init__()
-        self._plan = plan
-        self._session = Session(plan)
-        weakref.finalize(self, self._session.abandon)
-        self.metadata = self.metadata_of(plan)
-        self.render_mode = plan.options.render_mode
-        if plan.possible_agents is not None:
-            self.possible_agents = list(plan.possible_agents)
-        self._episode: Episode | None
-        self._by_agent = {binding.agent: binding for binding in plan.active}
-        self._np_random: np.random.Generator | None = None
-        self._observation_spaces: dict[str, spaces.Space[Any]] = {}
-        self._action_spaces: dict[str, spaces.Space[Any]] = {}
+        super().__init__(plan)
         self._clear()
-
-    @staticmethod
-    def check(plan: Plan) -> None:
-        """Make sure that a plan allows this view; every plan does."""
-
-    @staticmethod
-    def metadata_of(plan: Plan) -> dict[str, Any]:
-        """What the environments of a plan say about themselves."""
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes}
-
-    @property
-    def simulation(self) -> Any:
-        """The simulation that this environment runs."""
-        return self._session.simulation
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -89,19 +58,9 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         seed = checked_seed(seed)
-        if seed is not None or self._np_random is None:
-            self._np_random, _ = seeding.np_random(seed)
         self._clear()
-        self._episode = episode = self._session.start(seed, options, self._np_random)
-        if self._plan.possible_agents is None:  # names that may never come again
-            self._observation_spaces, self._action_spaces = {}, {}
-        elif seed is not None:
-            for agent in self._action_spaces:
-                self._seed_spaces(agent, seed)
-        for agent in episode.agents:
-            self._join(agent)
-        assert episode.pending is not None
-        self._select(episode.pending)
+        self._episode = episode = self._start(seed, options, rounds=False)
+        self._enter(episode)
 
     def step(self, action: Any) -> None:
         """Answer the decision of ``agent_selection`` and run to the next one.
@@ -117,7 +76,7 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
         episode = self._episode
         if episode is None:
             raise self._session.not_running()
-        if episode.over:
+        if self._leaving or episode.over:
             self._take_leave(episode, action)
             return
         agent = self.agent_selection
@@ -131,8 +90,8 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
         # The selected agent is the only one that the latest step has rewarded.
         self.rewards[agent] = self._cumulative_rewards[agent] = 0.0
         record = episode.pending
-        if record is None:
-            self._end(episode)
+        if record is None or episode.parting:
+            self._enter(episode)
         else:
             self._select(record)
 
@@ -156,7 +115,8 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
             raise episode.nothing_pending()
         observation = None
         if observe:
-            observation = episode.agents[agent].observation
+            record = episode.agents.get(agent)
+            observation = None if record is None else record.observation
             observation = observation.copy() if type(observation) is np.ndarray else self.observe(agent)
         return (
             observation,
@@ -178,16 +138,7 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
         """
         if self._episode is None:
             raise self._session.not_running()
-        record = self._episode.agents.get(agent)
-        if record is None:
-            raise self._unknown(agent)
-        if record.observation is None:
-            return blank(record.binding.definition.observation_space)
-        return duplicate(record.observation)
-
-    def render(self) -> Any:
-        """Render the simulation in ``render_mode``."""
-        return self._session.render()
+        return self._observation(self._episode, agent)
 
     def close(self) -> None:
         """End the episode and unwind the simulation; a later ``reset`` begins anew.
@@ -196,60 +147,24 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
             BaseException: What the simulation raises while it unwinds.
         """
         self._clear()
-        self._session.close()
-
-    # -- spaces -----------------------------------------------------------------------------------
-
-    def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The observation space of an agent: of this environment alone, and always the same object.
-
-        Raises:
-            UnknownAgentError: There is no such agent.
-        """
-        space = self._observation_spaces.get(agent)
-        return space if space is not None else self._make_spaces(agent)[0]
-
-    def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The action space of an agent: of this environment alone, and always the same object.
-
-        Raises:
-            UnknownAgentError: There is no such agent.
-        """
-        space = self._action_spaces.get(agent)
-        return space if space is not None else self._make_spaces(agent)[1]
-
-    def _make_spaces(self, agent: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        binding = self._by_agent.get(agent)
-        if binding is None:
-            if self._episode is None or agent not in self._episode.agents:
-                raise self._unknown(agent)
-            binding = self._episode.agents[agent].binding
-        made = copy.deepcopy((binding.definition.observation_space, binding.definition.action_space))
-        self._observation_spaces[agent], self._action_spaces[agent] = made
-        if self._session.seed is not None:
-            self._seed_spaces(agent, self._session.seed)
-        return made
-
-    def _seed_spaces(self, agent: str, seed: int) -> None:
-        seed_space(self._observation_spaces[agent], seed, agent)
-        seed_space(self._action_spaces[agent], seed, agent)
-
-    def _unknown(self, agent: Any) -> UnknownAgentError:
-        return UnknownAgentError(f"there is no agent {agent!r}; the agents now are {self.agents}")
+        super().close()
 
     # -- PettingZoo's books -----------------------------------------------------------------------
 
     def _clear(self) -> None:
         self._episode = None
-        self.agents: list[str] = []
+        self.agents = []
+        self._places: dict[str, int] = {}  # of the agents, in the list of agents
+        self._leaving: list[str] = []  # whose episode has ended, the next one last
+        self._rewarded: list[str] = []  # whom the latest step has rewarded, if not just the selected one
         self.rewards: dict[str, float] = {}
         self._cumulative_rewards: dict[str, float] = {}
         self.terminations: dict[str, bool] = {}
         self.truncations: dict[str, bool] = {}
         self.infos: dict[str, dict[str, Any]] = {}
-        self._rewards_are_old = False
 
     def _join(self, agent: str) -> None:
+        self._places[agent] = len(self.agents)
         self.agents.append(agent)
         self.rewards[agent] = self._cumulative_rewards[agent] = 0.0
         self.terminations[agent] = self.truncations[agent] = False
@@ -266,34 +181,55 @@ class SimulationAECEnv(AECEnv[str, Any, Any]):
         self.infos[agent] = record.info
         self.agent_selection = agent
 
-    def _end(self, episode: Episode) -> None:
-        """Enter the end of the episode: last rewards, flags, and the agents' leave."""
-        for agent, record in episode.agents.items():
-            if agent not in self.rewards:
+    def _enter(self, episode: Episode) -> None:
+        """Enter what a reset or a turn has brought besides a decision: births and ends."""
+        if not self.agents:
+            for agent in episode.agents:
                 self._join(agent)
-            self.rewards[agent] = record.reward
-            self._cumulative_rewards[agent] += record.reward
-            self.terminations[agent], self.truncations[agent] = episode.terminated, episode.truncated
-            self.infos[agent] = record.info
-        # Leave is taken from the list's end, where that costs the same for any number of agents; those
-        # that have never decided come last.
-        self.agents.sort(key=lambda agent: episode.agents[agent].decided)
-        self.agent_selection = self.agents[-1]
-        self._rewards_are_old = False
+        for record in episode.parting:
+            self._part(record, terminated=True, truncated=False)
+        if episode.over:
+            # Those that have never decided come last.
+            for record in sorted(episode.agents.values(), key=lambda record: not record.decided):
+                self._part(record, terminated=episode.terminated, truncated=episode.truncated)
+        self._leaving.reverse()
+        if episode.pending is not None:
+            self._select(episode.pending)
+            self._rewarded.append(episode.pending.agent)
+        if self._leaving:
+            self.agent_selection = self._leaving[-1]
+
+    def _part(self, record: Record, *, terminated: bool, truncated: bool) -> None:
+        """Enter the end of an agent: last reward, flags; its ``None`` step is to come."""
+        agent = record.agent
+        if agent not in self.rewards:
+            self._join(agent)
+        self.rewards[agent] = record.reward
+        self._cumulative_rewards[agent] += record.reward
+        self.terminations[agent], self.truncations[agent] = terminated, truncated
+        self.infos[agent] = record.info
+        self._leaving.append(agent)
+        self._rewarded.append(agent)
 
     def _take_leave(self, episode: Episode, action: Any) -> None:
         """The step of an agent whose episode has ended."""
-        if not self.agents:
+        if not self._leaving:
             raise episode.nothing_pending()
         if action is not None and action is not RULE:
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {action!r}"
             )
-        agent = self.agents.pop()
+        for agent in self._rewarded:
+            self.rewards[agent] = 0.0
+        self._rewarded = []
+        agent = self._leaving.pop()
         for book in (self.rewards, self._cumulative_rewards, self.terminations, self.truncations, self.infos):
             del book[agent]
-        if not self._rewards_are_old:
-            self.rewards = dict.fromkeys(self.agents, 0.0)
-            self._rewards_are_old = True
-        if self.agents:
-            self.agent_selection = self.agents[-1]
+        # The last agent takes its place in the list, which so takes the same time for any number of agents.
+        place, mover = self._places.pop(agent), self.agents.pop()
+        if mover != agent:
+            self.agents[place], self._places[mover] = mover, place
+        if self._leaving:
+            self.agent_selection = self._leaving[-1]
+        elif episode.pending is not None:
+            self.agent_selection = episode.pending.agent

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import copy
-import weakref
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
 
-from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
-from .._session import Session, checked_seed, seed_space
+from .._session import checked_seed, seed_space
+from ..decision import Definition
 from ..errors import ViewError
+from ._view import View
 
 
-class SimulationEnv(gym.Env[Any, Any]):
+class SimulationEnv(View, gym.Env[Any, Any]):
     """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``.
 
     Attributes:
@@ -29,17 +33,11 @@ class SimulationEnv(gym.Env[Any, Any]):
             ViewError: Not just one agent is active, or its name is only known when it decides.
             SimEnvError: Something else in the plan cannot work.
         """
-        self.check(plan)
-        self._plan = plan
-        self._agent = str(plan.active[0].agent)
-        self._session = Session(plan)
-        weakref.finalize(self, self._session.abandon)
+        super().__init__(plan)
         definition = plan.active[0].definition
+        self._agent = str(plan.active[0].agent)
         self.observation_space = copy.deepcopy(definition.observation_space)
         self.action_space = copy.deepcopy(definition.action_space)
-        self.metadata = self.metadata_of(plan)
-        self.render_mode = plan.options.render_mode
-        self._episode: Episode | None = None
         self._record: Record
 
     @staticmethod
@@ -49,23 +47,13 @@ class SimulationEnv(gym.Env[Any, Any]):
         Raises:
             ViewError: It does not.
         """
-        agents = plan.possible_agents
-        if agents is None or len(agents) != 1:
+        View.check(plan)
+        if len(plan.active) != 1 or plan.active[0].agent is None:
             points = ", ".join(binding.point.name for binding in plan.active)
             raise ViewError(
                 "the single view needs one active decision point, whose agent has a name of its own; active are"
                 f" {points}. Name one in points=, answer the others with policies=, or use aec_env"
             )
-
-    @staticmethod
-    def metadata_of(plan: Plan) -> dict[str, Any]:
-        """What the environments of a plan say about themselves."""
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes}
-
-    @property
-    def simulation(self) -> Any:
-        """The simulation that this environment runs."""
-        return self._session.simulation
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the simulation and run it to its first decision.
@@ -83,7 +71,7 @@ class SimulationEnv(gym.Env[Any, Any]):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         seed = checked_seed(seed)
-        super().reset(seed=seed)
+        gym.Env.reset(self, seed=seed)
         self._episode = None
         self._episode = episode = self._session.start(seed, options, self.np_random)
         if seed is not None:
@@ -111,17 +99,70 @@ class SimulationEnv(gym.Env[Any, Any]):
             raise self._session.not_running()
         episode.turn(action)
         record = self._record
-        return record.observation, record.reward, episode.terminated, episode.truncated, record.info
+        return (
+            record.observation,
+            record.reward,
+            episode.terminated or record.ended,
+            episode.truncated and not record.ended,
+            record.info,
+        )
 
-    def render(self) -> Any:
-        """Render the simulation in ``render_mode``."""
-        return self._session.render()
 
-    def close(self) -> None:
-        """End the episode and unwind the simulation; a later ``reset`` begins anew.
+class SimulationGoalEnv(SimulationEnv):
+    """A single view whose observations tell the goal that was achieved and the one that is desired.
+
+    Made where the decision point has a ``goal_space``. Its observation space is a ``Dict`` of ``observation``,
+    ``achieved_goal`` and ``desired_goal``.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Make the environment of a plan.
 
         Raises:
-            BaseException: What the simulation raises while it unwinds.
+            SimEnvError: Something in the plan cannot work.
         """
-        self._episode = None
-        self._session.close()
+        self.check(plan)
+        self._definition = plan.active[0].definition
+        super().__init__(plan.redefined(plan.active[0].point, _with_goals(self._definition)))
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:
+        """What the rewards had been, had these been the goals.
+
+        Args:
+            achieved_goal: Of shape ``goal_space.shape``, or ``(n, *goal_space.shape)`` of n steps.
+            desired_goal: The same.
+            info: The info of the step, or a sequence of n.
+
+        Returns:
+            The reward, or an array of n.
+        """
+        compute = self._definition.compute_reward
+        assert compute is not None
+        reward = np.asarray(compute(achieved_goal, desired_goal, info), np.float64)
+        return float(reward) if reward.ndim == 0 else reward
+
+
+def _with_goals(definition: Definition) -> Definition:
+    goal_space, observe = definition.goal_space, definition.observation_space_mapping
+    achieved, desired = definition.achieved_goal_mapping, definition.desired_goal_mapping
+    assert goal_space is not None
+    assert achieved is not None
+    assert desired is not None
+
+    def observe_with_goals(*args: Any, **kwargs: Any) -> dict[str, Any]:
+        return {
+            "observation": observe(*args, **kwargs),
+            "achieved_goal": achieved(*args, **kwargs),
+            "desired_goal": desired(*args, **kwargs),
+        }
+
+    space = spaces.Dict(
+        {"observation": definition.observation_space, "achieved_goal": goal_space, "desired_goal": goal_space}
+    )
+    return replace(definition, observation_space=space, observation_space_mapping=observe_with_goals)
+
+
+def single_view(plan: Plan) -> type[SimulationEnv]:
+    """Which of the single views a plan asks for."""
+    SimulationEnv.check(plan)
+    return SimulationEnv if plan.active[0].definition.goal_space is None else SimulationGoalEnv

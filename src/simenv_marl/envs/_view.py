@@ -1,0 +1,180 @@
+"""What all views have in common: a session, spaces of their own, a picture and a state."""
+
+from __future__ import annotations
+
+import copy
+import weakref
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+
+from .._driver import unattended
+from .._episode import Episode
+from .._plan import Binding, Plan
+from .._session import Session, seed_space
+from .._spaces import blank, duplicate, observation_cast
+from ..errors import UnknownAgentError, UnknownOptionError
+
+
+class View:
+    """A reading of a simulation's episodes.
+
+    Attributes:
+        metadata: Its name, and the render modes of its simulation.
+        render_mode: What ``render`` returns.
+    """
+
+    metadata: dict[str, Any]
+    render_mode: str | None
+
+    def __init__(self, plan: Plan) -> None:
+        """Make the view of a plan.
+
+        Raises:
+            SimEnvError: Something in the plan cannot work.
+        """
+        self.check(plan)
+        super().__init__()
+        self._plan = plan
+        self._session = Session(plan)
+        weakref.finalize(self, self._session.abandon)
+        self._episode: Episode | None = None
+        self.metadata = self.metadata_of(plan)
+        self.render_mode = plan.options.render_mode
+
+    @staticmethod
+    def check(plan: Plan) -> None:
+        """Make sure that a plan allows this view.
+
+        Raises:
+            ViewError: It does not.
+        """
+        if plan.options.flatten:
+            raise UnknownOptionError("flatten is an option of the joint view alone")
+
+    @staticmethod
+    def metadata_of(plan: Plan) -> dict[str, Any]:
+        """What the environments of a plan say about themselves."""
+        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": 4}
+
+    @property
+    def simulation(self) -> Any:
+        """The simulation that this environment runs."""
+        return self._session.simulation
+
+    @property
+    def state_space(self) -> spaces.Space[Any] | None:
+        """The space of ``state()``, where the environment was made with one."""
+        return self._plan.options.state_space
+
+    def state(self) -> Any:
+        """The state of the simulation, for centralised critics: what its own ``state()`` returns.
+
+        Returns:
+            A new array; in the dtype of ``state_space``, where the environment was made with one.
+
+        Raises:
+            NotImplementedError: The simulation has no ``state``, as PettingZoo has it.
+        """
+        tell = getattr(self.simulation, "state", None)
+        if not callable(tell):
+            raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
+        with unattended():
+            value = tell()
+        return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
+
+    def render(self) -> Any:
+        """Render the simulation in ``render_mode``; without one, None and a warning."""
+        return self._session.render()
+
+    def close(self) -> None:
+        """End the episode and unwind the simulation; a later ``reset`` begins anew.
+
+        Raises:
+            BaseException: What the simulation raises while it unwinds.
+        """
+        self._episode = None
+        self._session.close()
+
+
+class AgentsView(View):
+    """A view in which agents are told apart. ``possible_agents`` exists only where all are known beforehand.
+
+    Attributes:
+        agents: The agents that are there now.
+    """
+
+    agents: list[str]
+
+    def __init__(self, plan: Plan) -> None:
+        """Make the view of a plan.
+
+        Raises:
+            SimEnvError: Something in the plan cannot work.
+        """
+        super().__init__(plan)
+        if plan.possible_agents is not None:
+            self.possible_agents = plan.possible_agents
+        self._generator: np.random.Generator | None = None
+        self._observation_spaces: dict[str, spaces.Space[Any]] = {}
+        self._action_spaces: dict[str, spaces.Space[Any]] = {}
+
+    def _start(self, seed: int | None, options: dict[str, Any] | None, *, rounds: bool) -> Episode:
+        """Begin an episode, and seed the agents' spaces."""
+        if seed is not None or self._generator is None:
+            self._generator, _ = seeding.np_random(seed)
+        episode = self._session.start(seed, options, self._generator, rounds=rounds)
+        if not self._plan.complete:  # names that may never come again
+            self._observation_spaces, self._action_spaces = {}, {}
+        elif seed is not None:
+            for agent in self._action_spaces:
+                self._seed_spaces(agent, seed)
+        return episode
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The observation space of an agent: of this environment alone, and always the same object.
+
+        Raises:
+            UnknownAgentError: There is no such agent.
+        """
+        space = self._observation_spaces.get(agent)
+        return space if space is not None else self._make_spaces(agent)[0]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The action space of an agent: of this environment alone, and always the same object.
+
+        Raises:
+            UnknownAgentError: There is no such agent.
+        """
+        space = self._action_spaces.get(agent)
+        return space if space is not None else self._make_spaces(agent)[1]
+
+    def _binding(self, agent: str) -> Binding:
+        binding = self._plan.roster.get(agent)
+        if binding is None:
+            record = self._episode.record(agent) if self._episode is not None else None
+            if record is None:
+                raise UnknownAgentError(f"there is no agent {agent!r}; the agents now are {self.agents[:10]}")
+            binding = record.binding
+        return binding
+
+    def _make_spaces(self, agent: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        definition = self._binding(agent).definition
+        made = copy.deepcopy((definition.observation_space, definition.action_space))
+        self._observation_spaces[agent], self._action_spaces[agent] = made
+        if self._session.seed is not None:
+            self._seed_spaces(agent, self._session.seed)
+        return made
+
+    def _seed_spaces(self, agent: str, seed: int) -> None:
+        seed_space(self._observation_spaces[agent], seed, agent)
+        seed_space(self._action_spaces[agent], seed, agent)
+
+    def _observation(self, episode: Episode, agent: str) -> Any:
+        """The latest observation of an agent, as a copy of the caller's own."""
+        record = episode.record(agent)
+        if record is None or record.observation is None:
+            return blank(self._binding(agent).definition.observation_space)
+        return duplicate(record.observation)

@@ -1,0 +1,116 @@
+"""The parallel view: rounds, in which every agent has at most one action."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pettingzoo import ParallelEnv
+
+from .._episode import Episode
+from .._plan import Plan
+from .._record import Record
+from .._session import checked_seed
+from ._view import AgentsView
+
+Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
+
+
+class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
+    """A simulation as a PettingZoo parallel environment. Made by ``parallel_env`` and ``generate_env``.
+
+    A step answers each decision as it arises with the action given for its agent, once, and returns at the
+    first decision whose action is missing or used already. All actions at once so give simultaneous moves,
+    and one action at a time gives turns. All live agents are observed and rewarded at the return.
+
+    Attributes:
+        agents: The live agents.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Make the environment of a plan.
+
+        Raises:
+            SimEnvError: Something in the plan cannot work.
+        """
+        super().__init__(plan)
+        self.agents = []
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Reset the simulation and run it to its first decision.
+
+        Args:
+            seed: Seeds the environment's generator and the agents' spaces, and is what the simulation's
+                ``reset`` gets. None: the simulation gets a seed drawn from the generator.
+            options: Handed to the simulation's ``reset``, where that takes them.
+
+        Returns:
+            By agent, the observations and the infos.
+
+        Raises:
+            NoDecisionError: The simulation ended without a decision.
+            BaseException: Whatever the model, a mapping or a policy raises.
+        """
+        seed = checked_seed(seed)
+        self._episode, self.agents = None, []
+        self._episode = episode = self._start(seed, options, rounds=True)
+        self.agents = list(episode.agents)
+        records = episode.agents.values()
+        return (
+            {record.agent: self._observation(episode, record.agent) for record in records},
+            {record.agent: _info(episode, record) for record in records},
+        )
+
+    def step(self, actions: Mapping[str, Any]) -> Results:
+        """Play a round.
+
+        Args:
+            actions: By live agent: an action in its action space, or ``RULE``.
+
+        Returns:
+            By agent: observations, rewards (python floats), terminations, truncations (python bools) and
+            infos. ``infos[agent]["deciding"]`` tells whose decision is pending, ``["acted"]`` whether the
+            agent's action was used. Agents that have ended are among them for the last time.
+
+        Raises:
+            UnknownAgentError: An action is for nobody who lives. The environment stands where it stood.
+            InvalidActionError: An action is not legal. The environment stands where it stood.
+            ResetNeededError: There is no episode to go on with.
+            BaseException: Whatever the model, a mapping or a policy raises.
+        """
+        episode = self._episode
+        if episode is None:
+            raise self._session.not_running()
+        try:
+            episode.play(actions)
+        except BaseException:
+            if episode.over:  # an error has ended it
+                self.agents = []
+            raise
+        records = [*episode.parting, *episode.agents.values()]
+        results: Results = {}, {}, {}, {}, {}
+        observations, rewards, terminations, truncations, infos = results
+        for record in records:
+            agent, ended = record.agent, record.ended
+            observations[agent] = self._observation(episode, agent)
+            rewards[agent] = record.reward
+            terminations[agent] = ended or episode.terminated
+            truncations[agent] = episode.truncated and not ended
+            infos[agent] = _info(episode, record)
+        self.agents = [] if episode.over else list(episode.agents)
+        return results
+
+    def close(self) -> None:
+        """End the episode and unwind the simulation; a later ``reset`` begins anew.
+
+        Raises:
+            BaseException: What the simulation raises while it unwinds.
+        """
+        self.agents = []
+        super().close()
+
+
+def _info(episode: Episode, record: Record) -> dict[str, Any]:
+    return {**record.info, "deciding": record is episode.pending, "acted": record.acted}

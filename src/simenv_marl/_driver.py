@@ -13,12 +13,14 @@ finds that out by one test.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import copy_context
 from functools import partial
-from threading import get_ident
+from threading import get_ident, local
 from typing import Any, Final, Protocol
+from weakref import ref
 
 from greenlet import getcurrent, greenlet
 
@@ -36,8 +38,12 @@ EVALUATING: dict[int, dict[Any, Any]] = {}
 """By thread: what differences remember for the agent whose mapping is being evaluated there."""
 
 
-class SimulationExit(BaseException):
-    """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught."""
+class SimulationExit(SystemExit):
+    """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught.
+
+    A ``SystemExit``, because event loops pass that on at once, where they would keep any other exception for
+    whoever awaits the task and let the other tasks go on.
+    """
 
 
 class Bound(Protocol):
@@ -78,14 +84,69 @@ class Driver(Protocol):
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from here."""
 
+    def lost(self) -> bool:
+        """Whether the simulation cannot be resumed from anywhere any more."""
+
     def forget(self) -> None:
         """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
+
+
+class _Home:
+    """Stands for a thread; unlike the thread's number it is never given to another one."""
+
+
+_homes = local()
+
+
+def _home() -> _Home:
+    try:
+        home: _Home = _homes.home
+    except AttributeError:
+        home = _homes.home = _Home()
+    return home
+
+
+class _EventLoops:
+    """Keeps apart the event loops in which a simulation and its user may run.
+
+    asyncio knows one running loop of a thread, whichever stack it runs on.
+    """
+
+    __slots__ = ("_inner", "_outer")
+
+    def __init__(self) -> None:
+        self._inner: Any = None
+        self._outer: Any = None
+
+    def enter(self) -> None:
+        """The simulation goes on."""
+        events = sys.modules["asyncio.events"]
+        self._outer = events._get_running_loop()
+        events._set_running_loop(self._inner)
+
+    def leave(self) -> None:
+        """The simulation is suspended, or over."""
+        events = sys.modules["asyncio.events"]
+        self._inner = events._get_running_loop()
+        events._set_running_loop(self._outer)
+        self._outer = None
 
 
 class GreenletDriver:
     """Runs a simulation on a greenlet of the thread in which it is made."""
 
-    __slots__ = ("_ask", "_bindings", "_body", "_inside", "_switch_out", "_thread", "caller", "resume")
+    __slots__ = (
+        "_ask",
+        "_bindings",
+        "_body",
+        "_home",
+        "_inside",
+        "_loops",
+        "_switch_out",
+        "_thread",
+        "caller",
+        "resume",
+    )
 
     def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Bound]) -> None:
         """Prepare a greenlet; the first ``resume`` starts it.
@@ -97,6 +158,9 @@ class GreenletDriver:
         self._bindings = bindings
         self._ask: Ask | None = self.ask
         self._thread = get_ident()
+        self._home = ref(_home())
+        # Where nobody has imported asyncio, nobody runs an event loop.
+        self._loops = _EventLoops() if "asyncio" in sys.modules else None
         self._body = greenlet(self._run)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
         self._body.gr_context = copy_context()
@@ -115,15 +179,18 @@ class GreenletDriver:
         finally:
             if self._ask is not None:
                 del RUNNING[self._thread]
+                if self._loops is not None:
+                    self._loops.leave()
 
     def ask(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """In the simulation: decide a call of a decision point."""
         binding = self._bindings.get(point)
         if binding is None:
             return point.rule(*args, **kwargs)
-        inside = getcurrent()
-        if inside is not self._inside:  # a model may switch stacks of its own: come back to the one that asks
-            self._inside, self.resume = inside, inside.switch
+        if getcurrent() is not self._inside:
+            self._come_back_here()
+        if self._loops is not None:
+            self._loops.leave()
         switch_out, thread, deliver = self._switch_out, self._thread, binding.deliver
         del RUNNING[thread]
         try:
@@ -132,13 +199,23 @@ class GreenletDriver:
             self._running()
             raise
         RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
+        if self._loops is not None:
+            self._loops.enter()
         if reply is RULE:
             return point.rule(*args, **kwargs)
         return reply if deliver is None else deliver(reply, *args, **kwargs)
 
+    def _come_back_here(self) -> None:
+        """A model may switch stacks of its own: remember the one that asks."""
+        # The stack that asks must not refer to itself, which nobody could collect.
+        self._inside = getcurrent()
+        self.resume = self._inside.switch
+
     def _running(self) -> None:
         if self._ask is not None:
             RUNNING[self._thread] = self._ask
+            if self._loops is not None:
+                self._loops.enter()
 
     def enter(self) -> None:
         """Make ready to be resumed from here.
@@ -165,7 +242,11 @@ class GreenletDriver:
 
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from here."""
-        return self._thread == get_ident()
+        return self._home() is _home()
+
+    def lost(self) -> bool:
+        """Whether the thread has ended in which alone the simulation could be resumed."""
+        return self._home() is None
 
     def forget(self) -> None:
         """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""

@@ -24,7 +24,6 @@ Views read the records of agents; none of them computes an observation or a rewa
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from threading import get_ident
 from typing import Any, Final
@@ -52,11 +51,13 @@ from .errors import (
     ReentrancyError,
     UnknownAgentError,
     WrongThreadError,
+    warn_user,
 )
 from .simulation import RULE, TRUNCATED, Sentinel
 
-UNWINDING_TRIES: Final = 8
-"""How often a simulation that is to be unwound may decide or swallow before it is given up."""
+UNWINDING_TRIES: Final = 1000
+"""How often a simulation that is to be unwound may decide or swallow before it is given up. A SimPy model loses one of
+its processes at each try."""
 
 MISSING: Final = Sentinel("MISSING")
 
@@ -476,6 +477,8 @@ class Episode:
         """
         if self.pending is None and not self.over:
             raise self.nothing_pending()
+        if self._driver is not None and self._driver.lost():
+            self._let_go_of_driver()
         if self._driver is not None and not self._driver.reachable():
             raise WrongThreadError(
                 "the simulation is suspended in another thread, and only there it can be closed or reset"
@@ -491,7 +494,7 @@ class Episode:
         if self._driver is not None and not self._driver.reachable():
             self._let_go_of_driver()  # its own thread unwinds it, as soon as that switches again
         for problem in self._unwind():
-            warnings.warn(f"a simulation that was abandoned raised {problem!r}", ResourceWarning, stacklevel=2)
+            warn_user(f"a simulation that was abandoned raised {problem!r}", ResourceWarning)
 
     def _unwind(self) -> list[BaseException]:
         """Raise ``SimulationExit`` in the suspended simulation until it is gone. Returns what else it raised."""
@@ -515,11 +518,10 @@ class Episode:
                     return problems
         _given_up.append(driver)
         self._driver = None
-        warnings.warn(
+        warn_user(
             f"{type(self._simulation).__name__} refuses to end: it went on after {UNWINDING_TRIES} times"
             " SimulationExit was raised in it; it is left suspended. Let it re-raise what it does not know.",
             ResourceWarning,
-            stacklevel=3,
         )
         return problems
 

@@ -6,7 +6,6 @@ is abandoned in mid-episode goes at once and takes its session along.
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 from zlib import crc32
 
@@ -16,7 +15,7 @@ from gymnasium import spaces
 from ._driver import unattended
 from ._episode import Episode
 from ._plan import Plan
-from .errors import ClosedError, NotResetError, OptionValueError
+from .errors import ClosedError, NotResetError, OptionValueError, warn_user
 from .simulation import make_simulation, resetter
 
 
@@ -70,9 +69,7 @@ class Session:
             NoDecisionError: The simulation ended without one.
             BaseException: What the model raises.
         """
-        if self._episode is not None:
-            self._episode.close()
-            self._episode = None
+        self.end()
         self._closed = False
         self._hold_sites()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
@@ -85,6 +82,20 @@ class Session:
         self._episode = episode = Episode(self.plan, self.simulation, self.seed, rounds=rounds)
         return episode
 
+    def end(self) -> None:
+        """End the episode that runs, if one does.
+
+        Raises:
+            ReentrancyError, WrongThreadError: It cannot be ended from here; it goes on.
+            BaseException: What the simulation raises while it unwinds.
+        """
+        if self._episode is not None:
+            try:
+                self._episode.close()
+            finally:
+                if self._episode.over:
+                    self._episode = None
+
     def not_running(self) -> Exception:
         """The error that says why there is no episode."""
         if self._closed:
@@ -95,10 +106,7 @@ class Session:
         """Render the simulation in the environment's render mode; None, with a warning, where it has none."""
         mode = self.plan.options.render_mode
         if mode is None:
-            warnings.warn(
-                f"render() without a render_mode shows nothing; the simulation's are {self.plan.render_modes}",
-                stacklevel=3,
-            )
+            warn_user(f"render() without a render_mode shows nothing; the simulation's are {self.plan.render_modes}")
             return None
         with unattended():
             return self.simulation.render(mode)
@@ -107,14 +115,15 @@ class Session:
         """Unwind the simulation and put back what was patched.
 
         Raises:
+            ReentrancyError, WrongThreadError: The episode cannot be ended from here; it goes on.
             BaseException: What the simulation raises while it unwinds.
         """
-        episode, self._episode, self._closed = self._episode, None, True
         try:
-            if episode is not None:
-                episode.close()
+            self.end()
         finally:
-            self._let_go_of_sites()
+            if self._episode is None:
+                self._closed = True
+                self._let_go_of_sites()
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""

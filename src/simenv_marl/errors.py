@@ -27,6 +27,10 @@
 Every error is raised with its message alone, so that it survives pickling.
 """
 
+import sys
+import warnings
+from pathlib import Path
+
 __all__ = [
     "AgentError",
     "ClosedError",
@@ -50,6 +54,16 @@ __all__ = [
     "ViewError",
     "WrongThreadError",
 ]
+
+_PACKAGE = str(Path(__file__).parent)
+
+
+def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn, and point at the line outside this package that has led here."""
+    level, frame = 1, sys._getframe(0)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
 
 
 class SimEnvError(Exception):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from gymnasium.utils import seeding
 from .._driver import unattended
 from .._episode import Episode
 from .._plan import Binding, Plan
-from .._session import Session, seed_space
+from .._session import Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast
 from ..errors import UnknownAgentError, UnknownOptionError
 
@@ -95,8 +96,19 @@ class View:
         Raises:
             BaseException: What the simulation raises while it unwinds.
         """
+        self._end(self._session.close)
+
+    def _end(self, end: Callable[[], None]) -> None:
+        """End the episode; forget it, unless that was refused."""
+        try:
+            end()
+        finally:
+            if self._episode is None or self._episode.over:
+                self._clear()
+
+    def _clear(self) -> None:
+        """Forget the episode."""
         self._episode = None
-        self._session.close()
 
 
 class AgentsView(View):
@@ -122,7 +134,9 @@ class AgentsView(View):
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
 
     def _start(self, seed: int | None, options: dict[str, Any] | None, *, rounds: bool) -> Episode:
-        """Begin an episode, and seed the agents' spaces."""
+        """End the episode that runs, begin another, and seed the agents' spaces."""
+        seed = checked_seed(seed)
+        self._end(self._session.end)
         if seed is not None or self._generator is None:
             self._generator, _ = seeding.np_random(seed)
         episode = self._session.start(seed, options, self._generator, rounds=rounds)

@@ -10,7 +10,6 @@ from pettingzoo import AECEnv
 from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
-from .._session import checked_seed
 from ..errors import InvalidActionError
 from ..simulation import RULE
 from ._view import AgentsView
@@ -57,8 +56,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        seed = checked_seed(seed)
-        self._clear()
         self._episode = episode = self._start(seed, options, rounds=False)
         self._enter(episode)
 
@@ -140,19 +137,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             raise self._session.not_running()
         return self._observation(self._episode, agent)
 
-    def close(self) -> None:
-        """End the episode and unwind the simulation; a later ``reset`` begins anew.
-
-        Raises:
-            BaseException: What the simulation raises while it unwinds.
-        """
-        self._clear()
-        super().close()
-
     # -- PettingZoo's books -----------------------------------------------------------------------
 
     def _clear(self) -> None:
-        self._episode = None
+        super()._clear()
         self.agents = []
         self._places: dict[str, int] = {}  # of the agents, in the list of agents
         self._leaving: list[str] = []  # whose episode has ended, the next one last

@@ -75,8 +75,8 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         seed = checked_seed(seed)
+        self._end(self._session.end)
         gym.Env.reset(self, seed=seed)
-        self._episode = None
         self._episode = self._session.start(seed, options, self.np_random, rounds=True)
         if seed is not None:
             seed_space(self.observation_space, seed, "joint")

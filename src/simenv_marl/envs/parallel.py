@@ -10,7 +10,6 @@ from pettingzoo import ParallelEnv
 from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
-from .._session import checked_seed
 from ._view import AgentsView
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
@@ -53,8 +52,6 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        seed = checked_seed(seed)
-        self._episode, self.agents = None, []
         self._episode = episode = self._start(seed, options, rounds=True)
         self.agents = list(episode.agents)
         records = episode.agents.values()
@@ -102,14 +99,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         self.agents = [] if episode.over else list(episode.agents)
         return results
 
-    def close(self) -> None:
-        """End the episode and unwind the simulation; a later ``reset`` begins anew.
-
-        Raises:
-            BaseException: What the simulation raises while it unwinds.
-        """
+    def _clear(self) -> None:
+        super()._clear()
         self.agents = []
-        super().close()
 
 
 def _info(episode: Episode, record: Record) -> dict[str, Any]:

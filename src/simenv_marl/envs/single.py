@@ -38,7 +38,7 @@ class SimulationEnv(View, gym.Env[Any, Any]):
         self._agent = str(plan.active[0].agent)
         self.observation_space = copy.deepcopy(definition.observation_space)
         self.action_space = copy.deepcopy(definition.action_space)
-        self._record: Record
+        self._record: Any
 
     @staticmethod
     def check(plan: Plan) -> None:
@@ -71,8 +71,8 @@ class SimulationEnv(View, gym.Env[Any, Any]):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         seed = checked_seed(seed)
+        self._end(self._session.end)
         gym.Env.reset(self, seed=seed)
-        self._episode = None
         self._episode = episode = self._session.start(seed, options, self.np_random)
         if seed is not None:
             seed_space(self.observation_space, seed, self._agent)
@@ -98,7 +98,7 @@ class SimulationEnv(View, gym.Env[Any, Any]):
         if episode is None:
             raise self._session.not_running()
         episode.turn(action)
-        record = self._record
+        record: Record = self._record
         return (
             record.observation,
             record.reward,
@@ -106,6 +106,10 @@ class SimulationEnv(View, gym.Env[Any, Any]):
             episode.truncated and not record.ended,
             record.info,
         )
+
+    def _clear(self) -> None:
+        super()._clear()
+        self._record = None
 
 
 class SimulationGoalEnv(SimulationEnv):

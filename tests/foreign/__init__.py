@@ -1,0 +1,1 @@
+"""Somebody else's package: it has never heard of decision points."""

@@ -1,0 +1,474 @@
+"""Section 5.9 of the contract: ends in mid-episode, and what is left behind, which is nothing."""
+
+import gc
+import subprocess
+import sys
+import threading
+import warnings
+import weakref
+from contextlib import suppress
+from textwrap import dedent
+
+import greenlet
+import pytest
+
+from simenv_marl import RULE, ClosedError, SimEnvError, aec_env, single_env
+
+from .models import Script, alive, calling, decision, play, script, stacks
+
+VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
+TRIGGERS = pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
+
+
+@VIEWS
+@TRIGGERS
+def test_an_end_in_mid_episode_unwinds_the_simulation(view, trigger):
+    log = []
+
+    class Managed:
+        def __enter__(self):
+            log.append("enter")
+
+        def __exit__(self, *error):
+            log.append("exit")
+
+    def main(simulation):
+        try:
+            with Managed():
+                try:
+                    decide()
+                    decide()
+                finally:
+                    log.append("inner")
+            log.append("never")
+        finally:
+            log.append("outer")
+
+    decide = decision()
+    env = view(script(main), decide)
+    env.reset()
+    env.step(1)
+    assert log == ["enter"]
+    if trigger == "collect":
+        del env
+        gc.collect()
+    else:
+        getattr(env, trigger)()
+    assert log[:4] == ["enter", "inner", "exit", "outer"]
+    assert log[4:] == (["enter"] if trigger == "reset" else [])
+
+
+@VIEWS
+@TRIGGERS
+def test_decisions_while_unwinding_are_not_answered(view, trigger):
+    log, asked = [], []
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            log.append("finally")
+            try:
+                log.append(decide())
+            finally:
+                log.append("inner finally")
+                log.append(other())
+                log.append("never")
+
+    decide = decision(lambda: log.append("rule"), agent="a_0", reward_mapping=lambda: asked.append(1) or 0)
+    other = decision(agent="b_0")
+    env = view(script(main), [decide, other], policies={other: RULE} if view is single_env else None)
+    env.reset()
+    asked.clear()
+    if trigger == "collect":
+        del env
+        gc.collect()
+    else:
+        getattr(env, trigger)()
+    expected = ["finally", "inner finally"]
+    # A point that nobody asked for is nothing but its rule.
+    assert log == (expected if view is aec_env else [*expected, "rule", "never"])
+    assert len(asked) == (1 if trigger == "reset" else 0)  # 1: the next episode's
+
+
+@VIEWS
+def test_closing_does_not_touch_what_has_ended(view):
+    decide = decision()
+    env = view(calling(decide), decide)
+    env.reset()
+    env.step(1)
+    env.close()
+    env.close()
+    assert env.unwrapped.simulation.log == [1]
+
+
+@VIEWS
+def test_an_end_by_max_steps_is_unwound_by_what_comes_next(view):
+    log = []
+
+    def main(simulation):
+        try:
+            while True:
+                decide()
+        finally:
+            log.append("unwound")
+
+    decide = decision()
+    env = view(script(main), decide, max_steps=2)
+    for number in range(3):
+        env.reset()
+        assert len(log) == number
+        env.step(1)
+        env.step(1)
+    env.close()
+    assert len(log) == 3
+    env.reset()
+    env.step(1)
+    env.step(1)
+    del env
+    gc.collect()
+    assert len(log) == 4
+
+
+@VIEWS
+@pytest.mark.parametrize("how", ["ended", "suspended", "failed", "closed", "truncated", "never reset", "reset failed"])
+def test_environments_are_collected_and_take_everything_along(view, how):
+    class Witness:
+        pass
+
+    class Watched(Script):
+        def __init__(self):
+            super().__init__(None)
+            self.witness = Witness()
+
+        def run(self):
+            if how == "reset failed":
+                raise ZeroDivisionError
+            local = Witness()
+            for _ in range(3):
+                decide(local)
+            if how == "failed":
+                raise ZeroDivisionError
+
+    before = stacks()
+    decide = decision(lambda witness: 0, agent="a_0", observation_space_mapping=lambda witness: [0, 0])
+    env = view(Watched, decide, max_steps=2 if how == "truncated" else None)
+    if how == "reset failed":
+        with pytest.raises(ZeroDivisionError):
+            env.reset()
+    elif how != "never reset":
+        env.reset()
+        env.step(1)
+        if how != "suspended":
+            env.step(1)
+        if how == "ended":
+            env.step(1)
+        if how == "failed":
+            with pytest.raises(ZeroDivisionError):
+                env.step(1)
+        if how == "closed":
+            env.close()
+    references = [weakref.ref(env), weakref.ref(env.unwrapped.simulation)]
+    del env
+    gc.collect()
+    assert [reference() for reference in references] == [None, None]
+    assert alive(Witness) == 0
+    assert stacks() == before
+
+
+@VIEWS
+def test_an_abandoned_environment_goes_without_the_collector(view):
+    log = []
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            log.append("unwound")
+
+    decide = decision()
+    gc.collect()
+    gc.disable()
+    try:
+        env = view(script(main), decide)
+        env.reset()
+        del env
+        assert log == ["unwound"]
+    finally:
+        gc.enable()
+
+
+@VIEWS
+def test_many_episodes_leave_nothing_behind(view):
+    def main(simulation):
+        local = Witness()
+        decide(local)
+        decide(local)
+
+    class Witness:
+        pass
+
+    decide = decision(lambda witness: 0, agent="a_0", observation_space_mapping=lambda witness: [0, 0])
+    env = view(script(main), decide)
+    threads = threading.active_count()
+    env.reset()
+    before = stacks(), alive(Witness)
+    for number in range(50):
+        env.reset()
+        if number % 3:
+            env.step(1)
+        if number % 3 == 2:
+            env.step(1)
+    env.reset()
+    assert (stacks(), alive(Witness)) == before
+    assert threading.active_count() == threads
+    env.close()
+    assert alive(Witness) == 0
+
+
+def test_objects_do_not_pile_up():
+    decide = decision()
+    env = aec_env(calling(*[decide] * 5), decide)
+
+    def count():
+        for _ in range(20):
+            play(env, 1)
+            env.reset()
+        gc.collect()
+        return len(gc.get_objects())
+
+    count()
+    before = count()
+    for _ in range(3):
+        after = count()
+    assert after - before < 20
+
+
+def test_a_simulation_that_refers_to_itself_and_to_its_frames_is_collected():
+    class Knotted(Script):
+        def run(self):
+            self.generator = (self for _ in [1])
+            self.me = self
+            frames = [self]
+            frames.append(frames)
+            decide()
+
+    decide = decision()
+    env = single_env(lambda: Knotted(None), decide)
+    env.reset()
+    reference = weakref.ref(env.unwrapped.simulation)
+    del env
+    gc.collect()
+    assert reference() is None
+
+
+# -- models that resist ---------------------------------------------------------------------------
+
+
+def swallow_exceptions(simulation):
+    while True:
+        try:
+            decide()
+        except Exception:
+            simulation.log.append("swallowed")
+
+
+def swallow_once(simulation):
+    with suppress(BaseException):
+        decide()
+    return "done"
+
+
+def swallow_a_few(simulation):
+    for _ in range(4):
+        with suppress(BaseException):
+            decide()
+
+
+def translate(simulation):
+    try:
+        decide()
+    except BaseException as error:
+        raise RuntimeError("translated") from error
+
+
+def stop_in_finally(simulation):
+    while True:
+        try:
+            decide()
+        finally:
+            break  # noqa: B012
+
+
+decide = decision()
+
+
+@VIEWS
+@TRIGGERS
+@pytest.mark.parametrize("main", [swallow_exceptions, swallow_once, swallow_a_few, translate, stop_in_finally])
+def test_models_that_resist_a_little_are_unwound(view, trigger, main):
+    before = stacks()
+    env = view(script(main), decide)
+    env.reset()
+    simulation = env.unwrapped.simulation
+    log = simulation.log
+    if trigger == "collect":
+        del env
+        gc.collect()
+    else:
+        getattr(env, trigger)()
+    assert log == []
+    if trigger != "reset":
+        assert stacks() == before
+
+
+def stubborn(simulation):
+    while True:
+        with suppress(BaseException):
+            simulation.log.append(decide())
+
+
+@VIEWS
+@pytest.mark.parametrize("trigger", ["close", "reset"])
+def test_a_model_that_refuses_to_unwind_is_given_up_with_a_warning(view, trigger):
+    stop = [False]
+
+    def refuse(simulation):
+        while not stop[0]:
+            with suppress(BaseException):
+                simulation.log.append(decide())
+
+    env = view(script(refuse), decide)
+    env.reset()
+    env.step(1)
+    log = env.unwrapped.simulation.log
+    with pytest.warns(ResourceWarning, match="Script"):
+        getattr(env, trigger)()
+    assert log == [1]  # none of its decisions was answered
+    if trigger == "close":
+        with pytest.raises(ClosedError):
+            env.step(1)
+        env.reset()
+    env.step(2)
+    assert env.unwrapped.simulation.log == [2]
+    stop[0] = True
+    env.step(3)
+
+
+@VIEWS
+def test_a_model_that_refuses_to_unwind_when_it_is_collected_is_given_up_with_a_warning(view):
+    env = view(script(stubborn), decide)
+    env.reset()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        del env
+        gc.collect()
+    assert [warning.category for warning in caught] == [ResourceWarning]
+
+
+def test_the_warning_points_at_the_users_line():
+    env = single_env(script(stubborn), decide)
+    env.reset()
+    with pytest.warns(ResourceWarning) as caught:
+        env.close()
+    assert caught[0].filename == __file__
+
+
+def test_errors_while_a_collected_simulation_unwinds_are_not_lost():
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            raise KeyError("while unwinding")
+
+    env = single_env(script(main), decide)
+    env.reset()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        del env
+        gc.collect()
+    assert "while unwinding" in str(caught[0].message)
+
+
+def test_an_end_of_the_process_unwinds_what_is_suspended():
+    code = """
+        import sys
+        from tests.models import decision, script
+        from simenv_marl import aec_env
+        decide = decision()
+        def main(simulation):
+            try:
+                decide()
+            finally:
+                print("unwound", flush=True)
+        env = aec_env(script(main), decide)
+        env.reset()
+    """
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", dedent(code)], capture_output=True, text=True, check=False
+    )
+    assert (result.returncode, result.stdout, result.stderr) == (0, "unwound\n", "")
+
+
+# -- threads --------------------------------------------------------------------------------------
+
+
+def test_an_environment_whose_thread_has_ended_can_be_dropped():
+    log = []
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            log.append("unwound")
+
+    env = single_env(script(main), decide)
+    thread = threading.Thread(target=env.reset)
+    thread.start()
+    thread.join()
+    reference = weakref.ref(env)
+    del env, thread
+    gc.collect()
+    assert reference() is None
+
+
+def test_an_environment_whose_thread_has_ended_can_be_reset():
+    env = single_env(calling(decide, decide), decide)
+    thread = threading.Thread(target=env.reset)
+    thread.start()
+    thread.join()
+    env.reset()
+    env.step(1)
+    assert env.unwrapped.simulation.log == [1]
+    env.close()
+
+
+def test_an_environment_that_is_dropped_in_another_thread_unwinds_in_its_own():
+    log = []
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            log.append(threading.get_ident())
+
+    held = [single_env(script(main), decide)]
+    held[0].reset()
+    thread = threading.Thread(target=held.clear)
+    thread.start()
+    thread.join()
+    gc.collect()
+    greenlet.greenlet(lambda: None).switch()  # whatever switches next
+    assert log == [threading.get_ident()]
+
+
+def test_refusals_are_not_errors_of_the_next_episode():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        env = single_env(script(stubborn), decide)
+        for _ in range(3):
+            env.reset()
+            env.step(1)
+        env.close()
+        with pytest.raises(SimEnvError):
+            env.step(1)

@@ -60,6 +60,8 @@ UNWINDING_TRIES: Final = 1000
 its processes at each try."""
 
 MISSING: Final = Sentinel("MISSING")
+UNNAMED: Final = Sentinel("UNNAMED")
+NAMED_AT_CALL: Final = Sentinel("NAMED_AT_CALL")
 
 _given_up: list[Driver] = []
 """Simulations that refused to unwind: dropping them would resume them at some random moment."""
@@ -99,7 +101,8 @@ class Episode:
         self.parting: list[Record] = []
         self.over = self.terminated = self.truncated = False
         self.turns = 0
-        self._swift: dict[Any, Record] = {}  # by binding: agents for which nothing but the mappings is to be done
+        # By binding: whose decision it is, where nothing but the mappings is to be seen to.
+        self._swift: dict[Any, Any] = {}
         self._answered: dict[str, Record] = {}  # those for whom policies answer
         self._latest: Record | None = None
         self._plan, self._simulation, self._seed = plan, simulation, seed
@@ -175,7 +178,14 @@ class Episode:
                 # Functions are fetched from attributes before they are called: calling them there is slower.
                 resume = driver.resume
                 binding, args, kwargs = resume(reply)
-                record = self._swift.get(binding)
+                record, agent = self._swift.get(binding), UNNAMED
+                if record is NAMED_AT_CALL:
+                    (first,) = args
+                    name_agent = binding.name_agent
+                    agent = name_agent(first)
+                    record = self.agents.get(agent) if type(agent) is str else None
+                    if record is not None and (record.binding is not binding or not record.decided):
+                        record = None
                 if record is not None and turns != self._max_turns:
                     # What ``_take`` and ``Record.settle`` do, for the calls of most models: of one argument, with
                     # nothing but the mappings to be seen to.
@@ -197,7 +207,7 @@ class Episode:
                     record.info = {}
                     self.pending = record
                     return
-                reply = self._take(binding, args, kwargs)
+                reply = self._take(binding, args, kwargs, agent)
                 if self.pending is not None or self.over:
                     return
                 binding = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
@@ -212,7 +222,7 @@ class Episode:
             return EpisodeOverError("the episode is over; call reset() to begin the next one")
         return ReentrancyError("the environment was used from inside its own simulation or mappings")
 
-    def _take(self, binding: Any, args: Any, kwargs: Any) -> Any:
+    def _take(self, binding: Any, args: Any, kwargs: Any, agent: Any = UNNAMED) -> Any:
         """See to an event: make its decision pending, or return the reply to it, or end the episode."""
         if type(binding) is not Binding:
             if type(binding) is Removal:
@@ -220,11 +230,10 @@ class Episode:
             result = [args]
             args = None  # this frame must not hold an error that is about to have it in its traceback
             return self._end(binding, result)
-        agent = binding.agent
+        if agent is UNNAMED:
+            agent = binding.agent or binding.name_agent(*args, **kwargs)
         if agent is None:
-            agent = binding.name_agent(*args, **kwargs)
-            if agent is None:
-                return RULE
+            return RULE
         record = self.agents.get(agent) if type(agent) is str else None
         if record is None or record.binding is not binding:
             record = self._meet(agent, binding)
@@ -239,8 +248,8 @@ class Episode:
             return None
         else:
             record.settle(args, kwargs)
-            if not record.followed_up and binding.legal is None and binding.point.alone:
-                self._swift[binding] = record
+            if self._clock is None and binding.legal is None and binding.point.alone:
+                self._swift[binding] = NAMED_AT_CALL if binding.agent is None else record
         self.pending = record
         return None
 
@@ -429,7 +438,8 @@ class Episode:
                 continue
             self._conclude(record)
             record.ended = True
-            self._swift.pop(binding, None)
+            if binding.agent is not None:
+                self._swift.pop(binding, None)
             self.gone[agent] = self.agents.pop(agent)
             self.parting.append(record)
         return RULE

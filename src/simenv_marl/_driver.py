@@ -106,47 +106,13 @@ def _home() -> _Home:
     return home
 
 
-class _EventLoops:
-    """Keeps apart the event loops in which a simulation and its user may run.
-
-    asyncio knows one running loop of a thread, whichever stack it runs on.
-    """
-
-    __slots__ = ("_inner", "_outer")
-
-    def __init__(self) -> None:
-        self._inner: Any = None
-        self._outer: Any = None
-
-    def enter(self) -> None:
-        """The simulation goes on."""
-        events = sys.modules["asyncio.events"]
-        self._outer = events._get_running_loop()
-        events._set_running_loop(self._inner)
-
-    def leave(self) -> None:
-        """The simulation is suspended, or over."""
-        events = sys.modules["asyncio.events"]
-        self._inner = events._get_running_loop()
-        events._set_running_loop(self._outer)
-        self._outer = None
-
-
 class GreenletDriver:
     """Runs a simulation on a greenlet of the thread in which it is made."""
 
     __slots__ = (
-        "_ask",
-        "_bindings",
-        "_body",
-        "_home",
-        "_inside",
-        "_loops",
-        "_switch_out",
-        "_thread",
-        "caller",
-        "resume",
-    )
+        "_ask", "_bindings", "_body", "_get_loop", "_home", "_inside", "_switch_out", "_thread", "_users_loop",
+        "caller", "resume",
+    )  # fmt: skip
 
     def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Bound]) -> None:
         """Prepare a greenlet; the first ``resume`` starts it.
@@ -159,8 +125,10 @@ class GreenletDriver:
         self._ask: Ask | None = self.ask
         self._thread = get_ident()
         self._home = ref(_home())
-        # Where nobody has imported asyncio, nobody runs an event loop.
-        self._loops = _EventLoops() if "asyncio" in sys.modules else None
+        # asyncio knows one running loop of a thread, whichever stack it runs on: the simulation's and its user's
+        # are to be kept apart. Where nobody has imported asyncio, nobody runs a loop.
+        self._get_loop = getattr(sys.modules.get("asyncio.events"), "_get_running_loop", None)
+        self._users_loop: Any = None
         self._body = greenlet(self._run)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
         self._body.gr_context = copy_context()
@@ -171,16 +139,13 @@ class GreenletDriver:
 
     def _run(self, run: Callable[[], Any], _: Any) -> Event:
         self._inside = None  # the first decision sets ``resume`` to what resumes it
-        self._running()
+        self._go_in(None)
         try:
             return FINISHED, run(), None
         except BaseException as error:
             return FAILED, error, None
         finally:
-            if self._ask is not None:
-                del RUNNING[self._thread]
-                if self._loops is not None:
-                    self._loops.leave()
+            self._go_out()
 
     def ask(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """In the simulation: decide a call of a decision point."""
@@ -189,18 +154,22 @@ class GreenletDriver:
             return point.rule(*args, **kwargs)
         if getcurrent() is not self._inside:
             self._come_back_here()
-        if self._loops is not None:
-            self._loops.leave()
-        switch_out, thread, deliver = self._switch_out, self._thread, binding.deliver
+        # What ``_go_out`` and ``_go_in`` do, without the calls.
+        switch_out, thread, deliver, get_loop = self._switch_out, self._thread, binding.deliver, self._get_loop
+        loop = get_loop() if get_loop is not None else None
+        if loop is not None or self._users_loop is not None:
+            self._swap_loops(self._users_loop)
         del RUNNING[thread]
         try:
             reply = switch_out(binding, args, kwargs)
         except BaseException:
-            self._running()
+            self._go_in(loop)
             raise
         RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
-        if self._loops is not None:
-            self._loops.enter()
+        if get_loop is not None:
+            self._users_loop = get_loop()
+            if loop is not None or self._users_loop is not None:
+                self._swap_loops(loop)
         if reply is RULE:
             return point.rule(*args, **kwargs)
         return reply if deliver is None else deliver(reply, *args, **kwargs)
@@ -211,11 +180,25 @@ class GreenletDriver:
         self._inside = getcurrent()
         self.resume = self._inside.switch
 
-    def _running(self) -> None:
-        if self._ask is not None:
-            RUNNING[self._thread] = self._ask
-            if self._loops is not None:
-                self._loops.enter()
+    def _go_in(self, loop: Any) -> None:
+        """The simulation goes on, in the event loop in which it was."""
+        if self._ask is None:  # forgotten: it unwinds, and nobody has asked it to
+            return
+        RUNNING[self._thread] = self._ask
+        if self._get_loop is not None:
+            self._users_loop = self._get_loop()
+            self._swap_loops(loop)
+
+    def _go_out(self) -> None:
+        """The simulation's user goes on, in the event loop in which that was."""
+        if self._ask is None:
+            return
+        del RUNNING[self._thread]
+        if self._get_loop is not None:
+            self._swap_loops(self._users_loop)
+
+    def _swap_loops(self, loop: Any) -> None:
+        sys.modules["asyncio.events"]._set_running_loop(loop)
 
     def enter(self) -> None:
         """Make ready to be resumed from here.

@@ -190,10 +190,13 @@ class Episode:
                     # What ``_take`` and ``Record.settle`` do, for the calls of most models: of one argument, with
                     # nothing but the mappings to be seen to.
                     self._latest = record
-                    record._args, record._kwargs = args, kwargs
+                    (first,) = args
+                    if agent is UNNAMED:
+                        record._args, record._kwargs = args, kwargs
+                    elif record._weakly is None or record._weakly() is not first or record._kwargs:
+                        record.hold(args, kwargs)
                     if self._remembering:
                         EVALUATING[get_ident()] = record.memory
-                    (first,) = args
                     reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
                     reward = reward_mapping(first)
                     if type(reward) is not float:
@@ -409,8 +412,6 @@ class Episode:
                     record.hold(args, {})
                     if not self._rounds:
                         record.observe(args, {})
-                    if binding.agent is None:
-                        record.loosen()
 
     def _names(self) -> str:
         names = list(self.agents)

@@ -48,7 +48,7 @@ class Record:
         self.decided = self.acted = self.ended = False
         self._time: float | None = None
         self._now: float | None = None
-        self.followed_up = binding.agent is None or clock is not None or binding.definition.choices is not None
+        self.followed_up = clock is not None or binding.definition.choices is not None
         self.observation: Any = None
         self.reward = 0.0
         self.info: dict[str, Any] = {}
@@ -62,21 +62,6 @@ class Record:
     def follow_up(self) -> None:
         """See to what is to be done when its decision is answered, if ``followed_up``."""
         self._time, self.choices = self._now, None
-        if self.binding.agent is None:
-            self.loosen()
-
-    def loosen(self) -> None:
-        """Keep the first argument weakly from now on, so that the model can let go of an entity."""
-        args = self._args
-        if args:
-            first = args[0]
-            if self._weakly is None or self._weakly() is not first:
-                try:
-                    self._weakly = ref(first)
-                except TypeError:  # cannot be held weakly
-                    self._weakly = None
-                    return
-            self._args = (self._weakly, *args[1:])
 
     def arguments(self) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
         """The arguments of the latest decision; None where there are none any more."""
@@ -87,8 +72,21 @@ class Record:
         return None if args is None else (args, self._kwargs)
 
     def hold(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Keep the arguments of a decision."""
+        """Keep the arguments of a decision.
+
+        The first one of an entity-level point is kept weakly where it can be, so that the model can let go of
+        the entity. While its decision is pending, the simulation holds it.
+        """
         self._args, self._kwargs = args, kwargs
+        if args and self.binding.agent is None:
+            first = args[0]
+            if self._weakly is None or self._weakly() is not first:
+                try:
+                    self._weakly = ref(first)
+                except TypeError:
+                    self._weakly = None
+                    return
+            self._args = (self._weakly, *args[1:])
 
     def first(self) -> Any:
         """The first argument of the latest decision; None where there is none any more."""

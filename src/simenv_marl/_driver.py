@@ -220,6 +220,8 @@ class GreenletDriver:
     def throw(self) -> Event:
         """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
         self.enter()
+        if self._body.dead:
+            return FINISHED, None, None
         event: Event = self._inside.throw(SimulationExit())
         return event
 

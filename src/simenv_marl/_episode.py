@@ -385,12 +385,32 @@ class Episode:
 
     def _settle_all(self) -> None:
         """Reward and observe all live agents, as far as the calls are known on which they decide."""
+        thread = get_ident()
+        plain = {binding for binding in self._plan.active if binding.legal is None and self._clock is None}
         for record in self.agents.values():
             arguments = record.arguments()
             if arguments is None:
                 record.reward, record.info = 0.0, {}
-            else:
-                record.settle(*arguments)
+                continue
+            args, kwargs = arguments
+            binding = record.binding
+            if kwargs or len(args) != 1 or not record.decided or binding not in plain:
+                record.settle(args, kwargs)
+                continue
+            # The same, for the calls of most models: of one argument, with nothing but the mappings to be seen to.
+            self._latest = record
+            (first,) = args
+            reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
+            EVALUATING[thread] = record.memory
+            reward = reward_mapping(first)
+            if type(reward) is not float:
+                reward = number(reward)
+            if reward - reward != 0.0:
+                raise not_finite(record, reward)
+            record.reward = reward
+            record.observation = cast(observe(first))
+            record.info = {}
+        EVALUATING.pop(thread, None)
 
     def _foresee(self) -> None:
         """Get to know agents before they decide, where the simulation knows the calls to come."""
@@ -398,17 +418,18 @@ class Episode:
         if expected is None:
             return
         for binding in self._plan.active:
+            name_agent = binding.name_agent
             for call in expected(binding.point.name):
                 args = tuple(call)
-                agent = binding.agent or binding.name_agent(*args)
-                if agent is None or agent in self.gone or agent in self._answered:
-                    continue
-                record = self.agents.get(agent)
+                agent = binding.agent if name_agent is None else name_agent(*args)
+                record = self.agents.get(agent) if type(agent) is str else None
                 if record is None or record.binding is not binding:
+                    if agent is None or agent in self.gone or agent in self._answered:
+                        continue
                     record = self._meet(agent, binding)
-                if record is self.pending or record.policy is not None:
-                    continue
-                if self._rounds or not record.decided:
+                    if record.policy is not None:
+                        continue
+                if record is not self.pending and (self._rounds or not record.decided):
                     record.hold(args, {})
                     if not self._rounds:
                         record.observe(args, {})

@@ -27,6 +27,7 @@ class Record:
         decided: Whether a reward has been asked for it in this episode: the first one is dropped.
         acted: Whether an action of its user was used in the latest round.
         ended: Whether its episode has ended before the simulation's.
+        handed_out: The observation that a view has given away, and which is not to be given away again.
         followed_up: Whether something is to be done when its decision is answered.
         observation: Its latest observation, cast to its space; None before it was ever observed.
         reward: The reward of its action before, as of its latest decision or its end.
@@ -37,7 +38,7 @@ class Record:
 
     __slots__ = (
         "_args", "_kwargs", "_now", "_time", "_weakly", "acted", "agent", "binding", "choices", "clock", "decided",
-        "ended", "followed_up", "info", "mask", "memory", "observation", "policy", "reward",
+        "ended", "followed_up", "handed_out", "info", "mask", "memory", "observation", "policy", "reward",
     )  # fmt: skip
 
     def __init__(self, agent: str, binding: Binding, policy: Any, clock: Callable[[], float] | None) -> None:
@@ -51,6 +52,7 @@ class Record:
         self.followed_up = clock is not None or binding.definition.choices is not None
         self.observation: Any = None
         self.reward = 0.0
+        self.handed_out: Any = None
         self.info: dict[str, Any] = {}
         self.mask: Any = None
         self.choices: Any = None

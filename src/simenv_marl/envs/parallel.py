@@ -7,9 +7,9 @@ from typing import Any
 
 from pettingzoo import ParallelEnv
 
-from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
+from .._spaces import blank, duplicate
 from ._view import AgentsView
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
@@ -56,8 +56,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         self.agents = list(episode.agents)
         records = episode.agents.values()
         return (
-            {record.agent: self._observation(episode, record.agent) for record in records},
-            {record.agent: _info(episode, record) for record in records},
+            {record.agent: self._hand_out(record) for record in records},
+            {
+                record.agent: {**record.info, "deciding": record is episode.pending, "acted": False}
+                for record in records
+            },
         )
 
     def step(self, actions: Mapping[str, Any]) -> Results:
@@ -86,16 +89,17 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             if episode.over:  # an error has ended it
                 self.agents = []
             raise
-        records = [*episode.parting, *episode.agents.values()]
         results: Results = {}, {}, {}, {}, {}
         observations, rewards, terminations, truncations, infos = results
-        for record in records:
-            agent, ended = record.agent, record.ended
-            observations[agent] = self._observation(episode, agent)
+        terminated, truncated, pending = episode.terminated, episode.truncated, episode.pending
+        for agent, record in (*((record.agent, record) for record in episode.parting), *episode.agents.items()):
+            ended, info = record.ended, record.info
+            observations[agent] = self._hand_out(record)
             rewards[agent] = record.reward
-            terminations[agent] = ended or episode.terminated
-            truncations[agent] = episode.truncated and not ended
-            infos[agent] = _info(episode, record)
+            terminations[agent] = ended or terminated
+            truncations[agent] = truncated and not ended
+            info["deciding"], info["acted"] = record is pending, record.acted
+            infos[agent] = info
         self.agents = [] if episode.over else list(episode.agents)
         return results
 
@@ -103,6 +107,12 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         super()._clear()
         self.agents = []
 
-
-def _info(episode: Episode, record: Record) -> dict[str, Any]:
-    return {**record.info, "deciding": record is episode.pending, "acted": record.acted}
+    def _hand_out(self, record: Record) -> Any:
+        """The observation of an agent, which nobody else gets to see: each return makes its own."""
+        observation = record.observation
+        if observation is None:
+            return blank(record.binding.definition.observation_space)
+        if record.handed_out is observation:  # it could not be observed anew
+            return duplicate(observation)
+        record.handed_out = observation
+        return observation

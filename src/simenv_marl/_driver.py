@@ -13,11 +13,11 @@ finds that out by one test.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import copy_context
 from functools import partial
+from sys import modules
 from threading import get_ident, local
 from typing import Any, Final, Protocol
 from weakref import ref
@@ -127,7 +127,8 @@ class GreenletDriver:
         self._home = ref(_home())
         # asyncio knows one running loop of a thread, whichever stack it runs on: the simulation's and its user's
         # are to be kept apart. Where nobody has imported asyncio, nobody runs a loop.
-        self._get_loop = getattr(sys.modules.get("asyncio.events"), "_get_running_loop", None)
+        self._get_loop: Any = None
+        self._find_loops()
         self._users_loop: Any = None
         self._body = greenlet(self._run)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
@@ -156,6 +157,8 @@ class GreenletDriver:
             self._come_back_here()
         # What ``_go_out`` and ``_go_in`` do, without the calls.
         switch_out, thread, deliver, get_loop = self._switch_out, self._thread, binding.deliver, self._get_loop
+        if get_loop is None and "asyncio" in modules:
+            get_loop = self._find_loops()
         loop = get_loop() if get_loop is not None else None
         if loop is not None or self._users_loop is not None:
             self._swap_loops(self._users_loop)
@@ -197,8 +200,12 @@ class GreenletDriver:
         if self._get_loop is not None:
             self._swap_loops(self._users_loop)
 
+    def _find_loops(self) -> Any:
+        self._get_loop = getattr(modules.get("asyncio.events"), "_get_running_loop", None)
+        return self._get_loop
+
     def _swap_loops(self, loop: Any) -> None:
-        sys.modules["asyncio.events"]._set_running_loop(loop)
+        modules["asyncio.events"]._set_running_loop(loop)
 
     def enter(self) -> None:
         """Make ready to be resumed from here.

@@ -146,7 +146,9 @@ class Episode:
             EpisodeOverError: No decision is pending.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        record, driver = self.pending, self._driver
+        agent: Any
+        record: Any = self.pending
+        driver = self._driver
         if record is None or driver is None:
             raise self.nothing_pending()
         if (RUNNING or EVALUATING) and attended():  # inside another environment's simulation
@@ -213,7 +215,8 @@ class Episode:
                 reply = self._take(binding, args, kwargs, agent)
                 if self.pending is not None or self.over:
                     return
-                binding = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
+                # Else they would keep alive what the model lets go meanwhile.
+                binding = args = kwargs = first = agent = record = None
         except BaseException as error:
             binding = args = kwargs = first = None  # else the error would keep them alive
             self._fail(error)
@@ -372,7 +375,7 @@ class Episode:
         if action is not RULE:
             if record.mask is not None and not binding.allowed(action, record.mask):
                 return MISSING
-            action = binding.convert(action) if record.choices is None else record.choices[action]
+            action = binding.convert(action) if record.choices is None else [record.choices[action]]
         del left[record.agent]
         record.acted = True
         if not record.decided:  # seen for the first time, and acting at once

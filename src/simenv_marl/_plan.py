@@ -175,7 +175,7 @@ class Binding:
             InvalidActionError: The action is not legal.
         """
         legal = self.checked(action, agent, mask)
-        return self.convert(legal) if choices is None else choices[legal]
+        return self.convert(legal) if choices is None else [choices[legal]]
 
     def checked(self, action: Any, agent: str, mask: Any) -> Any:
         """Check an action: the first half of ``reply``."""
@@ -239,7 +239,7 @@ def _chosen(mapping: Callable[..., Any], most: int, name: str, args: Any, kwargs
 
 def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
     """Make what turns a reply into the value of a call, which for a generator function is a generator."""
-    apply = definition.apply
+    apply = definition.apply if definition.choices is None else _taken_out
     if kind == "function":
         return apply
     wrap = _returning if kind == "generator" else _awaiting
@@ -251,6 +251,11 @@ def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
         return value if inspect.isgenerator(value) or inspect.isawaitable(value) else wrap(value)
 
     return deliver
+
+
+def _taken_out(box: list[Any], *args: Any, **kwargs: Any) -> Any:
+    """The choice in a box, in which it crosses so that nothing on the user's side keeps it alive."""
+    return box.pop()
 
 
 def _returning(value: Any) -> Any:

@@ -273,12 +273,8 @@ class Site:
         self._held, self._inherited = held, attribute not in vars(owner)
         self._binding = type(held) if held is not function else None
         self._users = 0
-        bound = self._binding is not staticmethod
-        if self._inherited:
-            rule = _next_in_line(owner, attribute, function, self._binding)
-            self.point = DecisionPoint(rule, name, bound=bound, like=function)
-        else:
-            self.point = DecisionPoint.of(function, name, bound=bound)
+        rule = _next_in_line(owner, attribute, function, self._binding) if self._inherited else function
+        self.point = DecisionPoint(rule, name, bound=self._binding is not staticmethod, like=function)
         wrapper = self.point.wrap(None)
         self._wrapper: Any = wrapper if self._binding is None else self._binding(wrapper)
 

@@ -71,7 +71,8 @@ class Definition:
             PatchError: ``function`` is none of these.
         """
         rule, binding = unbind(function)
-        point = DecisionPoint.of(unwrapped(rule), bound=binding is not staticmethod)
+        known = point_of(rule)
+        point = known[0] if known else DecisionPoint(rule, bound=binding is not staticmethod)
         wrapper = point.wrap(self)
         point.definition = self
         _REGISTRY[point.name] = point
@@ -223,9 +224,6 @@ def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[
 _REGISTRY: WeakValueDictionary[str, DecisionPoint] = WeakValueDictionary()
 """The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
 
-_BY_RULE: WeakValueDictionary[int, DecisionPoint] = WeakValueDictionary()
-"""The point of every rule, by the rule's identity. A point holds its rule, so that none outlives it."""
-
 
 class DecisionPoint:
     """One function of a model that decides something.
@@ -271,19 +269,6 @@ class DecisionPoint:
             self.kind = "coroutine"
         else:
             self.kind = "function"
-
-        _BY_RULE[id(rule)] = self
-
-    @classmethod
-    def of(cls, rule: FunctionType, name: str | None = None, *, bound: bool) -> DecisionPoint:
-        """The point of a rule, which is made where there is none yet.
-
-        Args:
-            rule: The function that decides.
-            name: As when a point is made.
-            bound: As when a point is made.
-        """
-        return _BY_RULE.get(id(rule)) or cls(rule, name, bound=bound)
 
     def __repr__(self) -> str:
         return f"<DecisionPoint {self.name}>"

@@ -10,6 +10,7 @@
     |-- AgentError           (ValueError)    names of agents that clash or are none
     |-- UnknownAgentError    (LookupError)   an agent that the environment does not know
     |-- ViewError            (ValueError)    a view that these decision points do not allow
+    |-- CopyError            (TypeError)     an environment that was to be copied or pickled
     |-- UnknownOptionError   (TypeError)     an option that does not exist
     |-- OptionValueError     (ValueError)    an option that cannot have this value
     |-- InvalidActionError   (ValueError)    an action that is not legal; nothing has moved
@@ -34,6 +35,7 @@ from pathlib import Path
 __all__ = [
     "AgentError",
     "ClosedError",
+    "CopyError",
     "DefinitionError",
     "EpisodeOverError",
     "InvalidActionError",
@@ -96,6 +98,10 @@ class UnknownAgentError(SimEnvError, LookupError):
 
 class ViewError(SimEnvError, ValueError):
     """A view was asked for that the active decision points do not allow."""
+
+
+class CopyError(SimEnvError, TypeError):
+    """An environment was to be copied or pickled, which it cannot be."""
 
 
 class UnknownOptionError(SimEnvError, TypeError):

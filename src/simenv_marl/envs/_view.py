@@ -16,7 +16,7 @@ from .._episode import Episode
 from .._plan import Binding, Plan
 from .._session import Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast
-from ..errors import UnknownAgentError, UnknownOptionError
+from ..errors import CopyError, UnknownAgentError, UnknownOptionError
 
 
 class View:
@@ -105,6 +105,10 @@ class View:
         finally:
             if self._episode is None or self._episode.over:
                 self._clear()
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse to be copied or pickled: the stack of a simulation cannot be."""
+        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
 
     def _clear(self) -> None:
         """Forget the episode."""

@@ -579,16 +579,6 @@ def test_one_function_may_have_many_definitions():
         assert [decided_by(named, called) for named in (early, late, last)] == ["early", "late", "last"]
 
 
-def test_many_definitions_may_all_be_applied_to_the_undecorated_function():
-    def rule():
-        return 0
-
-    one = define(action_space_mapping=lambda action: ("one", action))(rule)
-    two = define(action_space_mapping=lambda action: ("two", action))(rule)
-    for called in (one, two):
-        assert [decided_by(named, called) for named in (one, two)] == ["one", "two"]
-
-
 class Twice:
     """Decorated in its class, and once more from outside."""
 

@@ -1,5 +1,7 @@
 """Section 4: generate_env, aec_env, single_env and their options."""
 
+import copy
+
 import gymnasium
 import numpy as np
 import pettingzoo
@@ -468,6 +470,33 @@ def test_an_agent_has_one_decision_point():
     env.reset()
     with pytest.raises(AgentError):
         env.step(1)
+
+
+# -- copies ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [aec_env, single_env])
+@pytest.mark.parametrize("state", ["fresh", "suspended", "over"])
+def test_a_copy_of_an_environment_works_or_is_refused(make, state):
+    env = make(calling(PUMP, PUMP), PUMP)
+    if state != "fresh":
+        env.reset()
+        env.step(1)
+    if state == "over":
+        env.step(1)
+    try:
+        copied = copy.deepcopy(env)
+    except (SimEnvError, TypeError):
+        pass
+    else:
+        copied.reset()
+        copied.step(3)
+        copied.step(4)
+        assert copied.unwrapped.simulation.log == [3, 4]
+        assert copied.unwrapped.simulation is not env.unwrapped.simulation
+    env.reset()
+    env.step(5)
+    assert env.unwrapped.simulation.log == [5]
 
 
 # -- rendering ------------------------------------------------------------------------------------

@@ -758,6 +758,60 @@ def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
     assert env.unwrapped.simulation.log == [[False, True]]
 
 
+def test_a_choice_that_the_model_lets_go_at_once_goes_at_once():
+    class Grass:
+        pass
+
+    class Goat:
+        def __init__(self):
+            self.meadow = [Grass(), Grass()]
+
+        @define(agent="goat_0", action_space=spaces.Discrete(2), choices=lambda self: list(self.meadow))
+        def browse(self):
+            return self.meadow[0]
+
+    def main(simulation):
+        goat = Goat()
+        watched = [weakref.ref(grass) for grass in goat.meadow]
+        goat.meadow.remove(goat.browse())
+        simulation.log.append([watch() is None for watch in watched])
+
+    for action, gone in ((RULE, [True, False]), (0, [True, False]), (1, [False, True])):
+        env = single_env(script(main), Goat.browse)
+        env.reset()
+        env.step(action)
+        assert env.unwrapped.simulation.log == [gone]
+
+
+@pytest.mark.parametrize("policy", [None, RULE, lambda observation: 1], ids=["nobody", "rule", "policy"])
+@pytest.mark.parametrize("actions", [RULE, 1])
+def test_nor_any_entity_that_is_no_agent_or_a_policys(policy, actions):
+    class Lamb:
+        def __init__(self, number):
+            self.number = number
+
+        @define(agent=lambda self: None if policy is None and self.number == 2 else f"lamb_{self.number}")
+        def choose(self):
+            return 1
+
+    def main(simulation):
+        lambs = [Lamb(1), Lamb(2), Lamb(1)]
+        watched = [weakref.ref(lamb) for lamb in lambs]
+        while lambs:
+            lambs.pop(0).choose()
+            simulation.log.append([watch() is None for watch in watched])
+
+    gc.collect()
+    gc.disable()
+    try:
+        env = aec_env(script(main), Lamb.choose, policies=policy and {"lamb_2": policy})
+        turns = play(env, actions)
+    finally:
+        gc.enable()
+    assert decisions(turns) == ["lamb_1", "lamb_1"]
+    assert env.unwrapped.simulation.log == [[True, False, False], [True, True, False], [True, True, True]]
+
+
 def test_entities_that_live_are_rewarded_and_observed_at_the_end():
     def main(simulation):
         simulation.herd = [Sheep(number) for number in range(3)]

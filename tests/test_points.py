@@ -500,6 +500,43 @@ def test_a_class_made_while_the_base_class_was_decided_outlives_that():
     assert log_of(opened(sub_class())) == [5, 9]
 
 
+class Animal:
+    def move(self):
+        return "rule"
+
+
+class Wolf(Animal):
+    pass
+
+
+class Sheep(Animal):
+    pass
+
+
+Wolf.move = define(action_space_mapping=lambda action: ("wolf", action))(Wolf.move)
+Sheep.move = define(action_space_mapping=lambda action: ("sheep", action))(Sheep.move)
+
+
+def animals():
+    return calling(*[lambda kind=kind: kind().move() for kind in (Animal, Wolf, Sheep)])
+
+
+@pytest.mark.parametrize(
+    ("points", "log"),
+    [
+        (Wolf.move, ["rule", ("wolf", 9), "rule"]),
+        (Sheep.move, ["rule", "rule", ("sheep", 9)]),
+        (f"{__name__}.Wolf.move", ["rule", ("wolf", 9), "rule"]),
+        (f"{__name__}.Sheep.move", ["rule", "rule", ("sheep", 9)]),
+        ([Wolf.move, Sheep.move], ["rule", ("wolf", 9), ("sheep", 9)]),
+        ([f"{__name__}.Sheep.move", f"{__name__}.Wolf.move"], ["rule", ("wolf", 9), ("sheep", 9)]),
+    ],
+    ids=["wolf", "sheep", "wolf-by-name", "sheep-by-name", "both", "both-by-name"],
+)
+def test_siblings_may_each_decorate_what_they_have_inherited(points, log):
+    assert log_of(aec_env(animals(), points)) == log
+
+
 # -- restoring ------------------------------------------------------------------------------------
 
 

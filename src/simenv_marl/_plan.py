@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from . import _spaces
-from ._points import NamedPoint, Site, find_point, find_points, locate, owner_class
+from ._points import NamedPoint, Site, find_point, find_points, locate, owner_class, stand_ins
 from ._spaces import ILLEGAL
 from .decision import DecisionPoint, Definition, unwrapped
 from .errors import (
@@ -314,6 +314,9 @@ class Plan:
                 active.append(binding)
         self.active = active
         self.sites: list[Site] = [point.site for point in everything if point.site is not None]
+        for bound in list(self.bindings.values()):
+            for other in stand_ins(bound.point):
+                self.bindings.setdefault(other, bound)
         self._find_removals()
         self.unanswered = unanswered
         if not active and not unanswered:
@@ -327,7 +330,7 @@ class Plan:
         return list(self.roster) if self.complete else None
 
     def _find_removals(self) -> None:
-        for binding in list(self.bindings.values()):
+        for binding in dict.fromkeys(self.bindings.values()):
             assert isinstance(binding, Binding)
             for name, agent in binding.definition.removed_by.items():
                 point, _, site = locate(name)

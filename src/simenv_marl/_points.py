@@ -7,13 +7,12 @@ everybody else it runs what it replaced.
 
 from __future__ import annotations
 
-import gc
 import importlib
 import inspect
-import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
+from sys import modules
 from types import FunctionType, ModuleType
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
@@ -144,16 +143,56 @@ def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None, Site | No
 
 def _is_decided(owner: Any, attribute: str) -> bool:
     held = _held(owner, attribute)
-    return point_of(held.__func__ if isinstance(held, (staticmethod, classmethod)) else held) is not None
+    return point_of(_plain(held)) is not None
 
 
 def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
     held = _held(owner, attribute)
-    known = point_of(held.__func__ if isinstance(held, (staticmethod, classmethod)) else held)
+    known = point_of(_plain(held))
     if known is not None and attribute in vars(owner):
         return (*known, Site.of(known[0]))
     site = Site.at(name, owner, attribute)
     return site.point, (known[1] or known[0].definition) if known else None, site  # decorated in a base class
+
+
+def stand_ins(point: DecisionPoint) -> list[DecisionPoint]:
+    """The points whose calls are this one's, too: other decorations of the same function in the same place.
+
+    A function that is decorated twice is one decision point with two definitions, whichever of its decision
+    functions the model calls. Inherited by two classes, and decorated for each, it is two.
+    """
+    family = point.family()
+    places = _decorated_places(point) if family else set()
+    return [
+        other
+        for other in family
+        if not places or not (others := _decorated_places(other)) or not places.isdisjoint(others)
+    ]
+
+
+def _decorated_places(point: DecisionPoint) -> set[Any]:
+    """The classes and modules that have a decision function of the point under the function's own name."""
+    name, wrappers = point.rule.__name__, set(point.wrappers)
+    owners: list[Any] = [*_all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
+    found = ((owner, vars(owner).get(name)) for owner in owners)
+    return {owner for owner, held in found if isinstance(_plain(held), FunctionType) and _plain(held) in wrappers}
+
+
+def _all_classes() -> Iterator[type]:
+    """All classes that there are."""
+    seen: set[type] = set()
+    left = [object]
+    while left:
+        owner = left.pop()
+        if owner not in seen:
+            seen.add(owner)
+            yield owner
+            left += type.__subclasses__(owner)
+
+
+def _plain(held: Any) -> Any:
+    """What a class or module holds, without its binding."""
+    return held.__func__ if isinstance(held, (staticmethod, classmethod)) else held
 
 
 def owner_class(point: DecisionPoint) -> type | None:
@@ -231,11 +270,9 @@ def _unknown(name: str, why: str) -> UnknownPointError:
 
 def _owner_at_hand(function: FunctionType) -> type:
     """Find the class that holds a function which is not found by its name, as inside another function."""
-    for namespace in gc.get_referrers(function):
-        if isinstance(namespace, dict) and namespace.get(function.__name__) is function:
-            for owner in gc.get_referrers(namespace):
-                if isinstance(owner, type) and vars(owner).get(function.__name__) is function:
-                    return owner
+    for owner in _all_classes():
+        if _plain(vars(owner).get(function.__name__)) is function:
+            return owner
     raise PatchError(
         f"{function.__module__}.{function.__qualname__} is not what is found under that name, nor in any class;"
         " name it where it is found, or decorate it with make_step"
@@ -263,7 +300,7 @@ class Site:
 
     def __init__(self, name: str, owner: Any, attribute: str) -> None:
         held = _held(owner, attribute)
-        function = held.__func__ if isinstance(held, (staticmethod, classmethod)) else held
+        function = _plain(held)
         if not isinstance(function, FunctionType):
             raise PatchError(
                 f"{name} cannot be a decision point: it is a {type(held).__name__} and no function written in"
@@ -337,7 +374,7 @@ def _places_of(function: Any) -> list[tuple[Any, str]]:
     """All names of loaded modules under which a function is found."""
     return [
         (module, name)
-        for module in list(sys.modules.values())
+        for module in list(modules.values())
         if isinstance(module, ModuleType)
         for name, value in list(vars(module).items())
         if value is function

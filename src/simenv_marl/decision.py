@@ -17,7 +17,7 @@ from functools import update_wrapper
 from threading import get_ident
 from types import FunctionType, MethodType
 from typing import Any, Final
-from weakref import WeakSet, WeakValueDictionary
+from weakref import WeakKeyDictionary, WeakSet, WeakValueDictionary
 
 import numpy as np
 from gymnasium import spaces
@@ -224,6 +224,9 @@ def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[
 _REGISTRY: WeakValueDictionary[str, DecisionPoint] = WeakValueDictionary()
 """The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
 
+_FAMILIES: WeakKeyDictionary[FunctionType, WeakSet[DecisionPoint]] = WeakKeyDictionary()
+"""By rule: the points that were made of it, each by a decoration of its own."""
+
 
 class DecisionPoint:
     """One function of a model that decides something.
@@ -235,10 +238,11 @@ class DecisionPoint:
             outside and is a decision point for some environments alone.
         alone: Whether every call has one argument, which is what it is called on.
         bound: Whether its first argument is what it is called on, which nobody passes by keyword.
+        wrappers: Its decision functions.
         kind: "function", "generator" or "coroutine": what a call of it returns.
     """
 
-    __slots__ = ("__weakref__", "alone", "bound", "definition", "kind", "name", "rule")
+    __slots__ = ("__weakref__", "alone", "bound", "definition", "kind", "name", "rule", "wrappers")
 
     def __init__(
         self, rule: FunctionType, name: str | None = None, *, bound: bool, like: FunctionType | None = None
@@ -261,6 +265,8 @@ class DecisionPoint:
         like = like or rule
         parameters = list(inspect.signature(rule, follow_wrapped=False).parameters.values())
         self.alone = self.bound and len(parameters) == 1 and _is_required(parameters[0])
+        self.wrappers: WeakSet[FunctionType] = WeakSet()
+        _FAMILIES.setdefault(rule, WeakSet()).add(self)
         if inspect.isasyncgenfunction(like):
             raise PatchError(f"{self.name} is an async generator function, which cannot return a decision")
         if inspect.isgeneratorfunction(like):
@@ -287,7 +293,12 @@ class DecisionPoint:
         """
         wrapper = _generate(self, definition)
         update_wrapper(wrapper, self.rule)
+        self.wrappers.add(wrapper)
         return wrapper
+
+    def family(self) -> list[DecisionPoint]:
+        """The other points of the same rule."""
+        return [point for point in _FAMILIES[self.rule] if point is not self]
 
 
 def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:

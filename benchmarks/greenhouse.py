@@ -9,12 +9,12 @@ import numpy as np
 from examples.greenhouse_coop.env import (
     DAYS,
     GreenhouseSim,
-    WateringEnv,
     exchange_air,
     observe,
     raw_env,
     reward,
     to_litres,
+    watering_env,
 )
 from examples.greenhouse_coop.model import Greenhouse
 
@@ -71,7 +71,7 @@ def plain_days(model: type[Greenhouse]) -> Contender:
 
 def single_days() -> Contender:
     """Make a contender that runs the same episode through the waterer's single environment."""
-    env: Any = WateringEnv()
+    env: Any = watering_env()
 
     def run() -> float:
         env.reset(seed=1)

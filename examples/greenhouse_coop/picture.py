@@ -1,0 +1,100 @@
+"""The picture of what training was worth: returns of all policies, and how the days went by under them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+COLOURS: Final = ("#8c8c8c", "#c9c9c9", "#e3b778", "#d1812c", "#7fb3d3", "#1b6f5f")
+"""In the order of the table: grey where nobody thinks, orange where constants were searched for, then the learnt."""
+
+INK: Final = "#333333"
+
+
+def draw(
+    returns: Mapping[str, Sequence[float]],
+    alive: Mapping[str, NDArray[Any]],
+    poured: Mapping[str, NDArray[Any]],
+    folder: Path,
+) -> Path:
+    """Draw the picture.
+
+    Args:
+        returns: By the title of each team, its return for each seed.
+        alive: Likewise, the plants alive by seed and day.
+        poured: Likewise, the litres poured by seed and day.
+        folder: Where to put it; is made if need be.
+
+    Returns:
+        The path of the picture.
+    """
+    colours = dict(zip(returns, COLOURS, strict=True))
+    figure = Figure(figsize=(12, 5.6), layout="constrained")
+    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.05), height_ratios=(1.5, 1))
+    _draw_returns(figure.add_subplot(grid[:, 0]), returns, colours)
+    _draw_alive(days := figure.add_subplot(grid[0, 1]), alive, colours)
+    _draw_poured(figure.add_subplot(grid[1, 1], sharex=days), poured, colours)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "greenhouse.png"
+    figure.savefig(path, dpi=150)
+    return path
+
+
+def _draw_returns(axes: Axes, returns: Mapping[str, Sequence[float]], colours: Mapping[str, str]) -> None:
+    jitter = np.random.default_rng(0)
+    for row, (title, values) in enumerate(returns.items()):
+        mean, spread = float(np.mean(values)), float(np.std(values))
+        axes.barh(row, mean, height=0.62, color=colours[title], xerr=spread, ecolor=INK, capsize=3)
+        axes.scatter(values, row + jitter.uniform(-0.2, 0.2, len(values)), s=7, color=INK, alpha=0.35, linewidths=0)
+        axes.annotate(
+            f"{mean:.1f}",
+            (max(*values, mean + spread), row),
+            (6, 0),
+            textcoords="offset points",
+            va="center",
+            color=INK,
+        )
+    axes.set_yticks(range(len(returns)), list(returns))
+    axes.invert_yaxis()
+    axes.set_xlim(min(0.0, axes.get_xlim()[0]), 107)
+    axes.axvline(0, color=INK, linewidth=0.8)
+    axes.set_title("Return of the team, over greenhouses it was not trained on", loc="left", fontsize=11)
+    axes.set_xlabel("share of plants alive less litres / 1000, summed over 100 days", fontsize=9)
+    _tidy(axes, "x")
+
+
+def _draw_alive(axes: Axes, alive: Mapping[str, NDArray[Any]], colours: Mapping[str, str]) -> None:
+    for title, counts in alive.items():
+        low, high = np.quantile(counts, (0.1, 0.9), axis=0)
+        days = np.arange(counts.shape[1])
+        axes.fill_between(days, low, high, color=colours[title], alpha=0.13, linewidth=0)
+        axes.plot(days, counts.mean(axis=0), color=colours[title], linewidth=1.8, label=title)
+    axes.set_ylim(0, None)
+    axes.set_title("Plants alive, day by day (mean, and 80 % of the greenhouses)", loc="left", fontsize=11)
+    axes.tick_params(labelbottom=False)
+    axes.legend(fontsize=8.5, frameon=False, loc="lower right", ncols=2)
+    _tidy(axes, "y")
+
+
+def _draw_poured(axes: Axes, poured: Mapping[str, NDArray[Any]], colours: Mapping[str, str]) -> None:
+    for title, litres in poured.items():
+        axes.plot(np.arange(litres.shape[1]), litres.mean(axis=0), color=colours[title], linewidth=1.6)
+    axes.set_ylim(0, 220)  # random actions pour some 500 at first, out of sight for the sake of all others
+    axes.set_title("Litres poured, day by day", loc="left", fontsize=11)
+    axes.set_xlabel("day", fontsize=9)
+    _tidy(axes, "y")
+
+
+def _tidy(axes: Axes, along: Any) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis=along, color="#e6e6e6", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=9, colors=INK)

@@ -1,12 +1,15 @@
-"""Lets each page's examples import the model that lies beside it, as if no other page had."""
+"""Lets each page's examples import the models that lie beside it, as if no other page had."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
+collect_ignore = ["bakery_env.py"]  # it imports a model that is only found from a page
+
 
 @pytest.fixture(autouse=True)
 def _models_beside_the_page(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
-    monkeypatch.delitem(sys.modules, "bakery", raising=False)
+    for model in ("bakery", "bakery_env", "lake"):
+        monkeypatch.delitem(sys.modules, model, raising=False)

@@ -5,11 +5,14 @@ many litres are poured, ``ventilator_0`` how much air is exchanged. The model kn
 are named as decision points from here, and stay what they are for everyone else.
 
 - ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, bare and in PettingZoo's wrappers.
+- ``parallel_env``: both agents, as a PettingZoo parallel environment, a round a day.
+- ``joint_env``: one agent that takes both decisions, as a Gymnasium environment; its reward is the sum of the two.
 - ``watering_env``: the waterer alone, as a Gymnasium environment; ventilation runs its rule.
 - ``ventilation_env``: the ventilator alone; watering runs its rule.
 
-Importing this module registers them: ``pettingzoo.make("aec", "greenhouse_coop/coop_v0")``,
-``gymnasium.make("greenhouse_coop/Watering-v0")``, ``gymnasium.make("greenhouse_coop/Ventilation-v0")``.
+Importing this module registers them: ``pettingzoo.make("aec", "greenhouse_coop/coop_v0")``, the same with
+``"parallel"``, and ``gymnasium.make`` of ``"greenhouse_coop/Watering-v0"``, ``"greenhouse_coop/Ventilation-v0"`` and
+``"greenhouse_coop/Joint-v0"``.
 
 Both agents are rewarded alike, once a day: with the share of the plants that are alive, less a thousandth for each
 litre poured since their decision of the day before. As it is one reward, the return of the team is the return of
@@ -29,12 +32,15 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import ClipOutOfBoundsWrapper, OrderEnforcingWrapper
 
+import simenv_marl
 from simenv_marl import (
     TRUNCATED,
     Definition,
     SimulationAECEnv,
     SimulationEnv,
     SimulationInterface,
+    SimulationJointEnv,
+    SimulationParallelEnv,
     aec_env,
     difference,
     make_step,
@@ -240,14 +246,37 @@ def env(**options: Any) -> OrderEnforcingWrapper[str, Any, Any]:
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(raw_env(**options)))
 
 
+def parallel_env(**options: Any) -> SimulationParallelEnv:
+    """Make the environment of both agents in which they decide day by day, and see nothing of each other's decision.
+
+    Args:
+        **options: As ``simenv_marl.parallel_env`` takes them.
+    """
+    return simenv_marl.parallel_env(GreenhouseSim, **options)
+
+
+def joint_env(**options: Any) -> SimulationJointEnv:
+    """Make the environment of one agent that takes both decisions; ``flatten=True`` makes one vector of them.
+
+    Args:
+        **options: As ``simenv_marl.joint_env`` takes them.
+    """
+    return simenv_marl.joint_env(GreenhouseSim, **options)
+
+
 def _register() -> None:
     """Tell the registries of Gymnasium and PettingZoo, unless they know already."""
-    for name, entry_point in (("Watering", "watering_env"), ("Ventilation", "ventilation_env")):
+    for name, entry_point in (
+        ("Watering", "watering_env"),
+        ("Ventilation", "ventilation_env"),
+        ("Joint", "joint_env"),
+    ):
         if f"greenhouse_coop/{name}-v0" not in gymnasium.registry:
             gymnasium.register(f"greenhouse_coop/{name}-v0", f"{__name__}:{entry_point}")
-    known = getattr(pettingzoo, "aec_registry", None)  # younger than the oldest PettingZoo that will do
-    if known is not None and "greenhouse_coop/coop-v0" not in known:
-        pettingzoo.register("aec", "greenhouse_coop/coop_v0", f"{__name__}:env")
+    for kind, entry_point in (("aec", "env"), ("parallel", "parallel_env")):
+        known = getattr(pettingzoo, f"{kind}_registry", None)  # younger than the oldest PettingZoo that will do
+        if known is not None and "greenhouse_coop/coop-v0" not in known:
+            pettingzoo.register(kind, "greenhouse_coop/coop_v0", f"{__name__}:{entry_point}")
 
 
 _register()

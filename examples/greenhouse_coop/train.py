@@ -239,7 +239,7 @@ class Schedule:
     def of(cls, budget: int) -> Self:
         """Divide a budget."""
         units = (len(LITRES), len(LITRES) * len(EXCHANGES), POPULATION * EPISODES_EACH, POPULATION * EPISODES_EACH)
-        shares = (0.1, 0.2, 0.2, 0.5)
+        shares = (0.1, 0.25, 0.2, 0.45)
         return cls(*(max(1, int(budget * share) // unit) for share, unit in zip(shares, units, strict=True)))
 
     @property
@@ -362,7 +362,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Read the options of the command line."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     parser = argparse.ArgumentParser(description="Train two agents to keep a greenhouse together.")
-    parser.add_argument("--budget", type=int, default=4500, help="episodes to learn from (default: %(default)s)")
+    parser.add_argument("--budget", type=int, default=3600, help="episodes to learn from (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="determines everything (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=cores, help="processes (default: one for each core)")

@@ -110,16 +110,14 @@ class Design:
     overseen: str = ""
     truncates: bool = False
 
-    @property
-    def names(self) -> list[str]:
-        """Of all creatures there may be."""
-        return [f"creature_{number}" for number in range(self.most)]
 
+MOST = 10
+ROSTER = [f"creature_{number}" for number in range(MOST)]
 
 designs = st.builds(
     Design,
     initial=st.integers(1, 5),
-    most=st.integers(5, 10),
+    most=st.integers(5, MOST),
     ticks=st.integers(1, 6),
     overseen=st.sampled_from(["", "before", "after"]),
     truncates=st.booleans(),
@@ -272,7 +270,7 @@ class Answered(Colony):
         return {agent: float(self.last[agent] - self.first[agent]) for agent in self.first}
 
 
-def colony_points(design: Design) -> dict[Any, Any]:
+def colony_points(*, overseen: bool) -> dict[Any, Any]:
     """The points of a colony, at which the change of its fortune is paid."""
     space = {"observation_space": spaces.Box(-1, 1e4, (3,), np.float64)}
     points = {
@@ -284,7 +282,7 @@ def colony_points(design: Design) -> dict[Any, Any]:
             **space,
         )
     }
-    if design.overseen:
+    if overseen:
         points[Colony.oversee] = define(
             agent="overseer_0",
             observation_space_mapping=lambda colony: [-1, colony.overseen, colony.fortune],
@@ -292,6 +290,27 @@ def colony_points(design: Design) -> dict[Any, Any]:
             **space,
         )
     return points
+
+
+_made: dict[Any, Any] = {}
+
+
+def colony(make: Any, design: Design, simulation: type[Colony] = Colony, *, roster: bool = False) -> Any:
+    """An environment of a colony: one that may have been used before, for another design.
+
+    Args:
+        make: What makes it.
+        design: The design of its episodes from now on.
+        simulation: Of which colony.
+        roster: Whether all that may be born are declared.
+    """
+    key = make, bool(design.overseen), simulation, roster
+    if key not in _made:
+        names = {f"{HERE}.Creature.act": ROSTER} if roster else None
+        points = colony_points(overseen=bool(design.overseen))
+        _made[key] = make(lambda: simulation(design), points, possible_agents=names)
+    _made[key].unwrapped.simulation.design = design
+    return _made[key]
 
 
 def advised(observation: Any, seed: int) -> Any:

@@ -4,6 +4,8 @@ import functools
 import inspect
 import math
 import pickle
+import typing
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -107,6 +109,36 @@ def test_a_decision_function_keeps_its_looks():
     assert inspect.ismethod(Pump().flow)
     assert Pump.strongest.__doc__ == "The power."
     assert Pump.rounded.__name__ == "rounded"
+
+
+def test_an_abstract_decision_stays_abstract():
+    class Model(ABC):
+        @define()
+        @abstractmethod
+        def decide(self):
+            """To be overridden."""
+
+    class Concrete(Model):
+        @define(agent="concrete_0")
+        def decide(self):
+            return super().decide() or "rule"
+
+    with pytest.raises(TypeError):
+        Model()
+    assert Concrete().decide() == "rule"
+    # What is overridden is another decision, which the one that overrides it may call.
+    env = aec_env(calling(lambda: Concrete().decide()), [Model.decide, Concrete.decide])
+    assert decisions(play(env, {"concrete_0": RULE, "decide_0": 3})) == ["concrete_0", "decide_0"]
+    assert env.unwrapped.simulation.log == [3]
+
+
+def test_decision_functions_are_pickled_by_name():
+    for function in (Pump.flow, Pump.rounded, Pump.strongest, Twice.decide):
+        assert pickle.loads(pickle.dumps(function)) == function
+
+
+def test_the_signature_is_the_rules_where_annotations_are_asked_for():
+    assert typing.get_type_hints(Pump.rounded) == {"amount": float, "return": int}
 
 
 def test_the_rule_is_what_was_decorated():
@@ -337,6 +369,10 @@ class Tank:
     def strict(self, amount, /, unit="l"):
         return "rule"
 
+    @staticmethod
+    def named(*, amount=1):
+        return "rule"
+
 
 @pytest.mark.parametrize(
     ("name", "call", "args", "kwargs"),
@@ -354,6 +390,8 @@ class Tank:
         ("build", lambda tank: tank.build(size=2), ("class",), {"size": 2}),
         ("mixed", lambda tank: tank.mixed(), ("self",), {}),
         ("mixed", lambda tank: tank.mixed(1, 2, x=3), ("self", 1, 2), {"x": 3}),
+        ("named", lambda tank: tank.named(), (), {}),
+        ("named", lambda tank: tank.named(amount=2), (), {"amount": 2}),
         ("strict", lambda tank: tank.strict(1), ("self", 1), {}),
         ("strict", lambda tank: tank.strict(1, unit=None), ("self", 1), {"unit": None}),
     ],

@@ -3,6 +3,8 @@
 import gc
 import random
 import weakref
+from functools import partial
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -275,6 +277,42 @@ def test_observations_are_never_shared_between_calls_or_with_the_model(kind, mak
     assert not any(np.shares_memory(one, two) for one in arrays for two in arrays if one is not two)
 
 
+class Holder:
+    """Holds an array once, in one of the places in which things are held."""
+
+    def __init__(self, place):
+        array = np.array([1.0, 2.0])
+        if place == "attribute":
+            self.array = array
+            self.observe = lambda: self.array
+        elif place == "list":
+            listed = [array]
+            self.observe = lambda: listed[0]
+        elif place == "closure":
+            self.observe = lambda: array
+        elif place == "default":
+            self.observe = partial(self._given, array)
+        elif place == "dict":
+            held = {"array": array}
+            self.observe = partial(held.get, "array")
+        elif place == "iterator":
+            self.observe = partial(next, repeat(array))
+
+    @staticmethod
+    def _given(array):
+        return array
+
+
+@pytest.mark.parametrize("place", ["attribute", "list", "closure", "default", "dict", "iterator"])
+def test_an_array_that_is_held_but_once_is_held(place):
+    observe = Holder(place).observe
+    decide = decision(observation_space_mapping=observe)
+    for env in (single_env(calling(decide, decide), decide), aec_env(calling(decide, decide), decide)):
+        for observation in (env.reset() or env.last())[0], (env.step(1) or env.last())[0]:
+            observation[:] = 0
+        assert observe().tolist() == [1.0, 2.0]
+
+
 @pytest.mark.parametrize("make", [aec_env, single_env])
 def test_infos_are_never_shared_between_steps(make):
     decide = decision(action_mask_mapping=lambda: MASK)
@@ -424,6 +462,36 @@ def test_before_its_first_decision_an_agents_observation_comes_from_expected_cal
         env.step(1)
 
 
+def test_agents_that_are_announced_are_rewarded_from_their_own_first_action_on():
+    class Ant:
+        def __init__(self, name):
+            self.name = name
+
+        @define(
+            agent=lambda self: self.name,
+            reward_mapping=lambda self: len(log),
+            observation_space_mapping=lambda self: [len(log), ord(self.name[0])],
+        )
+        def dig(self):
+            return 0
+
+    log = []
+    ants = [Ant("a"), Ant("b")]
+
+    def main(simulation):
+        log.clear()
+        for ant in (ants[0], ants[0], ants[1], ants[1]):
+            log.append(ant.dig())
+
+    env = aec_env(lambda: Foreseeing(main, {"dig": [(ant,) for ant in ants]}), Ant.dig)
+    env.reset()
+    assert env.observe("b").tolist() == [0, ord("b")]
+    turns = play(env, 1)
+    assert decisions(turns) == ["a", "a", "b", "b"]
+    assert [(turn.agent, turn.reward) for turn in turns[:4]] == [("a", 0.0), ("a", 1.0), ("b", 0.0), ("b", 3.0)]
+    assert {turn.agent: turn.reward for turn in turns[4:]} == {"a": 4.0, "b": 4.0}
+
+
 # -- 5.4: rewards ---------------------------------------------------------------------------------
 
 
@@ -519,12 +587,24 @@ def test_in_the_single_view_a_steps_reward_is_that_of_its_action():
         assert ledger.asked["a"] == 4 * number
 
 
-def test_agents_that_never_act_are_never_rewarded():
-    asked = []
-    a, b = decision(agent="a_0"), decision(agent="b_0", reward_mapping=lambda: asked.append(1) or 1.0)
-    env = aec_env(calling(a, a), [a, b])
-    turns = play(env)
-    assert [turn.reward for turn in turns if turn.agent == "b_0"] == [0.0]
+@pytest.mark.parametrize("expected", [{}, {"idle": [(7,)]}], ids=["unknown", "announced"])
+def test_agents_that_never_act_are_never_rewarded(expected):
+    asked, level = [], [0]
+
+    def idle(room):
+        return 0
+
+    a = decision(lambda: level.__setitem__(0, level[0] + 1), agent="a_0")
+    b = define(
+        agent="b_0",
+        observation_space_mapping=lambda room: [room, level[0]],
+        reward_mapping=lambda room: asked.append(1) or 1.0,
+    )(idle)
+    env = aec_env(lambda: Foreseeing(lambda simulation: [a(), a()], expected), [a, b])
+    turns = [turn for turn in play(env) if turn.agent == "b_0"]
+    assert [(turn.reward, turn.terminated) for turn in turns] == [(0.0, True)]
+    # At the end it is observed anew on the call that was to come.
+    assert turns[0].observation.tolist() == ([7, 2] if expected else [0, 0])
     assert not asked
 
 
@@ -566,6 +646,73 @@ def test_rewards_that_are_no_finite_number_are_errors(value):
         with pytest.raises(RewardError) as caught:
             env.step(1)
         assert isinstance(caught.value, ValueError)
+
+
+class Paid:
+    """Is paid what it has, at each of its decisions; a method, as most decisions are."""
+
+    value: Any = 0.0
+    observed: Any = (0.0, 0.0)
+
+    @define(
+        agent="paid_0",
+        reward_mapping=lambda self: self.value,
+        observation_space_mapping=lambda self: self.observed,
+    )
+    def choose(self):
+        return "rule"
+
+
+def paid(values, attribute="value"):
+    def main(simulation):
+        being = Paid()
+        for value in values:
+            being.choose()
+            setattr(being, attribute, value)
+
+    return script(main)
+
+
+VALUES = [2, np.float32(0.5), True, np.array([2.5]), np.array(1.5), -3.25, np.int8(4)]
+
+
+def test_rewards_of_methods_are_python_floats_at_every_step():
+    env = single_env(paid(VALUES), Paid.choose)
+    env.reset()
+    rewards = [env.step(1)[1] for _ in VALUES]
+    assert rewards == [2.0, 0.5, 1.0, 2.5, 1.5, -3.25, 4.0]
+    assert {type(reward) for reward in rewards} == {float}
+    turns = play(aec_env(paid(VALUES), Paid.choose), 1)
+    assert rewards_of(turns, "paid_0") == rewards
+    assert {type(turn.reward) for turn in turns} == {float}
+
+
+@pytest.mark.parametrize("value", [None, "1.0", np.nan, np.inf, [1.0, 2.0]], ids=str)
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_rewards_of_methods_that_are_no_finite_number_are_errors_at_every_step(value, number):
+    values = [1.0] * 3
+    values[number - 1] = value
+    for make in (aec_env, single_env):
+        env = make(paid(values), Paid.choose)
+        env.reset()
+        for _ in range(number - 1):
+            env.step(1)
+        with pytest.raises(RewardError):
+            env.step(1)
+
+
+@pytest.mark.parametrize("value", [None, "1.0", [1.0], [[1.0, 2.0]]], ids=str)
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_observations_of_methods_that_do_not_fit_are_errors_at_every_step(value, number):
+    values = [[1.0, 2.0]] * 3
+    values[number - 1] = value
+    for make in (aec_env, single_env):
+        env = make(paid(values, "observed"), Paid.choose)
+        env.reset()
+        for _ in range(number - 1):
+            env.step(1)
+        with pytest.raises(ObservationError):
+            env.step(1)
 
 
 def test_the_first_reward_of_an_episode_is_discarded_whatever_it_is():
@@ -881,6 +1028,8 @@ def test_entities_that_cannot_be_held_weakly_are_entities_too():
         (spaces.Box(0, 1, (1,), np.float32), [1.5, -0.1, np.nan, np.inf, [[0.5]], [0.5, 0.5], "a", None, 2, [2]]),
         (spaces.Box(0, 10, (1,), np.int32), [0.5, 11, -1, [1.5], None]),
         (spaces.Box(0, 10, (2,), np.uint8), [[256, 1], [-1, 1], [1.0, 1.5]]),
+        (spaces.Box(-1, 1, (5, 5), np.float32), [np.full((5, 5), 1.5), np.full((5, 5), np.nan), np.zeros(25), 0.5]),
+        (spaces.Box(0, 9, (25,), np.uint8), [np.full(25, 10), np.full(25, -1), np.full(25, 256), np.full(25, 1.0)]),
         (spaces.MultiDiscrete([2, 3]), [[0, 3], [2, 0], [0], 1, None, [-1, 0]]),
         (spaces.MultiBinary(2), [[0, 2], [1], 1, None]),
         (spaces.Tuple((spaces.Discrete(2), spaces.Discrete(2))), [(0,), (0, 2), 1, None]),
@@ -925,6 +1074,8 @@ def test_illegal_actions_are_errors_and_leave_everything_where_it_stood(make, sp
         (spaces.Box(0.1, 0.7, (2,), np.float32), [[0.1, 0.7], np.array([0.1, 0.7]), np.float32([0.1, 0.7])]),
         (spaces.Box(-np.inf, np.inf, (2,), np.float32), [[1e30, -1e30]]),
         (spaces.Box(0, 10, (2,), np.int32), [[0, 10], np.array([1, 2], np.uint8)]),
+        (spaces.Box(0.1, 0.7, (5, 5), np.float32), [np.full((5, 5), 0.1), np.full((5, 5), 0.7).tolist()]),
+        (spaces.Box(0, 9, (25,), np.uint8), [np.full(25, 9), np.zeros(25, np.int64)]),
         (spaces.MultiDiscrete([2, 3]), [[1, 2], np.array([0, 0])]),
         (spaces.MultiBinary(2), [[1, 0], np.array([1, 1], np.int8)]),
         (spaces.Text(3), ["abc"]),

@@ -24,7 +24,7 @@ from simenv_marl import (
     single_env,
 )
 
-from .models import Script, calling, culprits, decision, decisions, notes, play, script
+from .models import Script, calling, culprits, decision, decisions, define, notes, play, script
 
 # -- the tree -------------------------------------------------------------------------------------
 
@@ -374,6 +374,20 @@ def test_errors_while_unwinding_surface_as_themselves(trigger):
         goes_on(env)
 
 
+def test_errors_in_expected_calls_surface_as_themselves():
+    class Foreseeing(Script):
+        def expected_calls(self, point):
+            bomb()
+            return []
+
+    bomb, decide = Bomb(1), decision()
+    for view in (aec_env, single_env):
+        bomb.calls = 0
+        env = view(lambda: Foreseeing(lambda simulation: decide()), decide)
+        surfaces(env)
+        goes_on(env)
+
+
 def test_errors_in_rendering_surface_as_themselves():
     class Rendering(Script):
         def render(self, mode):
@@ -501,6 +515,42 @@ def test_notes_name_agent_decision_and_seed_of_the_episode():
         assert caught.value.__notes__ == [told]  # one note of one environment
 
 
+class Being:
+    """Has a mapping that fails at its second decision; a method, as most decisions are."""
+
+    def __init__(self, name):
+        self.name, self.decisions = name, 0
+
+    def observe(self):
+        self.decisions += 1
+        if self.name == "b" and self.decisions == 2:
+            raise Culprit("boom")
+        return [self.decisions, 0]
+
+    @define(agent=lambda self: f"being_{self.name}", observation_space_mapping=observe)
+    def choose(self):
+        return 0
+
+    @define(agent="alone_0", observation_space_mapping=observe)
+    def choose_alone(self):
+        return 0
+
+
+@pytest.mark.parametrize(("point", "agent"), [(Being.choose, "being_b"), (Being.choose_alone, "alone_0")])
+def test_notes_of_errors_at_later_decisions_of_methods(point, agent):
+    def main(simulation):
+        beings = [Being("a"), Being("b")]
+        for number in (0, 1, 0, 0, 1):
+            point(beings[number])
+
+    env = aec_env(script(main), point)
+    with pytest.raises(Culprit) as caught:
+        play(env, 1, seed=17)
+    assert agent in notes(caught.value)
+    assert "17" in notes(caught.value)
+    assert re.search(r"decision 5\b", notes(caught.value))
+
+
 def test_drawn_seeds_are_told_too_and_reproduce_the_error():
     seeds = []
 
@@ -559,6 +609,45 @@ def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing
     env.close()
     env.reset()
     env.step(1)
+
+
+@pytest.mark.parametrize("where", ["reset", "rule", "observation_space_mapping", "policy"])
+@pytest.mark.parametrize("what", ["step", "reset", "close"])
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_nothing(where, what, view):
+    raised = []
+
+    class Resetting(Script):
+        def reset(self, seed=None):
+            super().reset(seed)
+            if where == "reset":
+                use()
+
+    def use(*args):
+        if not raised:
+            raised.append(None)
+            with pytest.raises(SimEnvError) as caught:
+                env.step(1) if what == "step" else getattr(env, what)()
+            raised.append(type(caught.value))
+        return 1
+
+    changes = {"observation_space_mapping": lambda: use() and [0, 0]} if where.startswith("obs") else {}
+    decide = decision(agent="a_0", **changes)
+    other = decision(lambda: use() if where == "rule" else 1, agent="other_0")
+
+    def main(simulation):
+        for _ in range(2):
+            simulation.log.append((other(), decide()))
+
+    policies = {"other_0": use if where == "policy" else RULE}
+    env = view(lambda: Resetting(main), [decide, other], policies=policies)
+    env.reset()
+    assert raised[1] is ReentrancyError or (what == "step" and issubclass(raised[1], ResetNeededError))
+    env.step(3)
+    env.step(4)
+    assert env.unwrapped.simulation.episodes == 1
+    assert env.unwrapped.simulation.log == [(1, 3), (1, 4)]
+    env.close()
 
 
 # -- threads --------------------------------------------------------------------------------------

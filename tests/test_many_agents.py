@@ -24,6 +24,7 @@ from simenv_marl import (
     UnknownPointError,
     aec_env,
     difference,
+    parallel_env,
     single_env,
 )
 
@@ -41,6 +42,7 @@ from .many_worlds import (
     banish,
     being_of,
     beings,
+    colony,
     colony_points,
     designs,
     others,
@@ -1011,6 +1013,52 @@ def test_a_set_of_weak_references_is_as_it_would_be():
     assert len([turn for turn in turns if turn.terminated]) == 4
 
 
+class Hunt:
+    """Each being picks one of the living; whoever is let go of before its turn picks no more."""
+
+    def reset(self, seed=None):
+        self.beings = {number: Being(number) for number in range(4)}
+        self.weakly, self.log = weakref.WeakSet(self.beings.values()), []
+        for being in self.beings.values():
+            being.hunt = weakref.proxy(self)
+
+    def run(self):
+        for tick in range(2):
+            for number in range(4):
+                for being in [being for being in self.weakly if being.number == number]:
+                    picked = being.act()
+                    self.log.append((tick, number, getattr(picked, "number", picked)))
+                    del being, picked
+                if (tick, number) == (0, 1):
+                    del self.beings[2]
+
+
+class AnnouncedHunt(Hunt):
+    def expected_calls(self, point):
+        return [(being,) for being in self.beings.values()]
+
+
+@pytest.mark.parametrize("simulation", [Hunt, AnnouncedHunt])
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_choices_keep_nobody_alive(make, simulation):
+    """What somebody may choose from is not held until it does."""
+    plain = simulation()
+    plain.reset()
+    plain.run()
+    assert (0, 2, "rule") not in plain.log
+    definition = beings(
+        choices=lambda being: list(being.hunt.beings.values()), action_space=spaces.Discrete(4), removed_by=()
+    )
+    env = make(simulation, definition)
+    if make is aec_env:
+        play(env)
+    else:
+        env.reset()
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, RULE))
+    assert env.simulation.log == plain.log
+
+
 # -- everything at once ---------------------------------------------------------------------------
 
 
@@ -1052,8 +1100,8 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
     if not plain.decisions:
         return
     for simulation in (Colony, Announcing):
-        for roster in (None, {f"{HERE}.Creature.act": design.names}):
-            env = aec_env(lambda s=simulation: s(design), colony_points(design), possible_agents=roster)
+        for roster in (False, True):
+            env = colony(aec_env, design, simulation, roster=roster)
             result = played(env, lambda agent, number, observation: answer(seed, agent, number), seed)
             assert result.decisions == plain.decisions
             assert env.simulation.trace == plain.trace
@@ -1072,7 +1120,7 @@ def test_a_colony_is_what_it_would_be_without_the_library(design, seed):
 def test_observations_tell_what_is_needed(design, seed):
     """The answers follow from the observations alone, if these are those of the moment."""
     plain = Answered(design, seed)
-    env = aec_env(lambda: Announcing(design), colony_points(design))
+    env = colony(aec_env, design, Announcing)
     result = played(env, lambda agent, number, observation: advised(observation, seed), seed)
     assert result.decisions == plain.decisions
     assert env.simulation.trace == plain.trace
@@ -1084,7 +1132,7 @@ def test_with_rule_throughout_a_colony_is_the_plain_run(design, seed):
     plain = Colony(design)
     plain.reset(seed)
     ended = plain.run()
-    env = aec_env(lambda: Colony(design), colony_points(design))
+    env = colony(aec_env, design)
     played(env, lambda *_: RULE, seed)
     assert env.simulation.trace == plain.trace
     assert env.simulation.random.getstate() == plain.random.getstate()
@@ -1095,6 +1143,7 @@ def test_with_rule_throughout_a_colony_is_the_plain_run(design, seed):
 
 
 VILLAGE = Design(initial=5, most=40, ticks=12, overseen="after")
+NAMES_OF_THE_VILLAGE = [f"creature_{number}" for number in range(VILLAGE.most)]
 
 
 class Village(Colony):
@@ -1109,7 +1158,7 @@ class Village(Colony):
 
 
 def village(**options):
-    return aec_env(Village, colony_points(VILLAGE), **options)
+    return aec_env(Village, colony_points(overseen=True), **options)
 
 
 def test_api_with_births_and_deaths():
@@ -1126,8 +1175,8 @@ def test_api_with_a_roster():
     with warnings.catch_warnings():
         # Those that are never born are observed as zeros.
         warnings.filterwarnings("ignore", message="Observation numpy array is all zeros")
-        api_test(village(possible_agents=VILLAGE.names), num_cycles=100)
-    seed_test(lambda: village(possible_agents=VILLAGE.names), num_cycles=100)
+        api_test(village(possible_agents=NAMES_OF_THE_VILLAGE), num_cycles=100)
+    seed_test(lambda: village(possible_agents=NAMES_OF_THE_VILLAGE), num_cycles=100)
 
 
 # -- rewards --------------------------------------------------------------------------------------

@@ -643,6 +643,41 @@ def test_somebody_elses_patch_meanwhile_is_left_alone():
         Trader.bid = before
 
 
+def priced():
+    return calling(lambda: market.price("tea"), lambda: shop.total("tea"), lambda: shop.total_cost("tea"))
+
+
+PRICES = [f"{MARKET}.price", "tests.foreign.shop.price", "tests.foreign.shop.cost"]
+
+
+@pytest.mark.parametrize("first", range(3))
+def test_one_function_under_many_names_is_one_point(first):
+    before = market.price
+    classes = [generate_env(priced(), {name: define()}, view="aec") for name in PRICES[first:] + PRICES[:first]]
+    envs = [opened(env_class()) for env_class in classes]
+    for env in envs:
+        assert log_of(env) == [9, 9, 9]
+    for env in envs:
+        env.close()
+        assert log_of(envs[-1]) == [9, 9, 9]
+        assert log_of(envs[0]) == [9, 9, 9]
+    for env in envs:
+        env.close()
+    assert before is market.price is shop.price is shop.cost
+
+
+def test_one_function_under_many_names_is_one_point_for_environments_that_are_used_again():
+    one = aec_env(priced(), {PRICES[0]: define()})
+    one.close()
+    two = aec_env(priced(), {PRICES[1]: define()})
+    assert log_of(one) == log_of(two) == [9, 9, 9]
+
+
+def test_one_function_under_two_names_is_named_twice():
+    with pytest.raises(UnknownPointError, match="twice"):
+        aec_env(priced(), {PRICES[0]: define(agent="a_0"), PRICES[1]: define(agent="b_0")})
+
+
 # -- environments of the same undecorated model ---------------------------------------------------
 
 

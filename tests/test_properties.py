@@ -11,7 +11,8 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initial
 
 from simenv_marl import RULE, EpisodeOverError, InvalidActionError, ResetNeededError, aec_env, single_env
 
-from .worlds import Design, Reference, World, advised, agent_of, answers, designs, legal, points_of, seeds
+from .models import notes
+from .worlds import Design, FuseError, Reference, World, advised, agent_of, answers, designs, legal, points_of, seeds
 
 
 def made(design: Design, make: Any = aec_env, points: Any = None) -> Any:
@@ -165,6 +166,30 @@ def test_an_episode_replays_whatever_happened_before(design, disturbances, seed,
         if close:
             env.close()
     assert list(turns_of(env, seed, given_answers)) == fresh
+    assert list(turns_of(env, seed, given_answers)) == fresh
+
+
+@given(designs(), st.integers(1, 60), seeds, answers)
+@settings(max_examples=150)
+def test_an_error_anywhere_surfaces_and_the_next_episode_is_as_ever(design, fuse, seed, given_answers):
+    env = made(design)
+    fresh = list(turns_of(env, seed, given_answers))
+    world = env.unwrapped.simulation
+    world.fuse = fuse
+    told: list[Any] = []
+    raised = None
+    try:
+        told.extend(turns_of(env, seed, given_answers))
+    except FuseError as error:
+        raised = error
+    if raised is None:
+        assert told == fresh
+    else:
+        assert str(seed) in notes(raised)
+        assert world.trace[-1] == "over"
+        with pytest.raises(ResetNeededError):
+            env.step(0)
+    world.fuse = None
     assert list(turns_of(env, seed, given_answers)) == fresh
 
 

@@ -201,6 +201,43 @@ def test_an_inner_environment_may_be_made_reset_and_closed_inside():
     assert env.unwrapped.simulation.log == [([5], 9)] * 2
 
 
+@pytest.mark.parametrize("source", ["class", "factory", "generate_env"])
+def test_decisions_while_an_inner_simulation_is_made_reset_or_stopped_are_nobodys(source):
+    seen = []
+
+    class Inner(Script):
+        def __init__(self):
+            super().__init__(lambda simulation: INNER())
+            seen.append(("made", INNER()))
+
+        def reset(self, seed=None):
+            super().reset(seed)
+            seen.append(("reset", INNER()))
+
+        def stop(self):
+            seen.append(("stopped", INNER()))
+
+        def render(self, mode):
+            seen.append(("rendered", INNER()))
+
+    def rule():
+        if source == "generate_env":
+            inner = generate_env(lambda: Inner(), INNER)(render_mode="ansi")
+        else:
+            inner = single_env(Inner if source == "class" else lambda: Inner(), INNER, render_mode="ansi")
+        inner.reset()
+        inner.render()
+        inner.reset()
+        inner.close()
+
+    outer = decision(rule, agent="outer_0")
+    env = aec_env(calling(outer, INNER), [outer, INNER])
+    assert decisions(play(env, {"outer_0": RULE, "inner_0": 9})) == ["outer_0", "inner_0"]
+    done = [what for what, _ in seen if what != "made"]
+    assert done == ["reset", "rendered", "stopped", "reset", "stopped"]
+    assert {value for _, value in seen} == {"inner rule"}
+
+
 def test_an_inner_environment_may_be_abandoned_inside():
     unwound = []
 
@@ -582,6 +619,23 @@ def test_the_user_may_run_an_event_loop_between_steps_of_a_model_that_uses_one()
         asyncio.get_running_loop()
     env.reset()
     env.close()
+    with pytest.raises(RuntimeError):
+        asyncio.get_running_loop()
+
+
+@pytest.mark.usefixtures("_no_loop_stays_behind")
+def test_the_user_may_step_a_model_that_uses_asyncio_from_another_event_loop_each_time():
+    async def step(env):
+        loop = asyncio.get_running_loop()
+        ended = env.step(RULE)[2]
+        assert asyncio.get_running_loop() is loop
+        await asyncio.sleep(0)
+        return ended
+
+    env = single_env(office(), Office.rounds)
+    env.reset()
+    assert [asyncio.run(step(env)) for _ in range(3)] == [False] * 3
+    assert env.step(RULE)[2]
     with pytest.raises(RuntimeError):
         asyncio.get_running_loop()
 

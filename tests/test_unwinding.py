@@ -177,6 +177,47 @@ def test_environments_are_collected_and_take_everything_along(view, how):
 
 
 @VIEWS
+@pytest.mark.parametrize("held_by", ["mapping", "policy", "simulation"])
+def test_closed_environments_are_collected_though_their_own_parts_refer_to_them(view, held_by):
+    def closed():
+        one = decision(agent="one_0", **({"reward_mapping": lambda: env.max} if held_by == "mapping" else {}))
+        two = decision(agent="two_0")
+        policy = (lambda observation: env.max) if held_by == "policy" else RULE
+        env = view(calling(one, two, one), [one, two], policies={two: policy})
+        env.max = 1
+        env.reset()
+        env.step(1)
+        if held_by == "simulation":
+            env.unwrapped.simulation.environment = env
+        env.close()
+        return weakref.ref(env)
+
+    reference = closed()
+    gc.collect()
+    assert reference() is None
+
+
+@VIEWS
+def test_an_episode_that_has_ended_holds_nothing_that_its_model_has_let_go(view):
+    class Witness:
+        pass
+
+    def main(simulation):
+        witness = Witness()
+        decide(witness)
+        decide(witness)
+
+    decide = decision(lambda witness: 0, agent="a_0", observation_space_mapping=lambda witness: [0, 0])
+    env = view(script(main), decide)
+    env.reset()
+    env.step(1)
+    assert alive(Witness) == 1
+    env.step(1)
+    assert alive(Witness) == 0
+    env.close()
+
+
+@VIEWS
 def test_an_abandoned_environment_goes_without_the_collector(view):
     log = []
 
@@ -242,6 +283,43 @@ def test_objects_do_not_pile_up():
     for _ in range(3):
         after = count()
     assert after - before < 20
+
+
+@VIEWS
+@pytest.mark.parametrize("where", ["model", "observation_space_mapping", "reward_mapping"])
+def test_an_error_that_was_dealt_with_leaves_nothing_behind(view, where):
+    class Witness:
+        pass
+
+    def fail(*arguments):
+        if env.failing:
+            raise ZeroDivisionError
+        return 0.0 if where == "reward_mapping" else [0, 0]
+
+    def main(simulation):
+        local = Witness()
+        decide(local)
+        if where == "model":
+            fail()
+        decide(local)
+
+    changes = {} if where == "model" else {where: fail}
+    decide = decision(lambda witness: 0, agent="a_0", **changes)
+    before = stacks()
+    env = view(script(main), decide)
+    env.failing = False
+    env.reset()
+    env.failing = True
+    gc.disable()
+    try:
+        with suppress(ZeroDivisionError):
+            env.step(1)
+            pytest.fail("nothing was raised")
+        env.close()
+        assert sum(type(thing) is Witness for thing in gc.get_objects()) == 0
+    finally:
+        gc.enable()
+    assert stacks() == before
 
 
 def test_a_simulation_that_refers_to_itself_and_to_its_frames_is_collected():
@@ -451,6 +529,8 @@ def test_an_environment_that_is_dropped_in_another_thread_unwinds_in_its_own():
             decide()
         finally:
             log.append(threading.get_ident())
+            decide()
+            log.append("nobody was asked")
 
     held = [single_env(script(main), decide)]
     held[0].reset()
@@ -459,7 +539,13 @@ def test_an_environment_that_is_dropped_in_another_thread_unwinds_in_its_own():
     thread.join()
     gc.collect()
     greenlet.greenlet(lambda: None).switch()  # whatever switches next
-    assert log == [threading.get_ident()]
+    assert log == [threading.get_ident(), "nobody was asked"]
+    assert decide() == "rule"
+    env = single_env(calling(decide), decide)
+    env.reset()
+    assert decide() == "rule"
+    env.step(1)
+    assert env.unwrapped.simulation.log == [1]
 
 
 def test_refusals_are_not_errors_of_the_next_episode():

@@ -122,8 +122,25 @@ class Entity:
         self.world, self.number = world, number
 
 
+class FuseError(Exception):
+    """What a world raises when its fuse has burnt down."""
+
+
 class World:
-    """A simulation of a design."""
+    """A simulation of a design.
+
+    Attributes:
+        fuse: At how many more calls of its rules and mappings it fails; None: never.
+    """
+
+    fuse: int | None = None
+
+    def burn(self) -> None:
+        """Count a call of a rule or of a mapping."""
+        if self.fuse is not None:
+            self.fuse -= 1
+            if self.fuse == 0:
+                raise FuseError
 
     def __init__(self, design: Design, points: list[Callable[..., Any]]) -> None:
         self.design, self.points = design, points
@@ -155,6 +172,7 @@ class World:
         return function(self)
 
     def rule(self, point: int) -> int:
+        self.burn()
         value = self.random.randrange(7)
         if self.design.kinds[point] == "nested" and point > 0:
             value += self.call(point - 1, value % 3)
@@ -174,7 +192,9 @@ def points_of(design: Design) -> list[Callable[..., Any]]:
 
 def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
     def world_of(thing: Any) -> World:
-        return thing.world if isinstance(thing, Entity) else thing
+        world = thing.world if isinstance(thing, Entity) else thing
+        world.burn()
+        return world
 
     changes: dict[str, Any] = {
         "agent": f"point_{point}",
@@ -211,7 +231,7 @@ def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
     elif kind in ("keyword", "generator"):
         rule = vars(Rules)[kind]
     if kind == "choices":
-        changes |= {"choices": lambda world: offered(world.level), "action_space": spaces.Discrete(4)}
+        changes |= {"choices": lambda world: offered(world_of(world).level), "action_space": spaces.Discrete(4)}
     if kind == "apply":
         changes["apply"] = lambda action, world: action + world.random.randrange(3)
     return define(**changes)(rule)

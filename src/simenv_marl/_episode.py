@@ -79,6 +79,7 @@ class Episode:
         over: Whether the episode is over.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
         turns: How many actions the environment's user has given.
+        clock: Returns the simulation's time; None where it has none.
     """
 
     def __init__(self, plan: Plan, simulation: Any, seed: int | None, *, rounds: bool = False) -> None:
@@ -110,9 +111,9 @@ class Episode:
         self._failed_in_model = False
         self._remembering = bool(DIFFERENCES)
         self._rounds = rounds
-        self._clock = getattr(simulation, "time", None)
+        self.clock = getattr(simulation, "time", None)
         for agent, binding in () if plan.unanswered else plan.roster.items():
-            self.agents[agent] = Record(agent, binding, None, self._clock)
+            self.agents[agent] = Record(agent, binding, None, self.clock)
         self._driver: Driver | None = GreenletDriver(simulation.run, plan.bindings)
         with unattended():
             try:
@@ -248,13 +249,13 @@ class Episode:
             return self._consult(record, args, kwargs)
         record.hold(args, kwargs)
         if self._rounds:
-            record.restrict(args, kwargs)
+            record.arise(args, kwargs)
         elif self.turns == self._max_turns:
             self._finish(truncated=True)
             return None
         else:
             record.settle(args, kwargs)
-            if self._clock is None and binding.legal is None and binding.point.alone:
+            if self.clock is None and binding.legal is None and binding.point.alone:
                 self._swift[binding] = NAMED_AT_CALL if binding.agent is None else record
         self.pending = record
         return None
@@ -275,7 +276,7 @@ class Episode:
                 policy = RULE
             elif policy is None and self._plan.complete:
                 policy = self._undeclared(agent, binding)
-            record = Record(agent, binding, policy, self._clock)
+            record = Record(agent, binding, policy, self.clock)
             (self.agents if policy is None else self._answered)[agent] = record
         elif record.binding is not binding:
             raise AgentError(
@@ -300,7 +301,8 @@ class Episode:
         action = record.policy(record.observation, record.info)
         if action is RULE:
             return RULE
-        choices, record.choices = record.choices, None
+        choices = record.choices
+        record.follow_up()
         return record.binding.reply(action, record.agent, record.mask, choices)
 
     def record(self, agent: str) -> Record | None:
@@ -333,10 +335,11 @@ class Episode:
             return
         driver.enter()
         left = self._checked(actions, record)
-        self.turns += 1
-        self.parting = []
-        for other in self.agents.values():
+        if actions:
+            self.turns += 1
+        for other in (*self.agents.values(), *self.parting):
             other.acted = False
+        self.parting = []
         try:
             while record is not None and (reply := self._round_reply(record, left)) is not MISSING:
                 self.pending, record = None, None
@@ -347,7 +350,7 @@ class Episode:
             if self.over:
                 return
             self._foresee()
-            if self.turns == self._max_turns:
+            if self.turns == self._max_turns and actions:
                 self._finish(truncated=True)
             else:
                 self._settle_all()
@@ -389,7 +392,7 @@ class Episode:
     def _settle_all(self) -> None:
         """Reward and observe all live agents, as far as the calls are known on which they decide."""
         thread = get_ident()
-        plain = {binding for binding in self._plan.active if binding.legal is None and self._clock is None}
+        plain = {binding for binding in self._plan.active if binding.legal is None and self.clock is None}
         for record in self.agents.values():
             arguments = record.arguments()
             if arguments is None:
@@ -480,6 +483,7 @@ class Episode:
 
     def _finish(self, *, truncated: bool) -> None:
         """End the episode of every agent."""
+        self.pending = None
         for record in self.agents.values():
             self._conclude(record)
         self.over, self.truncated, self.terminated = True, truncated, not truncated

@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from . import _spaces
+from ._driver import unattended
 from ._points import NamedPoint, Site, find_point, find_points, locate, owner_class, stand_ins
 from ._spaces import ILLEGAL
 from .decision import DecisionPoint, Definition, unwrapped
@@ -126,7 +127,7 @@ class Binding:
     """
 
     __slots__ = (
-        "_mask_in_observation", "agent", "cast", "check", "convert", "definition", "deliver", "end", "first",
+        "_masked_parts", "agent", "cast", "check", "convert", "definition", "deliver", "end", "first",
         "legal", "name_agent", "observe", "point", "policy", "reward",
     )  # fmt: skip
 
@@ -145,7 +146,11 @@ class Binding:
         self.deliver = _delivery(definition, named.point.kind)
         space = definition.observation_space
         actions: Any = definition.action_space
-        self._mask_in_observation = isinstance(space, spaces.Dict) and _spaces.MASK in space.spaces
+        self._masked_parts = [
+            path
+            for path, part in (("", space), *_goal_parts(space))
+            if isinstance(part, spaces.Dict) and _spaces.MASK in part.spaces
+        ]
         self.legal: Callable[..., tuple[Any, Any]] | None = None
         if definition.action_mask_mapping is not None:
             self.legal = partial(_masked, definition.action_mask_mapping, _spaces.mask_cast(actions))
@@ -158,8 +163,11 @@ class Binding:
     def observation(self, args: tuple[Any, ...], kwargs: dict[str, Any], mask: Any) -> Any:
         """The observation of a call whose legal actions are known."""
         value = self.observe(*args, **kwargs)
-        if self._mask_in_observation and isinstance(value, Mapping):
-            value = {**value, _spaces.MASK: mask}
+        for part in self._masked_parts:
+            if part and isinstance(value[part], Mapping):
+                value = {**value, part: {**value[part], _spaces.MASK: mask}}
+            elif not part and isinstance(value, Mapping):
+                value = {**value, _spaces.MASK: mask}
         return self.cast(value)
 
     def reply(self, action: Any, agent: str, mask: Any, choices: Any) -> Any:
@@ -191,6 +199,14 @@ class Binding:
     def allowed(self, legal: Any, mask: Any) -> bool:
         """Whether a mask allows an action that is in the space."""
         return _spaces.mask_allows(self.definition.action_space, mask, legal)
+
+
+def _goal_parts(space: spaces.Space[Any]) -> list[tuple[str, spaces.Space[Any]]]:
+    return (
+        [("observation", space["observation"])]
+        if isinstance(space, spaces.Dict) and "desired_goal" in space.spaces
+        else []
+    )
 
 
 class Removal:
@@ -358,7 +374,8 @@ class Plan:
         model = source
         plain_factory = not isinstance(source, type) and not hasattr(source, "run")
         if plain_factory or (points is None and getattr(source, "points", None) is None):
-            model = make_simulation(source)
+            with unattended():
+                model = make_simulation(source)
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
         named = [] if unanswered and points == () else find_points(points, model)
         return cls(source, named, checked, list(modes), unanswered=unanswered)
@@ -375,6 +392,11 @@ class Plan:
             if binding.agent is None:
                 names[binding.point.name].append(agent)
         return self.amended({"possible_agents": names})
+
+    @property
+    def stale(self) -> bool:
+        """Whether a function that it patches has been replaced by another one since it was made."""
+        return any(site.stale for site in self.sites)
 
     @property
     def name(self) -> str:

@@ -17,7 +17,7 @@ from types import FunctionType, ModuleType
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
-from .decision import DecisionPoint, Definition, point_of, registered, registered_names, unbind
+from .decision import DecisionPoint, Definition, point_of, registered, registered_names, unbind, unwrapped
 from .errors import DefinitionError, PatchError, UnknownPointError
 
 
@@ -118,7 +118,7 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
     owner: Any
     try:
         owner, attribute = _resolve(name)
-        found = unbind(_held(owner, attribute))[0] is function
+        found = unwrapped(_held(owner, attribute)) is function
     except (UnknownPointError, PatchError):
         found = False
     if not found:  # the function is at hand, though not by its name
@@ -322,9 +322,11 @@ class Site:
         Raises:
             PatchError: What stands there cannot be patched.
         """
-        site = cls._all.get((owner, attribute))
-        if site is None:
-            site = cls._all[(owner, attribute)] = cls(name, owner, attribute)
+        # A function of a module may have names in several modules, and is one site all the same.
+        place = (owner, attribute) if isinstance(owner, type) else (_held(owner, attribute), "")
+        site = cls._all.get(place)
+        if site is None or site.stale:
+            site = cls._all[place] = cls(name, owner, attribute)
         return site
 
     @classmethod
@@ -332,16 +334,21 @@ class Site:
         """The site at which a point is patched in; None for a decorated point."""
         return next((site for site in cls._all.values() if site.point is point), None)
 
+    @property
+    def stale(self) -> bool:
+        """Whether something else has been set there, while no decision function was."""
+        there = vars(self._owner).get(self._attribute)
+        return self._users == 0 and there is not (None if self._inherited else self._held)
+
     def hold(self) -> None:
         """Have the decision function set until as many calls of ``let_go``.
 
         Raises:
             PatchError: The place refuses, or something else has been set there meanwhile.
         """
+        if self.stale:
+            raise PatchError(f"{self._name} has been replaced since it was named as a decision point")
         if self._users == 0:
-            there = vars(self._owner).get(self._attribute)
-            if there is not (None if self._inherited else self._held):
-                raise PatchError(f"{self._name} has been replaced since it was named as a decision point")
             self._set(self._held, self._wrapper)
         self._users += 1
 

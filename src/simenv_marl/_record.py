@@ -153,6 +153,12 @@ class Record:
             self.observation = binding.observation(args, kwargs, self.mask)
         del EVALUATING[get_ident()]
 
+    def arise(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Find out what must be known of a decision in mid-round. The arguments are those of ``settle``."""
+        self.restrict(args, kwargs)
+        if self.clock is not None:
+            self._now = float(self.clock())
+
     def restrict(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
         """Find out the legal actions. The arguments are those of ``settle``."""
         if self.binding.legal is None:

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from ._driver import unattended
 from ._episode import Episode
 from ._plan import Plan
-from .errors import ClosedError, NotResetError, OptionValueError, warn_user
+from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
 from .simulation import make_simulation, resetter
 
 
@@ -39,6 +39,7 @@ class Session:
         self.seed: int | None = None
         self._episode: Episode | None = None
         self._closed = False
+        self._starting = False
         self._held = False
         self._hold_sites()
         try:
@@ -70,7 +71,15 @@ class Session:
             BaseException: What the model raises.
         """
         self.end()
-        self._closed = False
+        self._closed, self._starting = False, True
+        try:
+            return self._begin(seed, options, generator, rounds)
+        finally:
+            self._starting = False
+
+    def _begin(
+        self, seed: int | None, options: dict[str, Any] | None, generator: np.random.Generator, rounds: bool
+    ) -> Episode:
         self._hold_sites()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
@@ -89,6 +98,8 @@ class Session:
             ReentrancyError, WrongThreadError: It cannot be ended from here; it goes on.
             BaseException: What the simulation raises while it unwinds.
         """
+        if self._starting:
+            raise ReentrancyError("the environment was used from inside its own reset")
         if self._episode is not None:
             try:
                 self._episode.close()
@@ -121,7 +132,7 @@ class Session:
         try:
             self.end()
         finally:
-            if self._episode is None:
+            if self._episode is None and not self._starting:
                 self._closed = True
                 self._let_go_of_sites()
 

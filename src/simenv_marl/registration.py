@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +13,7 @@ import pettingzoo
 from ._plan import Plan
 from .envs import aec_env, joint_env, parallel_env, single_env
 from .errors import UnknownPointError
+from .simulation import RULE
 
 
 @dataclass(frozen=True)
@@ -18,6 +21,8 @@ class _Recipe:
     simulation: Any
     points: Any
     options: dict[str, Any]
+    flatten: bool
+    active: list[str]
 
 
 _RECIPES: dict[str, _Recipe] = {}
@@ -47,27 +52,30 @@ def register_simulation(
     Raises:
         SimEnvError: Something in it cannot work; the leaf says what.
     """
+    flatten = options.pop("flatten", False)
     plan = Plan.draw_up(simulation, points, options)
-    recipe = f"{name}-v{version}"
-    _RECIPES[recipe] = _Recipe(simulation, points, options)
+    where = {"recipe": f"{name}-v{version}", "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
+    _RECIPES[where["recipe"]] = _Recipe(simulation, points, options, flatten, [b.point.name for b in plan.active])
     made: list[str] = []
-    for binding in plan.active:
-        if binding.agent is None:
-            continue
-        camel = "".join(part.capitalize() for part in binding.point.name.rpartition(".")[2].split("_"))
-        made.append(f"{name}/{camel}-v{version}")
-        _register_gymnasium(made[-1], "make_single", recipe=recipe, point=binding.point.name)
+    named = [binding.point.name for binding in plan.active if binding.agent is not None]
+    functions = [point.rpartition(".")[2] for point in named]
+    for point, function in zip(named, functions, strict=True):
+        parts = [function] if functions.count(function) == 1 else point.split(".")[-2:]
+        made.append(f"{name}/{''.join(map(_camel, parts))}-v{version}")
+        _register_gymnasium(made[-1], "make_single", **where, point=point)
     made.append(f"{name}/Joint-v{version}")
-    _register_gymnasium(made[-1], "make_joint", recipe=recipe)
-    coop = f"{name}/coop_v{version}"
+    _register_gymnasium(made[-1], "make_joint", **where)
     register: Any = getattr(pettingzoo, "register", None)
     if register is not None:  # PettingZoo has a registry since 1.26
         for kind in ("aec", "parallel"):
-            known = getattr(pettingzoo, f"{kind}_registry", {})
-            known.pop(f"{name}/coop-v{version}", None)
-            register(kind, coop, f"{__name__}:make_{kind}", kwargs={"recipe": recipe})
-        made.append(coop)
+            getattr(pettingzoo, f"{kind}_registry", {}).pop(f"{name}/coop-v{version}", None)
+            register(kind, f"{name}/coop_v{version}", f"{__name__}:make_{kind}", kwargs=where)
+        made.append(f"{name}/coop_v{version}")
     return made
+
+
+def _camel(name: str) -> str:
+    return "".join(part[:1].upper() + part[1:] for part in name.split("_"))
 
 
 def _register_gymnasium(identity: str, maker: str, **kwargs: Any) -> None:
@@ -75,7 +83,9 @@ def _register_gymnasium(identity: str, maker: str, **kwargs: Any) -> None:
     gymnasium.register(identity, f"{__name__}:{maker}", kwargs=kwargs)
 
 
-def _recipe(recipe: str) -> _Recipe:
+def _recipe(recipe: str, module: str) -> _Recipe:
+    if recipe not in _RECIPES and module != "__main__":
+        importlib.import_module(module)  # as in a process that knows no more than a spec
     try:
         return _RECIPES[recipe]
     except KeyError:
@@ -85,26 +95,29 @@ def _recipe(recipe: str) -> _Recipe:
         ) from None
 
 
-def make_single(recipe: str, point: str, **options: Any) -> Any:
-    """The entry point of the single views."""
-    known = _recipe(recipe)
-    points = {point: known.points[point]} if isinstance(known.points, dict) and point in known.points else point
-    return single_env(known.simulation, points, **{**known.options, **options})
+def make_single(recipe: str, module: str, point: str, **options: Any) -> Any:
+    """The entry point of the single views: all points but one run their rule, or the policy they have."""
+    known = _recipe(recipe, module)
+    merged = {**known.options, **options}
+    merged["policies"] = {other: RULE for other in known.active if other != point} | dict(merged.get("policies") or {})
+    for name in ("possible_agents", "undeclared"):
+        merged.pop(name, None)
+    return single_env(known.simulation, known.points, **merged)
 
 
-def make_joint(recipe: str, **options: Any) -> Any:
+def make_joint(recipe: str, module: str, **options: Any) -> Any:
     """The entry point of the joint view."""
-    known = _recipe(recipe)
-    return joint_env(known.simulation, known.points, **{**known.options, **options})
+    known = _recipe(recipe, module)
+    return joint_env(known.simulation, known.points, **{**known.options, "flatten": known.flatten, **options})
 
 
-def make_aec(recipe: str, **options: Any) -> Any:
+def make_aec(recipe: str, module: str, **options: Any) -> Any:
     """The entry point of the AEC view."""
-    known = _recipe(recipe)
+    known = _recipe(recipe, module)
     return aec_env(known.simulation, known.points, **{**known.options, **options})
 
 
-def make_parallel(recipe: str, **options: Any) -> Any:
+def make_parallel(recipe: str, module: str, **options: Any) -> Any:
     """The entry point of the parallel view."""
-    known = _recipe(recipe)
+    known = _recipe(recipe, module)
     return parallel_env(known.simulation, known.points, **{**known.options, **options})

@@ -72,7 +72,8 @@ def generate_env(simulation: Any, points: Any = None, *, view: str | None = None
     base = view_class(plan, view)
 
     def initialise(self: Any, **changes: Any) -> None:
-        base.__init__(self, plan.amended(changes))
+        current = Plan.draw_up(simulation, points, options) if plan.stale else plan
+        base.__init__(self, current.amended(changes))
 
     return type(
         f"{plan.name}Env",

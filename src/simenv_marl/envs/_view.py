@@ -40,7 +40,7 @@ class View:
         super().__init__()
         self._plan = plan
         self._session = Session(plan)
-        weakref.finalize(self, self._session.abandon)
+        self._finalizer = weakref.finalize(self, self._session.abandon)
         self._episode: Episode | None = None
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
@@ -97,6 +97,13 @@ class View:
             BaseException: What the simulation raises while it unwinds.
         """
         self._end(self._session.close)
+        # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
+        self._finalizer.detach()
+
+    def _attend(self) -> None:
+        """See to it that an environment which is abandoned ends its episode."""
+        if not self._finalizer.alive:
+            self._finalizer = weakref.finalize(self, self._session.abandon)
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode; forget it, unless that was refused."""
@@ -140,6 +147,7 @@ class AgentsView(View):
     def _start(self, seed: int | None, options: dict[str, Any] | None, *, rounds: bool) -> Episode:
         """End the episode that runs, begin another, and seed the agents' spaces."""
         seed = checked_seed(seed)
+        self._attend()
         self._end(self._session.end)
         if seed is not None or self._generator is None:
             self._generator, _ = seeding.np_random(seed)

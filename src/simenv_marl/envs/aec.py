@@ -172,8 +172,9 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     def _enter(self, episode: Episode) -> None:
         """Enter what a reset or a turn has brought besides a decision: births and ends."""
         if not self.agents:
-            for agent in episode.agents:
+            for agent, record in episode.agents.items():
                 self._join(agent)
+                self.infos[agent] = record.info
         for record in episode.parting:
             self._part(record, terminated=True, truncated=False)
         if episode.over:

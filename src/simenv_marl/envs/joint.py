@@ -47,6 +47,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
         self._agents = list(roster)
         observations = {agent: deepcopy(binding.definition.observation_space) for agent, binding in roster.items()}
         actions = {agent: deepcopy(binding.definition.action_space) for agent, binding in roster.items()}
+        self._time: float | None = None
         self._flatten = plan.options.flatten
         if self._flatten:
             self._cuts = np.cumsum([_length(space) for space in actions.values()])[:-1]
@@ -75,12 +76,14 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         seed = checked_seed(seed)
+        self._attend()
         self._end(self._session.end)
         gym.Env.reset(self, seed=seed)
         self._episode = self._session.start(seed, options, self.np_random, rounds=True)
         if seed is not None:
             seed_space(self.observation_space, seed, "joint")
             seed_space(self.action_space, seed, "joint")
+        self._time = None
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -93,7 +96,8 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
         Returns:
             Observation, sum of the rewards (a python float), terminated, truncated, info. An agent that has
             ended keeps its last observation. ``info["deciding"]`` names the agent whose decision is pending,
-            ``info["acted"]`` tells by agent whether its action was used.
+            ``info["acted"]`` tells by agent whether its action was used, and ``info["time"]`` and ``["elapsed"]``,
+            where the simulation has a clock, the time and how much has gone by since the step before.
 
         Raises:
             InvalidActionError: The action is not legal, or lacks an agent. The environment stands where it stood.
@@ -119,7 +123,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
                 raise InvalidActionError(f"the joint action {action!r} is not in {self.action_space}")
             return dict(zip(self._agents, np.split(action, self._cuts), strict=True))
         if not isinstance(action, Mapping) or set(action) != set(self._agents):
-            given = sorted(action) if isinstance(action, Mapping) else action
+            given = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
                 f"a joint action is a dict with an action for each of {', '.join(self._agents)}; given: {given!r}"
             )
@@ -152,6 +156,10 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
         }
         if masks:
             info["action_mask"] = masks
+        if episode.clock is not None:
+            now = float(episode.clock())
+            info["time"], info["elapsed"] = now, now - (now if self._time is None else self._time)
+            self._time = now
         return info
 
 

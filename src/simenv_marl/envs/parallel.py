@@ -10,6 +10,7 @@ from pettingzoo import ParallelEnv
 from .._plan import Plan
 from .._record import Record
 from .._spaces import blank, duplicate
+from ..simulation import Sentinel
 from ._view import AgentsView
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
@@ -63,11 +64,12 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             },
         )
 
-    def step(self, actions: Mapping[str, Any]) -> Results:
+    def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
         """Play a round.
 
         Args:
-            actions: By live agent: an action in its action space, or ``RULE``.
+            actions: By live agent: an action in its action space, or ``RULE``. ``RULE`` in place of the dict:
+                for all of them.
 
         Returns:
             By agent: observations, rewards (python floats), terminations, truncations (python bools) and
@@ -83,6 +85,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         episode = self._episode
         if episode is None:
             raise self._session.not_running()
+        if isinstance(actions, Sentinel):
+            actions = dict.fromkeys(episode.agents, actions)
         try:
             episode.play(actions)
         except BaseException:

@@ -1,0 +1,430 @@
+"""The registries of Gymnasium and PettingZoo."""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import api_test, parallel_api_test
+
+from simenv_marl import RULE, SimEnvError, UnknownOptionError, UnknownPointError, register_simulation
+
+from . import many_registered
+from .many_registered import Boat, Voyage
+from .many_worlds import Being, beings
+from .models import calling, decision, define, play, script
+
+ROOT = Path(__file__).parent.parent
+SINGLES = ["manyregistered/SteerBoat-v0", "manyregistered/SetSail-v0"]
+JOINT, COOP = "manyregistered/Joint-v0", "manyregistered/coop_v0"
+
+
+@pytest.fixture
+def register():
+    """Registers simulations until the test is over."""
+    registries = (gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry)
+    before = [dict(registry) for registry in registries]
+    yield register_simulation
+    for registry, entries in zip(registries, before, strict=True):
+        registry.clear()
+        registry.update(entries)
+
+
+def made(identity, **options):
+    """What Gymnasium makes, without its wrappers."""
+    return gymnasium.make(identity, **options).unwrapped
+
+
+# -- ids ------------------------------------------------------------------------------------------
+
+
+def test_the_ids():
+    assert [*SINGLES, JOINT, COOP] == many_registered.IDS
+    assert set(many_registered.IDS[:-1]) <= set(gymnasium.registry)
+    assert pettingzoo.spec("aec", COOP)
+    assert pettingzoo.spec("parallel", COOP)
+
+
+def test_a_single_view_for_each_point():
+    for identity in SINGLES:
+        env = gymnasium.make(identity)
+        observation, _ = env.reset(seed=1)
+        assert observation in env.observation_space == many_registered.PLACE
+        assert env.action_space == many_registered.PUSH
+        assert isinstance(env.unwrapped.simulation, Voyage)
+        decided = 0
+        while not env.step(env.action_space.sample())[2]:
+            decided += 1
+        assert decided == 11
+        env.close()
+
+
+def test_all_other_points_run_their_rule():
+    helm = made(SINGLES[0])
+    helm.reset(seed=1)
+    helm.step(np.array([1.0], np.float32))
+    assert helm.simulation.boat.course == 1.0
+    assert -0.61 < helm.simulation.boat.place < -0.39  # by the sails' own rule
+
+
+def test_the_joint_view():
+    env = gymnasium.make(JOINT)
+    assert set(env.action_space.spaces) == {"helm_0", "sail_0"}
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    flat = gymnasium.make(JOINT, flatten=True)
+    assert flat.action_space.shape == (2,)
+    assert flat.observation_space.shape == (4,)
+    flat.reset(seed=1)
+    flat.step(flat.action_space.sample())
+
+
+def test_the_views_of_many_agents():
+    env = pettingzoo.make("aec", COOP)
+    assert isinstance(env, pettingzoo.AECEnv)
+    assert env.possible_agents == ["helm_0", "sail_0"]
+    assert len(play(env, RULE, seed=1)) == 26
+    env = pettingzoo.make("parallel", COOP)
+    assert isinstance(env, pettingzoo.ParallelEnv)
+    env.reset(seed=1)
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, RULE))
+
+
+def test_options_are_given_when_it_is_made():
+    env = made(SINGLES[0], max_steps=1, render_mode="ansi")
+    env.reset()
+    assert env.step(RULE)[2:4] == (False, True)
+    assert env.render().startswith("at ")
+    env = pettingzoo.make("parallel", COOP, max_steps=1, render_mode="rgb_array")
+    env.reset()
+    assert all(env.step(dict.fromkeys(env.agents, RULE))[3].values())
+    assert env.render().shape == (8, 8, 3)
+    with pytest.raises(UnknownOptionError):
+        pettingzoo.make("aec", COOP, speed=3)
+    with pytest.raises(TypeError):
+        gymnasium.make(JOINT, speed=3)
+
+
+def test_options_are_given_when_it_is_registered(register):
+    ids = register(Voyage, name="optional", max_steps=2)
+    env = made(ids[0])
+    env.reset()
+    env.step(RULE)
+    assert env.step(RULE)[2:4] == (False, True)
+    env = made(ids[0], max_steps=None)
+    env.reset()
+    assert not any(any(env.step(RULE)[2:4]) for _ in range(5))
+    env = pettingzoo.make("aec", ids[-1])
+    assert len(play(env, RULE)) == 4
+
+
+def test_versions_stand_side_by_side(register):
+    first = register(Voyage, name="versions")
+    second = register(Voyage, name="versions", version=3, max_steps=1)
+    assert first == ["versions/SteerBoat-v0", "versions/SetSail-v0", "versions/Joint-v0", "versions/coop_v0"]
+    assert second == ["versions/SteerBoat-v3", "versions/SetSail-v3", "versions/Joint-v3", "versions/coop_v3"]
+    with warnings.catch_warnings():
+        # Gymnasium's advice to take the latest version.
+        warnings.filterwarnings("ignore", message=".*is out of date")
+        env = made(first[0])
+    env.reset()
+    assert not any(env.step(RULE)[2:4])
+    env = made(second[0])
+    env.reset()
+    assert env.step(RULE)[2:4] == (False, True)
+    assert len(play(pettingzoo.make("aec", first[-1]), RULE)) == 26
+    assert len(play(pettingzoo.make("aec", second[-1]), RULE)) == 3
+
+
+def test_registering_again_replaces_and_warns_of_nothing(register):
+    """As when a notebook's cell runs again."""
+    register(Voyage, name="again", max_steps=1)
+    ids = register(Voyage, name="again")
+    env = made(ids[0])
+    env.reset()
+    assert not any(env.step(RULE)[2:4])
+    assert len(play(pettingzoo.make("aec", ids[-1]), RULE)) == 26
+
+
+def test_points_are_those_that_are_named(register):
+    ids = register(Voyage, Boat.set_sail, name="named")
+    assert ids == ["named/SetSail-v0", "named/Joint-v0", "named/coop_v0"]
+    assert pettingzoo.make("aec", "named/coop_v0").possible_agents == ["sail_0"]
+    assert list(made("named/Joint-v0").action_space.spaces) == ["sail_0"]
+    ids = register(Voyage, f"{Boat.__module__}.Boat.steer_boat", name="named")
+    assert ids[0] == "named/SteerBoat-v0"
+
+
+def test_points_may_be_given_with_their_definitions(register):
+    definition = define(
+        agent="sail_0",
+        observation_space_mapping=lambda boat: [boat.place, boat.course],
+        action_space=spaces.Discrete(2),
+        reward_mapping=lambda boat: 0.0,
+    )
+    for key in (Boat.set_sail, f"{Boat.__module__}.Boat.set_sail"):
+        ids = register(Voyage, {key: definition}, name="defined")
+        assert ids[0] == "defined/SetSail-v0"
+        assert made(ids[0]).action_space == spaces.Discrete(2)
+        assert pettingzoo.make("aec", ids[-1]).action_space("sail_0") == spaces.Discrete(2)
+
+
+def test_points_may_be_functions_that_nobody_has_decorated(register):
+    definitions = beings(agent="hero_0", removed_by=())
+
+    def main(simulation):
+        simulation.log.append(Being(0).act())
+
+    ids = register(script(main), definitions, name="plain")
+    assert ids[0] == "plain/Act-v0"
+    env = made(ids[0])
+    env.reset()
+    env.step(4)
+    assert env.simulation.log == [4]
+    env.close()
+    assert Being(0).act() == "rule"
+
+
+def test_goals_may_be_registered(register):
+    ant = decision(
+        agent="ant_0",
+        goal_space=spaces.Box(0, 1, (1,), np.float32),
+        achieved_goal_mapping=lambda: [0.5],
+        desired_goal_mapping=lambda: [1],
+        compute_reward=lambda achieved, desired, info: -np.abs(achieved - desired).sum(-1),
+    )
+    ids = register(calling(ant, ant), ant, name="goals")
+    env = gymnasium.make(ids[0])
+    assert set(env.observation_space.spaces) == {"observation", "achieved_goal", "desired_goal"}
+    assert env.unwrapped.compute_reward(np.zeros((3, 1)), np.ones((3, 1)), [{}] * 3).tolist() == [-1, -1, -1]
+
+
+def test_entities_have_no_single_view_and_are_elsewhere(register):
+    clerk = decision(agent="clerk_0")
+
+    def main(simulation):
+        clerk()
+        simulation.being = Being(0)
+        simulation.being.act()
+
+    points = {clerk: define(agent="clerk_0"), **beings()}
+    ids = register(script(main), points, name="mixed", possible_agents=["being_0"])
+    assert ids == ["mixed/Choose-v0", "mixed/Joint-v0", "mixed/coop_v0"]
+    assert pettingzoo.make("aec", ids[-1]).possible_agents == ["clerk_0", "being_0"]
+    assert set(made(ids[1]).action_space.spaces) == {"clerk_0", "being_0"}
+
+
+def test_a_single_view_beside_a_roster_of_entities(register):
+    """The options of all points must not keep the views of single points from being made."""
+    clerk = decision(agent="clerk_0")
+
+    def main(simulation):
+        simulation.log.append(clerk())
+        simulation.log.append(Being(0).act())
+
+    points = {clerk: define(agent="clerk_0"), **beings()}
+    ids = register(script(main), points, name="mixed", possible_agents={Being.act: ["being_0"]})
+    env = made(ids[0])
+    env.reset()
+    env.step(4)
+    assert env.simulation.log == [4, "rule"]
+
+
+def test_policies_of_registered_simulations(register):
+    """Who is answered by a policy is so in every view, by whatever name it was given."""
+    for key in (Boat.set_sail, f"{Boat.__module__}.Boat.set_sail", "sail_0"):
+        ids = register(Voyage, name="policies", policies={key: lambda observation: 0.25})
+        assert ids == ["policies/SteerBoat-v0", "policies/Joint-v0", "policies/coop_v0"]
+        assert pettingzoo.make("aec", ids[-1]).possible_agents == ["helm_0"]
+        assert list(made(ids[1]).action_space.spaces) == ["helm_0"]
+        env = made(ids[0])
+        env.reset(seed=1)
+        env.step(np.array([1.0], np.float32))
+        assert 0.14 < env.simulation.boat.place < 0.36
+
+
+def test_two_points_of_one_name_have_two_ids(register):
+    class Cat:
+        @define(agent="cat_0", observation_space_mapping=lambda it: [0, 1], reward_mapping=lambda it: 0.0)
+        def move(self):
+            return 0
+
+    class Dog:
+        @define(agent="dog_0", observation_space_mapping=lambda it: [0, 2], reward_mapping=lambda it: 0.0)
+        def move(self):
+            return 0
+
+    ids = register(calling(Cat().move, Dog().move), [Cat.move, Dog.move], name="twice")
+    assert len(set(ids)) == len(ids) == 4
+    assert sorted(made(identity).reset()[0].tolist() for identity in ids[:2]) == [[0, 1], [0, 2]]
+
+
+def test_flatten_may_be_registered(register):
+    """It is an option of the joint view alone: the others are made without it."""
+    ids = register(Voyage, name="flat", flatten=True)
+    assert made("flat/Joint-v0").action_space.shape == (2,)
+    made(ids[0]).reset()
+    pettingzoo.make("parallel", ids[-1]).reset()
+
+
+def test_names_of_points_become_camel_case(register):
+    @define(agent="ant_0")
+    def choose_2nd_route():
+        return 0
+
+    ids = register(calling(choose_2nd_route), choose_2nd_route, name="camels")
+    assert ids[0] == "camels/Choose2ndRoute-v0"
+    made(ids[0]).reset()
+
+
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"points": "nowhere.at.all"}, UnknownPointError),
+        ({"speed": 3}, UnknownOptionError),
+        ({"max_steps": 0}, SimEnvError),
+        ({"simulation": 3}, SimEnvError),
+    ],
+)
+def test_what_cannot_be_registered(register, changes, error):
+    before = set(gymnasium.registry)
+    with pytest.raises(error):
+        register(**{"simulation": Voyage, "points": None, "name": "broken"} | changes)
+    assert set(gymnasium.registry) == before
+
+
+# -- conformance ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("identity", many_registered.IDS[:-1])
+@pytest.mark.parametrize("mode", [None, "ansi", "rgb_array"])
+def test_gymnasiums_check(identity, mode):
+    check_env(made(identity, render_mode=mode))
+
+
+def test_gymnasiums_check_of_the_flattened_view():
+    check_env(made(JOINT, flatten=True))
+
+
+def test_pettingzoos_tests():
+    api_test(pettingzoo.make("aec", COOP), num_cycles=20)
+    parallel_api_test(pettingzoo.make("parallel", COOP), num_cycles=20)
+
+
+@pytest.mark.parametrize("identity", [SINGLES[0], JOINT])
+def test_vectors_of_gymnasium(identity):
+    envs = gymnasium.make_vec(identity, num_envs=2, vectorization_mode="sync")
+    envs.reset(seed=1)
+    for _ in range(20):
+        envs.step(envs.action_space.sample())
+    envs.close()
+
+
+# -- specs ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("identity", many_registered.IDS[:-1])
+def test_specs_can_be_written_down(identity):
+    env = gymnasium.make(identity, max_steps=2)
+    text = env.spec.to_json()
+    json.loads(text)
+    again = gymnasium.make(EnvSpec.from_json(text))
+    assert again.spec == env.spec
+    told = [(one.reset(seed=3), one.unwrapped.step(RULE), one.unwrapped.step(RULE)) for one in (env, again)]
+    assert repr(told[0]) == repr(told[1])
+    assert told[0][2][3] is True
+    assert isinstance(env.spec.entry_point, str)
+
+
+def test_specs_of_pettingzoo_are_strings():
+    for kind in ("aec", "parallel"):
+        spec = pettingzoo.spec(kind, COOP)
+        assert isinstance(spec.entry_point, str)
+        json.dumps(spec.kwargs)
+        assert pettingzoo.make(kind, spec).possible_agents == ["helm_0", "sail_0"]
+
+
+def run_apart(code):
+    """Run some code in a process of its own, in which nothing is imported yet."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_in_another_process_by_module_and_id():
+    code = f"""
+import gymnasium
+for identity in {many_registered.IDS[:-1]!r}:
+    env = gymnasium.make("tests.many_registered:" + identity)
+    env.reset(seed=5)
+    env.step(env.action_space.sample())
+    env.close()
+    print(env.spec.id)
+import pettingzoo
+print(pettingzoo.make("aec", {COOP!r}).possible_agents)
+print(pettingzoo.make("parallel", {COOP!r}).possible_agents)
+"""
+    assert run_apart(code).splitlines() == [*many_registered.IDS[:-1], *["['helm_0', 'sail_0']"] * 2]
+
+
+def test_in_another_process_by_its_spec():
+    text = gymnasium.make(SINGLES[0], max_steps=2).spec.to_json()
+    code = f"""
+import gymnasium, tests.many_registered
+from gymnasium.envs.registration import EnvSpec
+env = gymnasium.make(EnvSpec.from_json({text!r}))
+print(env.reset(seed=5)[0].tolist())
+"""
+    here, _ = gymnasium.make(SINGLES[0]).reset(seed=5)
+    assert run_apart(code) == str(here.tolist())
+
+
+def test_in_another_process_by_its_spec_alone():
+    """A spec that was written down says all that is needed, as those of other environments do."""
+    text = gymnasium.make(f"tests.many_registered:{SINGLES[0]}").spec.to_json()
+    code = f"""
+import gymnasium
+from gymnasium.envs.registration import EnvSpec
+env = gymnasium.make(EnvSpec.from_json({text!r}))
+print(env.reset(seed=5)[0].tolist())
+"""
+    here, _ = gymnasium.make(SINGLES[0]).reset(seed=5)
+    assert run_apart(code) == str(here.tolist())
+
+
+def test_vectors_in_processes_of_their_own():
+    """Where processes are spawned, as on all systems but Linux, they know no more than the spec."""
+    code = f"""
+import gymnasium
+if __name__ == "__main__":
+    envs = gymnasium.make_vec(
+        "tests.many_registered:{SINGLES[0]}",
+        num_envs=2,
+        vectorization_mode="async",
+        vector_kwargs={{"context": "spawn"}},
+    )
+    observations, _ = envs.reset(seed=1)
+    envs.step(envs.action_space.sample())
+    envs.close()
+    print(observations.shape)
+"""
+    assert run_apart(code) == "(2, 2)"

@@ -540,7 +540,7 @@ class Being:
 def test_notes_of_errors_at_later_decisions_of_methods(point, agent):
     def main(simulation):
         beings = [Being("a"), Being("b")]
-        for number in (0, 1, 0, 0, 1):
+        for number in (1, 0, 0, 0, 1):
             point(beings[number])
 
     env = aec_env(script(main), point)

@@ -30,11 +30,13 @@ from simenv_marl import (
 
 from .many_worlds import (
     HERE,
+    AnnouncedHunt,
     Announcing,
     Answered,
     Being,
     Colony,
     Design,
+    Hunt,
     Other,
     Played,
     advised,
@@ -45,10 +47,11 @@ from .many_worlds import (
     colony,
     colony_points,
     designs,
+    hunters,
     others,
     seeds,
 )
-from .models import decision, decisions, define, play, script
+from .models import decision, decisions, define, notes, play, script
 
 
 class Knowing:
@@ -880,6 +883,24 @@ def test_agents_of_one_name_end_as_well():
         env.step(1)
 
 
+@pytest.mark.parametrize("view", [aec_env, parallel_env])
+def test_an_agent_of_one_name_is_not_revived_either(view):
+    def main(simulation):
+        simulation.beings = one, two = Being(0), Being(1)
+        for _ in range(3):
+            one.act()
+        one.leave()
+        two.act()
+
+    env = view(script(main), beings(agent="hero_0"))
+    env.reset()
+    for _ in range(2):
+        env.step({"hero_0": 1} if view is parallel_env else 1)
+    with pytest.raises(AgentError, match="hero_0"):
+        env.step({"hero_0": 1} if view is parallel_env else 1)
+    assert env.agents == []
+
+
 @pytest.mark.parametrize(
     ("removed_by", "error"),
     [
@@ -935,11 +956,35 @@ def test_an_error_in_a_last_reward_surfaces():
 
     env = aec_env(script(main), beings(reward_mapping=wages, observation_space_mapping=lambda being: [0, 0]))
     env.reset()
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError) as caught:
         env.step(1)
+    assert "being_0" in notes(caught.value)
     assert env.agents == []
     env.reset()
     assert env.agent_selection == "being_0"
+
+
+@pytest.mark.parametrize("ends", ["return", "remove"])
+def test_an_error_in_a_last_reward_says_whose_it_was(ends):
+    def main(simulation):
+        simulation.beings = one, two = Being(0), Being(1)
+        one.act()
+        two.act()
+        one.health = None
+        if ends == "remove":
+            one.leave()
+        two.health = 1
+
+    env = aec_env(
+        script(main),
+        beings(reward_mapping=lambda being: 1.0 + being.health, observation_space_mapping=lambda being: [0, 0]),
+    )
+    env.reset(seed=19)
+    env.step(1)
+    with pytest.raises(TypeError) as caught:
+        env.step(1)
+    assert "being_0" in notes(caught.value)
+    assert "seed 19" in notes(caught.value)
 
 
 def test_policies_agents_are_removed_without_a_word():
@@ -1013,31 +1058,6 @@ def test_a_set_of_weak_references_is_as_it_would_be():
     assert len([turn for turn in turns if turn.terminated]) == 4
 
 
-class Hunt:
-    """Each being picks one of the living; whoever is let go of before its turn picks no more."""
-
-    def reset(self, seed=None):
-        self.beings = {number: Being(number) for number in range(4)}
-        self.weakly, self.log = weakref.WeakSet(self.beings.values()), []
-        for being in self.beings.values():
-            being.hunt = weakref.proxy(self)
-
-    def run(self):
-        for tick in range(2):
-            for number in range(4):
-                for being in [being for being in self.weakly if being.number == number]:
-                    picked = being.act()
-                    self.log.append((tick, number, getattr(picked, "number", picked)))
-                    del being, picked
-                if (tick, number) == (0, 1):
-                    del self.beings[2]
-
-
-class AnnouncedHunt(Hunt):
-    def expected_calls(self, point):
-        return [(being,) for being in self.beings.values()]
-
-
 @pytest.mark.parametrize("simulation", [Hunt, AnnouncedHunt])
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_choices_keep_nobody_alive(make, simulation):
@@ -1046,10 +1066,7 @@ def test_choices_keep_nobody_alive(make, simulation):
     plain.reset()
     plain.run()
     assert (0, 2, "rule") not in plain.log
-    definition = beings(
-        choices=lambda being: list(being.hunt.beings.values()), action_space=spaces.Discrete(4), removed_by=()
-    )
-    env = make(simulation, definition)
+    env = make(simulation, hunters())
     if make is aec_env:
         play(env)
     else:

@@ -301,6 +301,27 @@ def test_the_models_are_as_they_were():
         assert vars(owner)[name] is function
 
 
+def test_side_by_side_they_do_not_touch_each_other():
+    plain = [plain_run(Meadow, 5), plain_run(Meadow, 6), plain_run(Cell, 5), plain_run(Meadow, 7)]
+    envs = [
+        aec_env(Meadow, herd()),
+        parallel_env(AnnouncedMeadow, herd()),
+        parallel_env(Cell, prisoners()),
+        aec_env(AnnouncedMeadow, {name: definition for name, definition in herd().items() if ".Wolf." in name}),
+    ]
+    for env, seed in zip(envs, (5, 6, 5, 7), strict=True):
+        env.reset(seed=seed)
+    while any(env.agents for env in envs):
+        for env in envs:
+            if env.agents and hasattr(env, "agent_selection"):
+                agent = env.agent_selection
+                env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
+            elif env.agents:
+                env.step(RULE)
+    for env, simulation in zip(envs, plain, strict=True):
+        assert all_alike(env.simulation.states, simulation.states)
+
+
 # -- births and deaths ----------------------------------------------------------------------------
 
 

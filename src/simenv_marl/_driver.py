@@ -91,6 +91,11 @@ class Driver(Protocol):
         """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
 
 
+LOOPS: Final = "asyncio.events"
+"""What knows the event loop that runs in a thread, whichever stack it runs on: a simulation's and its user's are to be
+kept apart. Where nobody has imported it, nobody runs a loop."""
+
+
 class _Home:
     """Stands for a thread; unlike the thread's number it is never given to another one."""
 
@@ -125,10 +130,6 @@ class GreenletDriver:
         self._ask: Ask | None = self.ask
         self._thread = get_ident()
         self._home = ref(_home())
-        # asyncio knows one running loop of a thread, whichever stack it runs on: the simulation's and its user's
-        # are to be kept apart. Where nobody has imported asyncio, nobody runs a loop.
-        self._get_loop: Any = None
-        self._find_loops()
         self._users_loop: Any = None
         self._body = greenlet(self._run)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
@@ -155,13 +156,10 @@ class GreenletDriver:
             return point.rule(*args, **kwargs)
         if getcurrent() is not self._inside:
             self._come_back_here()
+        switch_out, thread, deliver, loop = self._switch_out, self._thread, binding.deliver, None
         # What ``_go_out`` and ``_go_in`` do, without the calls.
-        switch_out, thread, deliver, get_loop = self._switch_out, self._thread, binding.deliver, self._get_loop
-        if get_loop is None and "asyncio" in modules:
-            get_loop = self._find_loops()
-        loop = get_loop() if get_loop is not None else None
-        if loop is not None or self._users_loop is not None:
-            self._swap_loops(self._users_loop)
+        if LOOPS in modules:
+            loop = self._leave_loop()
         del RUNNING[thread]
         try:
             reply = switch_out(binding, args, kwargs)
@@ -169,10 +167,8 @@ class GreenletDriver:
             self._go_in(loop)
             raise
         RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
-        if get_loop is not None:
-            self._users_loop = get_loop()
-            if loop is not None or self._users_loop is not None:
-                self._swap_loops(loop)
+        if LOOPS in modules:
+            self._enter_loop(loop)
         if reply is RULE:
             return point.rule(*args, **kwargs)
         return reply if deliver is None else deliver(reply, *args, **kwargs)
@@ -185,27 +181,30 @@ class GreenletDriver:
 
     def _go_in(self, loop: Any) -> None:
         """The simulation goes on, in the event loop in which it was."""
-        if self._ask is None:  # forgotten: it unwinds, and nobody has asked it to
-            return
-        RUNNING[self._thread] = self._ask
-        if self._get_loop is not None:
-            self._users_loop = self._get_loop()
-            self._swap_loops(loop)
+        if self._ask is not None:  # else it is forgotten, and unwinds without having been asked to
+            RUNNING[self._thread] = self._ask
+            if LOOPS in modules:
+                self._enter_loop(loop)
 
     def _go_out(self) -> None:
         """The simulation's user goes on, in the event loop in which that was."""
-        if self._ask is None:
-            return
-        del RUNNING[self._thread]
-        if self._get_loop is not None:
-            self._swap_loops(self._users_loop)
+        if self._ask is not None:
+            if LOOPS in modules:
+                self._leave_loop()
+            del RUNNING[self._thread]
 
-    def _find_loops(self) -> Any:
-        self._get_loop = getattr(modules.get("asyncio.events"), "_get_running_loop", None)
-        return self._get_loop
+    def _leave_loop(self) -> Any:
+        events = modules[LOOPS]
+        loop = events._get_running_loop()
+        if loop is not None or self._users_loop is not None:
+            events._set_running_loop(self._users_loop)
+        return loop
 
-    def _swap_loops(self, loop: Any) -> None:
-        modules["asyncio.events"]._set_running_loop(loop)
+    def _enter_loop(self, loop: Any) -> None:
+        events = modules[LOOPS]
+        self._users_loop = events._get_running_loop()
+        if loop is not None or self._users_loop is not None:
+            events._set_running_loop(loop)
 
     def enter(self) -> None:
         """Make ready to be resumed from here.

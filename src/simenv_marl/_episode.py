@@ -75,7 +75,7 @@ class Episode:
             episode is over.
         agents: The live agents of the environment, by name, in the order in which they joined.
         gone: Those whose episode has ended before the simulation's.
-        parting: Those of them of whom the latest turn or round has taken leave.
+        parting: Those of them whose end no view has entered yet.
         over: Whether the episode is over.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
         turns: How many actions the environment's user has given.
@@ -109,7 +109,6 @@ class Episode:
         self._plan, self._simulation, self._seed = plan, simulation, seed
         self._max_turns = plan.options.max_steps or -1  # never reached
         self._failed_in_model = False
-        self._remembering = bool(DIFFERENCES)
         self._rounds = rounds
         self.clock = getattr(simulation, "time", None)
         for agent, binding in () if plan.unanswered else plan.roster.items():
@@ -121,9 +120,11 @@ class Episode:
                 while self.pending is None and not self.over:
                     reply = self._take(*self._driver.resume(reply))
                 if not self.over:
-                    self._foresee()
+                    pending, self.pending = self.pending, None
+                    self._foresee(pending)
                     if rounds:
-                        self._settle_all()
+                        self._settle_all(pending)
+                    self.pending = pending
             except BaseException as error:
                 self._fail(error)
                 raise
@@ -174,14 +175,13 @@ class Episode:
         self.turns = turns = self.turns + 1
         if record.followed_up:
             record.follow_up()
-        if self.parting:
-            self.parting = []
         try:
             while True:
                 # Functions are fetched from attributes before they are called: calling them there is slower.
                 resume = driver.resume
                 binding, args, kwargs = resume(reply)
-                record, agent = self._swift.get(binding), UNNAMED
+                agent = UNNAMED
+                record = self._swift.get(binding)
                 if record is NAMED_AT_CALL:
                     (first,) = args
                     name_agent = binding.name_agent
@@ -198,7 +198,7 @@ class Episode:
                         record._args, record._kwargs = args, kwargs
                     elif record._weakly is None or record._weakly() is not first or record._kwargs:
                         record.hold(args, kwargs)
-                    if self._remembering:
+                    if DIFFERENCES:
                         EVALUATING[get_ident()] = record.memory
                     reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
                     reward = reward_mapping(first)
@@ -208,7 +208,7 @@ class Episode:
                         raise not_finite(record, reward)
                     record.reward = reward
                     record.observation = cast(observe(first))
-                    if self._remembering:
+                    if DIFFERENCES:
                         del EVALUATING[get_ident()]
                     record.info = {}
                     self.pending = record
@@ -349,11 +349,14 @@ class Episode:
                 record = self.pending
             if self.over:
                 return
-            self._foresee()
+            # Whoever steps an environment from inside a mapping is told so, as in mid-round.
+            pending, self.pending = self.pending, None
+            self._foresee(pending)
             if self.turns == self._max_turns and actions:
                 self._finish(truncated=True)
             else:
-                self._settle_all()
+                self._settle_all(pending)
+                self.pending = pending
         except BaseException as error:
             self._fail(error)
             raise
@@ -389,7 +392,7 @@ class Episode:
             record.follow_up()
         return action
 
-    def _settle_all(self) -> None:
+    def _settle_all(self, pending: Record | None) -> None:
         """Reward and observe all live agents, as far as the calls are known on which they decide."""
         thread = get_ident()
         plain = {binding for binding in self._plan.active if binding.legal is None and self.clock is None}
@@ -398,13 +401,15 @@ class Episode:
             if arguments is None:
                 record.reward, record.info = 0.0, {}
                 continue
+            self._latest = record
             args, kwargs = arguments
             binding = record.binding
             if kwargs or len(args) != 1 or not record.decided or binding not in plain:
                 record.settle(args, kwargs)
+                if record is not pending:
+                    record.choices = None  # which are asked for again when it decides
                 continue
             # The same, for the calls of most models: of one argument, with nothing but the mappings to be seen to.
-            self._latest = record
             (first,) = args
             reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
             EVALUATING[thread] = record.memory
@@ -418,13 +423,14 @@ class Episode:
             record.info = {}
         EVALUATING.pop(thread, None)
 
-    def _foresee(self) -> None:
+    def _foresee(self, pending: Record | None) -> None:
         """Get to know agents before they decide, where the simulation knows the calls to come."""
         expected = getattr(self._simulation, "expected_calls", None)
         if expected is None:
             return
         for binding in self._plan.active:
             name_agent = binding.name_agent
+            seen = {pending}  # of several calls the next one counts
             for call in expected(binding.point.name):
                 args = tuple(call)
                 agent = binding.agent if name_agent is None else name_agent(*args)
@@ -435,10 +441,13 @@ class Episode:
                     record = self._meet(agent, binding)
                     if record.policy is not None:
                         continue
-                if record is not self.pending and (self._rounds or not record.decided):
-                    record.hold(args, {})
-                    if not self._rounds:
-                        record.observe(args, {})
+                if record in seen or (record.decided and not self._rounds):
+                    continue
+                seen.add(record)
+                record.hold(args, {})
+                if not self._rounds:
+                    record.observe(args, {})
+                    record.choices = None
 
     def _names(self) -> str:
         names = list(self.agents)
@@ -474,6 +483,7 @@ class Episode:
 
     def _conclude(self, record: Record) -> None:
         """Give an agent its last reward and its last observation."""
+        self._latest = record
         arguments = record.arguments()
         if arguments is None:  # it was never seen, or the model has let it go
             record.reward, record.info = 0.0, {}

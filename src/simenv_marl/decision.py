@@ -460,15 +460,17 @@ def _run_rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any
 
 # -- differences ----------------------------------------------------------------------------------
 
-DIFFERENCES: WeakSet[Difference] = WeakSet()
-"""All differences. Where there is none, nobody needs to say whose mapping is being evaluated."""
+DIFFERENCES: list[str] = []
+"""Not empty once a difference was made. Where there is none, nobody needs to say whose mapping is
+being evaluated."""
 
 
 class Difference:
     """A mapping that returns by how much another has changed. Made by ``difference``."""
 
     def __init__(self, function: Mapped) -> None:
-        DIFFERENCES.add(self)
+        if not DIFFERENCES:  # one will do
+            DIFFERENCES.append(getattr(function, "__qualname__", repr(function)))
         self._function = function
         update_wrapper(self, function)
 

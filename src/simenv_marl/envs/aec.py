@@ -187,6 +187,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             self._rewarded.append(episode.pending.agent)
         if self._leaving:
             self.agent_selection = self._leaving[-1]
+        episode.parting = []
 
     def _part(self, record: Record, *, terminated: bool, truncated: bool) -> None:
         """Enter the end of an agent: last reward, flags; its ``None`` step is to come."""

@@ -130,6 +130,7 @@ class GreenletDriver:
         self._ask: Ask | None = self.ask
         self._thread = get_ident()
         self._home = ref(_home())
+        self._get_loop: Any = None  # found where asyncio has been imported
         self._users_loop: Any = None
         self._body = greenlet(self._run)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
@@ -158,8 +159,13 @@ class GreenletDriver:
             self._come_back_here()
         switch_out, thread, deliver, loop = self._switch_out, self._thread, binding.deliver, None
         # What ``_go_out`` and ``_go_in`` do, without the calls.
-        if LOOPS in modules:
-            loop = self._leave_loop()
+        get_loop = self._get_loop
+        if get_loop is None and LOOPS in modules:
+            get_loop = self._get_loop = modules[LOOPS]._get_running_loop
+        if get_loop is not None:
+            loop = get_loop()
+            if loop is not None or self._users_loop is not None:
+                self._leave_loop()
         del RUNNING[thread]
         try:
             reply = switch_out(binding, args, kwargs)
@@ -167,7 +173,7 @@ class GreenletDriver:
             self._go_in(loop)
             raise
         RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
-        if LOOPS in modules:
+        if get_loop is not None and (loop is not None or get_loop() is not None):
             self._enter_loop(loop)
         if reply is RULE:
             return point.rule(*args, **kwargs)
@@ -198,6 +204,7 @@ class GreenletDriver:
         loop = events._get_running_loop()
         if loop is not None or self._users_loop is not None:
             events._set_running_loop(self._users_loop)
+            self._users_loop = None
         return loop
 
     def _enter_loop(self, loop: Any) -> None:

@@ -383,6 +383,7 @@ class Episode:
                 return MISSING
             action = binding.convert(action) if record.choices is None else [record.choices[action]]
         del left[record.agent]
+        self._latest = record
         record.acted = True
         if not record.decided:  # seen for the first time, and acting at once
             arguments = record.arguments()
@@ -469,6 +470,7 @@ class Episode:
 
     def _release(self, removal: Removal, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """End the episode of the agents that the model is about to remove, while they are still whole."""
+        latest = self._latest
         for binding, agent in removal.agents(args, kwargs):
             record = self.agents.get(agent)
             if record is None or record.binding is not binding:
@@ -479,6 +481,7 @@ class Episode:
                 self._swift.pop(binding, None)
             self.gone[agent] = self.agents.pop(agent)
             self.parting.append(record)
+        self._latest = latest  # after whose decision the model now goes on
         return RULE
 
     def _conclude(self, record: Record) -> None:

@@ -263,6 +263,7 @@ def test_a_list_is_not_enough_for_two_points():
     [
         (["being_0", "being_0"], AgentError),
         ([0], AgentError),
+        ("being_0", SimEnvError),
         ({Other.act: ["other_0"]}, OptionValueError),
         ({f"{HERE}.Being.leave": ["being_0"]}, OptionValueError),
     ],
@@ -943,6 +944,19 @@ def test_removals_are_what_they_were_for_everybody_else():
     assert vars(Being)["act"] is act
 
 
+def test_points_that_were_named_while_another_environment_was_open():
+    """What ``Being.act`` is then stands for it as well, even when that environment is gone."""
+    first = aec_env(living(0), beings())
+    first.reset()
+    named = beings()
+    first.close()
+    del first
+    gc.collect()
+    env = aec_env(living(0, 1), named)
+    assert decisions(play(env, 1)) == ["being_0", "being_1"]
+    assert env.simulation.log == [1, 1]
+
+
 def test_an_error_in_a_last_reward_surfaces():
     def main(simulation):
         one = Being(0)
@@ -987,6 +1001,23 @@ def test_an_error_in_a_last_reward_says_whose_it_was(ends):
     assert "seed 19" in notes(caught.value)
 
 
+def test_an_error_after_a_removal_says_after_whose_decision_it_was():
+    def main(simulation):
+        simulation.beings = one, two = Being(0), Being(1)
+        one.act()
+        two.act()
+        one.leave()
+        raise ZeroDivisionError
+
+    env = aec_env(script(main), beings())
+    env.reset()
+    env.step(1)
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(1)
+    assert "being_1" in notes(caught.value)
+    assert "being_0" not in notes(caught.value)
+
+
 def test_policies_agents_are_removed_without_a_word():
     def main(simulation):
         one, two = Being(0), Being(1)
@@ -1024,7 +1055,7 @@ def test_the_environment_keeps_nobody_alive(announced):
                 return [(being,) for being in self.beings]
 
     env = aec_env(Town, beings(removed_by=()))
-    turns = play(env, lambda agent, env: env.last()[0] is not None and 1)
+    turns = play(env, 1)
     assert env.simulation.log == [[False, True, True]]
     last = next(turn for turn in turns if turn.terminated and turn.agent == "being_0")
     assert last.reward == 0.0

@@ -74,6 +74,10 @@ class Options:
     def __post_init__(self) -> None:
         if self.driver != "greenlet":
             raise OptionValueError(f'driver must be "greenlet", not {self.driver!r}')
+        if isinstance(self.possible_agents, str):
+            raise OptionValueError(
+                f"possible_agents must be a list of names, not the one name {self.possible_agents!r}"
+            )
         if self.undeclared not in ("error", "rule"):
             raise OptionValueError(f'undeclared must be "error" or "rule", not {self.undeclared!r}')
         if self.state_space is not None and not isinstance(self.state_space, spaces.Space):

@@ -113,7 +113,10 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
     function, _ = unbind(key)
     known = point_of(function)
     if known is not None:
-        return (*known, Site.of(known[0]))
+        site = Site.of(known[0])
+        if site is None and known[0].definition is None:  # of a patch that is no longer there
+            return _locate_name(known[0].name)
+        return (*known, site)
     name = f"{function.__module__}.{function.__qualname__}"
     owner: Any
     try:

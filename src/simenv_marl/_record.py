@@ -90,11 +90,6 @@ class Record:
                     return
             self._args = (self._weakly, *args[1:])
 
-    def first(self) -> Any:
-        """The first argument of the latest decision; None where there is none any more."""
-        arguments = self.arguments()
-        return arguments[0][0] if arguments and arguments[0] else None
-
     def forget(self) -> None:
         """Let go of the arguments; the agent has no more to observe."""
         self._args = self._weakly = None

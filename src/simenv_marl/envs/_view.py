@@ -100,10 +100,11 @@ class View:
         # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
         self._finalizer.detach()
 
-    def _attend(self) -> None:
-        """See to it that an environment which is abandoned ends its episode."""
+    def _make_way(self) -> None:
+        """End the episode that runs, and see to it that the next one ends should the environment be abandoned."""
         if not self._finalizer.alive:
             self._finalizer = weakref.finalize(self, self._session.abandon)
+        self._end(self._session.end)
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode; forget it, unless that was refused."""
@@ -147,8 +148,7 @@ class AgentsView(View):
     def _start(self, seed: int | None, options: dict[str, Any] | None, *, rounds: bool) -> Episode:
         """End the episode that runs, begin another, and seed the agents' spaces."""
         seed = checked_seed(seed)
-        self._attend()
-        self._end(self._session.end)
+        self._make_way()
         if seed is not None or self._generator is None:
             self._generator, _ = seeding.np_random(seed)
         episode = self._session.start(seed, options, self._generator, rounds=rounds)

@@ -76,8 +76,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         seed = checked_seed(seed)
-        self._attend()
-        self._end(self._session.end)
+        self._make_way()
         gym.Env.reset(self, seed=seed)
         self._episode = self._session.start(seed, options, self.np_random, rounds=True)
         if seed is not None:

@@ -71,8 +71,7 @@ class SimulationEnv(View, gym.Env[Any, Any]):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         seed = checked_seed(seed)
-        self._attend()
-        self._end(self._session.end)
+        self._make_way()
         gym.Env.reset(self, seed=seed)
         self._episode = episode = self._session.start(seed, options, self.np_random)
         if seed is not None:

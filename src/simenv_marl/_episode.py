@@ -271,7 +271,7 @@ class Episode:
                     f"the agent {agent!r} decides at {binding.point.name} after its end; let agent= give each entity"
                     " a name of its own, and removed_by= name what really ends it"
                 )
-            policy = binding.policy or self._plan.policies.get(agent)
+            policy = self._plan.policies.get(agent) or binding.policy
             if policy is None and self._plan.unanswered:
                 policy = RULE
             elif policy is None and self._plan.complete:
@@ -298,12 +298,9 @@ class Episode:
         if record.policy is RULE:
             return RULE
         record.observe(args, kwargs)
-        action = record.policy(record.observation, record.info)
-        if action is RULE:
-            return RULE
-        choices = record.choices
+        action, choices = record.policy(record.observation, record.info), record.choices
         record.follow_up()
-        return record.binding.reply(action, record.agent, record.mask, choices)
+        return RULE if action is RULE else record.binding.reply(action, record.agent, record.mask, choices)
 
     def record(self, agent: str) -> Record | None:
         """What is known of an agent of the environment, whether it lives or is gone."""

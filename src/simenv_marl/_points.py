@@ -36,13 +36,14 @@ class NamedPoint:
     site: Site | None
 
 
-def find_points(points: Any, simulation: Any) -> list[NamedPoint]:
+def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[NamedPoint]:
     """Find all that ``points=`` names.
 
     Args:
         points: A dotted name, a function, a list of these, or a dict from these to definitions. None: the
             attribute ``points`` of the simulation, else all decorated points.
         simulation: The simulation.
+        required: Whether all decorated points are meant where nobody names any, and not none.
 
     Returns:
         The points, in the order in which they were named.
@@ -55,6 +56,8 @@ def find_points(points: Any, simulation: Any) -> list[NamedPoint]:
     if points is None:
         points = getattr(simulation, "points", None)
     if points is None:
+        if not required:
+            return []
         points = _all_registered()
     if isinstance(points, Mapping):
         found = [find_point(key, definition) for key, definition in points.items()]
@@ -181,10 +184,10 @@ def _decorated_places(point: DecisionPoint) -> set[Any]:
     return {owner for owner, held in found if isinstance(_plain(held), FunctionType) and _plain(held) in wrappers}
 
 
-def _all_classes() -> Iterator[type]:
-    """All classes that there are."""
+def _all_classes(base: type = object) -> Iterator[type]:
+    """All classes that there are, or that derive from one."""
     seen: set[type] = set()
-    left = [object]
+    left = [base]
     while left:
         owner = left.pop()
         if owner not in seen:
@@ -196,6 +199,11 @@ def _all_classes() -> Iterator[type]:
 def _plain(held: Any) -> Any:
     """What a class or module holds, without its binding."""
     return held.__func__ if isinstance(held, (staticmethod, classmethod)) else held
+
+
+def have_instances(one: type, other: type) -> bool:
+    """Whether some object can be an instance of both classes, of all classes that there are now."""
+    return any(issubclass(owner, other) for owner in _all_classes(one))
 
 
 def owner_class(point: DecisionPoint) -> type | None:

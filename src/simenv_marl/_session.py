@@ -16,7 +16,7 @@ from ._driver import unattended
 from ._episode import Episode
 from ._plan import Plan
 from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
-from .simulation import make_simulation, resetter
+from .simulation import resetter
 
 
 class Session:
@@ -44,7 +44,7 @@ class Session:
         self._hold_sites()
         try:
             with unattended():
-                self.simulation = make_simulation(plan.source)
+                self.simulation = plan.make_simulation()
                 self._reset = resetter(self.simulation)
         except BaseException:
             self._let_go_of_sites()

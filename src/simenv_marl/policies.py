@@ -36,9 +36,6 @@ def simulate(
         SimEnvError: Something in it cannot work; the leaf says what.
         BaseException: Whatever the model, a mapping or a policy raises.
     """
-    if points is None and not hasattr(simulation, "points"):
-        names = [key for key in policies or {} if isinstance(key, str) and "." not in key]
-        points = None if names else ()  # agents are to be found among all points; points name themselves
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
     session = Session(plan)
     try:

@@ -6,7 +6,7 @@ is abandoned in mid-episode goes at once and takes its session along.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 from zlib import crc32
 
 import numpy as np
@@ -17,6 +17,8 @@ from ._episode import Episode
 from ._plan import Plan
 from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
 from .simulation import resetter
+
+AnyEpisode = TypeVar("AnyEpisode", bound=Episode)
 
 
 class Session:
@@ -55,16 +57,15 @@ class Session:
         seed: int | None,
         options: dict[str, Any] | None,
         generator: np.random.Generator,
-        *,
-        rounds: bool = False,
-    ) -> Episode:
+        kind: type[AnyEpisode],
+    ) -> AnyEpisode:
         """End the episode that runs, reset the simulation, and run it to its first decision.
 
         Args:
             seed: The seed to reset it with; None: one is drawn.
             options: What the environment's ``reset`` was given.
             generator: What a seed is drawn from.
-            rounds: Whether the episode is played in rounds or in turns.
+            kind: How the episode is played: in turns or in rounds.
 
         Raises:
             NoDecisionError: The simulation ended without one.
@@ -73,13 +74,17 @@ class Session:
         self.end()
         self._closed, self._starting = False, True
         try:
-            return self._begin(seed, options, generator, rounds)
+            return self._begin(seed, options, generator, kind)
         finally:
             self._starting = False
 
     def _begin(
-        self, seed: int | None, options: dict[str, Any] | None, generator: np.random.Generator, rounds: bool
-    ) -> Episode:
+        self,
+        seed: int | None,
+        options: dict[str, Any] | None,
+        generator: np.random.Generator,
+        kind: type[AnyEpisode],
+    ) -> AnyEpisode:
         self._hold_sites()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
@@ -88,7 +93,7 @@ class Session:
         except BaseException as error:
             error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
-        self._episode = episode = Episode(self.plan, self.simulation, self.seed, rounds=rounds)
+        self._episode = episode = kind(self.plan, self.simulation, self.seed)
         return episode
 
     def end(self) -> None:

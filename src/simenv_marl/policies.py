@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ._episode import Episode
 from ._plan import Plan
 from ._session import Session, checked_seed
 
@@ -39,7 +40,7 @@ def simulate(
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
     session = Session(plan)
     try:
-        session.start(checked_seed(seed), None, np.random.default_rng())
+        session.start(checked_seed(seed), None, np.random.default_rng(), Episode)
         return session.simulation
     finally:
         session.close()

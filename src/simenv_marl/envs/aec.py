@@ -56,7 +56,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = episode = self._start(seed, options, rounds=False)
+        self._episode = episode = self._start(seed, options, Episode)
         self._enter(episode)
 
     def step(self, action: Any) -> None:

@@ -9,6 +9,7 @@ from pettingzoo import ParallelEnv
 
 from .._plan import Plan
 from .._record import Record
+from .._rounds import Rounds
 from .._spaces import blank, duplicate
 from ..simulation import Sentinel
 from ._view import AgentsView
@@ -26,6 +27,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     Attributes:
         agents: The live agents.
     """
+
+    _episode: Rounds | None
 
     def __init__(self, plan: Plan) -> None:
         """Make the environment of a plan.
@@ -53,7 +56,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = episode = self._start(seed, options, rounds=True)
+        self._episode = episode = self._start(seed, options, Rounds)
         self.agents = list(episode.agents)
         records = episode.agents.values()
         return (

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
 from .._session import checked_seed, seed_space
@@ -73,7 +74,7 @@ class SimulationEnv(View, gym.Env[Any, Any]):
         seed = checked_seed(seed)
         self._make_way()
         gym.Env.reset(self, seed=seed)
-        self._episode = episode = self._session.start(seed, options, self.np_random)
+        self._episode = episode = self._session.start(seed, options, self.np_random, Episode)
         if seed is not None:
             seed_space(self.observation_space, seed, self._agent)
             seed_space(self.action_space, seed, self._agent)

@@ -18,7 +18,7 @@ from simenv_marl import aec_env, parallel_env
 SIZES = (2, 100, 1_000, 10_000)
 
 CONVERTED = (2, 100, 1_000)
-"""At how many agents ``aec_to_parallel`` is measured: its step is quadratic in them, and at 10,000 takes 20 s."""
+"""At how many agents ``aec_to_parallel`` is measured: its step is quadratic, and at 10,000 takes tens of seconds."""
 
 CONVERTED_ROUNDS = 3
 
@@ -76,7 +76,7 @@ def _tell(times: Times, beside: Times) -> Section:
     section.times(times)
     section.times({name: beside[name] for name in converters})
     section.remarks.append(
-        "aec_to_parallel is quadratic in the agents and left out at 10,000, where one step of it takes about 20 s."
+        "aec_to_parallel is quadratic in the agents and left out at 10,000, where one step of it takes tens of seconds."
         " A round takes turn_based_aec_to_parallel as many steps as there are agents, and its figures are of one such"
         " step."
     )

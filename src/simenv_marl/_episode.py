@@ -320,7 +320,7 @@ class Episode:
         for binding in self._plan.active:
             name_agent = binding.name_agent
             for call in expected(binding.point.name):
-                args = tuple(call)
+                args = call if type(call) is tuple else tuple(call)
                 agent = binding.agent if name_agent is None else name_agent(*args)
                 record = agents.get(agent) if type(agent) is str else None
                 if record is None or record.binding is not binding:

@@ -11,8 +11,11 @@ from collections.abc import Mapping
 from threading import get_ident
 from typing import Any, Final
 
+from greenlet import getcurrent
+
 from ._driver import EVALUATING, RUNNING, attended, unattended
 from ._episode import UNNAMED, Episode
+from ._plan import Plan
 from ._record import Record, not_finite, number
 from .decision import DIFFERENCES
 from .errors import UnknownAgentError
@@ -23,6 +26,18 @@ MISSING: Final = Sentinel("MISSING")
 
 class Rounds(Episode):
     """An episode that is played round by round, and not turn by turn."""
+
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None) -> None:
+        """Begin an episode, as ``Episode`` does; then reward and observe all agents for the first time."""
+        # By binding, how its agents are named, where nothing but the mappings is to be seen to.
+        self._quick: dict[Any, Any] = {}
+        if getattr(simulation, "time", None) is None:
+            self._quick = {
+                binding: binding.name_agent
+                for binding in plan.active
+                if binding.name_agent is not None and binding.legal is None and binding.point.alone
+            }
+        super().__init__(plan, simulation, seed)
 
     def play(self, actions: Mapping[str, Any]) -> None:
         """Answer decisions with actions, each once, up to the first whose action is missing; or to the end.
@@ -46,11 +61,14 @@ class Rounds(Episode):
             with unattended():
                 self.play(actions)
             return
-        self._driver.enter()
+        if getcurrent() is not self._driver.caller:
+            self._driver.enter()
         left = self._checked(actions, pending)
         if actions:
             self.turns += 1
-        for record in (*self.agents.values(), *self.parting):
+        for record in self.agents.values():
+            record.acted = False
+        for record in self.parting:
             record.acted = False
         self.parting = []
         try:
@@ -93,88 +111,99 @@ class Rounds(Episode):
         Returns:
             Whose decision is left unanswered; None if the episode is over.
         """
-        agents, take = self.agents, left.pop
+        agents, quick, take = self.agents, self._quick, left.pop
         driver = self._driver
         assert driver is not None
-        while (action := take(record.agent, MISSING)) is not MISSING:
-            if action is not RULE:
-                binding: Any = record.binding
-                if record.mask is not None and not binding.allowed(action, record.mask):
-                    break
-                convert = binding.convert
-                action = convert(action) if record.choices is None else [record.choices[action]]
-            self._latest = record
-            record.acted = True
-            if not record.decided:  # seen for the first time, and acting at once
-                arguments = record.arguments()
-                assert arguments is not None
-                record.join(*arguments)
-                arguments = None
-            if record.followed_up:
-                record.follow_up()
-            while True:
-                resume = driver.resume
-                binding, args, kwargs = resume(action)
-                agent: Any = UNNAMED
-                if binding in self._swift:
-                    # What ``_take`` does, for the calls of most models: of one argument, all of it always legal.
-                    (first,) = args
-                    name_agent = binding.name_agent
-                    agent = binding.agent if name_agent is None else name_agent(first)
-                    known = agents.get(agent) if type(agent) is str else None
-                    if known is not None and known.binding is binding:
-                        self._latest = record = known
-                        record.hold(args, kwargs)
+        binding: Any
+        args: Any
+        kwargs: Any
+        known: Any
+        try:
+            while (reply := self._reply(record, take(record.agent, MISSING))) is not MISSING:
+                while True:
+                    resume = driver.resume
+                    binding, args, kwargs = resume(reply)
+                    agent: Any = UNNAMED
+                    name_agent = quick.get(binding)
+                    if name_agent is not None:
+                        # What ``_take`` and ``_reply`` do, for entities of most models, whom all is always legal.
+                        (first,) = args
+                        agent = name_agent(first)
+                        known = agents.get(agent) if type(agent) is str else None
+                        if known is not None and known.decided and known.binding is binding:
+                            self._latest = known
+                            if known._weakly is None or known._weakly() is not first:
+                                known.hold(args, kwargs)
+                            action = take(agent, MISSING)
+                            if action is MISSING:
+                                return known  # type: ignore[no-any-return]
+                            known.acted = True
+                            if action is RULE:
+                                reply = action
+                            else:
+                                convert = binding.convert
+                                reply = convert(action)
+                            args = first = None  # else they would keep alive what the model lets go meanwhile
+                            continue
+                    reply = self._take(binding, args, kwargs, agent)
+                    args = kwargs = first = None
+                    if self.over:
+                        return None
+                    if self.pending is not None:
+                        record, self.pending = self.pending, None
                         break
-                action = self._take(binding, args, kwargs, agent)
-                # Else they would keep alive what the model lets go meanwhile.
-                binding = args = kwargs = first = agent = None
-                if self.over:
-                    return None
-                if self.pending is not None:
-                    record, self.pending = self.pending, None
-                    break
-        return record
+            return record
+        except BaseException:
+            args = kwargs = first = None  # else the error would keep them alive
+            raise
+
+    def _reply(self, record: Record, action: Any) -> Any:
+        """The reply to the decision of an agent, ``MISSING`` if there is no legal action for it any more."""
+        binding = record.binding
+        if action is MISSING or (
+            action is not RULE and record.mask is not None and not binding.allowed(action, record.mask)
+        ):
+            return MISSING
+        self._latest = record
+        if action is not RULE:
+            action = binding.convert(action) if record.choices is None else [record.choices[action]]
+        record.acted = True
+        if not record.decided:  # seen for the first time, and acting at once
+            arguments = record.arguments()
+            assert arguments is not None
+            record.join(*arguments)
+        if record.followed_up:
+            record.follow_up()
+        return action
 
     def _arise(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         record.arise(args, kwargs)
         self.pending = record
-        binding = record.binding
-        if self.clock is None and binding.legal is None and binding.point.alone:
-            self._swift[binding] = record
 
     def _foresee(self, pending: Record | None, *, settle: bool = True) -> None:
         """Find out on which calls the live agents are to be seen; reward and observe them, unless told otherwise."""
-        calls: dict[Record, tuple[Any, ...]] = {}
+        seen = {pending}
         for record, args in self._announced():
-            if record is not pending and record not in calls:  # of several calls the next one counts
+            if record not in seen:  # of several calls the next one counts
+                seen.add(record)
                 record.hold(args, {})
-                calls[record] = args
         if settle:
-            self._settle_all(pending, calls)
+            self._settle_all(pending)
 
-    def _settle_all(self, pending: Record | None, calls: dict[Record, tuple[Any, ...]]) -> None:
+    def _settle_all(self, pending: Record | None) -> None:
         """Reward and observe all live agents, as far as the calls are known on which they decide."""
-        thread = get_ident()
-        plain = {binding for binding in self._plan.active if binding.legal is None and self.clock is None}
+        thread, quick = get_ident(), self._quick
         for record in self.agents.values():
-            args: Any = calls.get(record)
-            kwargs: dict[str, Any] = {}
-            if args is None:
-                arguments = record.arguments()
-                if arguments is None:
-                    record.reward, record.info = 0.0, {}
-                    continue
-                args, kwargs = arguments
-            self._latest = record
-            binding = record.binding
-            if kwargs or len(args) != 1 or not record.decided or binding not in plain:
-                record.settle(args, kwargs)
-                if record is not pending:
-                    record.choices = None  # which are asked for again when it decides
+            binding, weakly = record.binding, record._weakly
+            if weakly is None or not record.decided or binding not in quick:
+                self._settle(record, pending)
                 continue
-            # The same, for the calls of most models: of one argument, with nothing but the mappings to be seen to.
-            (first,) = args
+            # The same, for entities of most models, with nothing but the mappings to be seen to.
+            first = weakly()
+            if first is None:
+                record.reward, record.info = 0.0, {}
+                continue
+            self._latest = record
             reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
             if DIFFERENCES:
                 EVALUATING[thread] = record.memory
@@ -187,3 +216,13 @@ class Rounds(Episode):
             record.observation = cast(observe(first))
             record.info = {}
         EVALUATING.pop(thread, None)
+
+    def _settle(self, record: Record, pending: Record | None) -> None:
+        arguments = record.arguments()
+        if arguments is None:
+            record.reward, record.info = 0.0, {}
+            return
+        self._latest = record
+        record.settle(*arguments)
+        if record is not pending:
+            record.choices = None  # which are asked for again when it decides

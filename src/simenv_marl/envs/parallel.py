@@ -99,14 +99,26 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         results: Results = {}, {}, {}, {}, {}
         observations, rewards, terminations, truncations, infos = results
         terminated, truncated, pending = episode.terminated, episode.truncated, episode.pending
-        for agent, record in (*((record.agent, record) for record in episode.parting), *episode.agents.items()):
-            ended, info = record.ended, record.info
+        for record in episode.parting:
+            agent = record.agent
             observations[agent] = self._hand_out(record)
             rewards[agent] = record.reward
-            terminations[agent] = ended or terminated
-            truncations[agent] = truncated and not ended
-            info["deciding"], info["acted"] = record is pending, record.acted
+            terminations[agent], truncations[agent] = True, False
+            infos[agent] = info = record.info
+            info["deciding"], info["acted"] = False, record.acted
+        for agent, record in episode.agents.items():
+            observation, info = record.observation, record.info
+            if observation is None or record.handed_out is observation:
+                observation = self._hand_out(record)
+            else:
+                record.handed_out = observation
+            observations[agent] = observation
+            rewards[agent] = record.reward
+            terminations[agent], truncations[agent] = terminated, truncated
+            info["deciding"], info["acted"] = False, record.acted
             infos[agent] = info
+        if pending is not None:
+            pending.info["deciding"] = True
         self.agents = [] if episode.over else list(episode.agents)
         return results
 

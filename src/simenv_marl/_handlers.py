@@ -155,9 +155,11 @@ class Attached:
                 f"the handler {title(self.handler)}{own} cannot be attached {self.position} {self.target.name}: it"
                 f" cannot be called with all arguments that {signature} takes ({error})"
             ) from None
-        if any(p.kind is p.VAR_KEYWORD for p in own.parameters.values()):
-            return frozenset(p.name for p in positional if _only_by_position(own, p.name))
-        return frozenset(p.name for p in positional if not takes(self.handler, p.name))
+        return frozenset(
+            p.name
+            for number, p in enumerate(positional)
+            if not _binds(own, number, [q.name for q in positional[number:] if q is p or q.default is q.empty] + result)
+        )
 
     def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any], result: Any = _NOTHING) -> Any:
         """Call the handler as the target was called."""
@@ -190,9 +192,13 @@ class Attached:
             error.add_note(note)
 
 
-def _only_by_position(signature: inspect.Signature, name: str) -> bool:
-    """Whether a handler that takes any keywords has another parameter in the place of that name's."""
-    return name not in signature.parameters
+def _binds(signature: inspect.Signature, count: int, keywords: list[str]) -> bool:
+    """Whether so many arguments and these keywords can be passed."""
+    try:
+        signature.bind(*[None] * count, **dict.fromkeys(keywords))
+    except TypeError:
+        return False
+    return True
 
 
 class Handlers:

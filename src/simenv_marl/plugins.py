@@ -220,7 +220,8 @@ def _at_hand(target: Target) -> Target:
     place = target.place
     if place is None or not place.stale:
         return _everywhere(target)
-    if exposure(plain(vars(place.owner).get(place.attribute))) is target:  # somebody has put it there for good
+    put_there_for_good: bool = exposure(plain(vars(place.owner).get(place.attribute))) is target
+    if put_there_for_good:
         target.place, target.patches = None, []
         return target
     return find_target(place.name)

@@ -6,12 +6,18 @@ The layers, each importing only from those above it::
     simulation    what a simulation is; RULE and TRUNCATED
     _spaces       casting observations to spaces, checking actions against them
     _driver       switching between a simulation's stack and its user's
+    _wrappers     functions that stand in front of others: decision functions, exposed functions
     decision      make_step: definitions, decision points, decision functions
-    _points       what ``points=`` names, and patches for what nobody has decorated
+    _patches      places in a model, and what is to stand there for a while
+    _handlers     handlers, and the calls in which they take part
+    _iterables    iterables whose items are handed out with handlers
+    plugins       handlers for everybody, for a while, for one environment; traces
+    _points       what ``points=`` names
     _plan         what an environment is made of, checked before anything runs
     _record       what an episode knows of one agent; rewards and observations
     _episode      what happens when: decisions, rewards, observations, ends, errors
     _rounds       the same in rounds, in which all agents may act
+    _surroundings what an environment's simulation finds around it whenever it is at work
     _session      a simulation over all episodes of one environment
     policies      policies back in the model's own loop
     envs          views: an episode read as a PettingZoo or Gymnasium environment
@@ -19,6 +25,7 @@ The layers, each importing only from those above it::
 """
 
 from . import errors
+from ._handlers import Call, ChangedArgs, ChangedResult
 from .decision import Definition, difference, make_step
 from .envs import (
     SimulationAECEnv,
@@ -32,6 +39,16 @@ from .envs import (
     single_env,
 )
 from .errors import *  # noqa: F403 - the whole tree is public
+from .plugins import (
+    attach_handler,
+    attached_handlers,
+    decision_points,
+    expose_to_plugins,
+    exposed_functions,
+    handlers,
+    remove_handler,
+    trace,
+)
 from .policies import simulate
 from .registration import register_simulation
 from .simulation import RULE, TRUNCATED, SimulationInterface
@@ -41,6 +58,9 @@ __version__ = "0.1.0"
 __all__ = [
     "RULE",
     "TRUNCATED",
+    "Call",
+    "ChangedArgs",
+    "ChangedResult",
     "Definition",
     "SimulationAECEnv",
     "SimulationEnv",
@@ -48,14 +68,22 @@ __all__ = [
     "SimulationJointEnv",
     "SimulationParallelEnv",
     "aec_env",
+    "attach_handler",
+    "attached_handlers",
+    "decision_points",
     "difference",
     "errors",
+    "expose_to_plugins",
+    "exposed_functions",
     "generate_env",
+    "handlers",
     "joint_env",
     "make_step",
     "parallel_env",
     "register_simulation",
+    "remove_handler",
     "simulate",
     "single_env",
+    "trace",
 ]
 __all__ += errors.__all__

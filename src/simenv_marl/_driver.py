@@ -38,6 +38,30 @@ EVALUATING: dict[int, dict[Any, Any]] = {}
 """By thread: what differences remember for the agent whose mapping is being evaluated there."""
 
 
+PLUGGED: dict[int, Any] = {}
+"""By thread: the plugins of the environment that is at work there, if it has any."""
+
+
+class Surrounding(Protocol):
+    """Something that an environment's simulation is to find around it whenever it is at work.
+
+    The environment's user enters it before anything runs for the environment, and leaves it afterwards. That may
+    be nested, and ``unattended`` may lie in between.
+    """
+
+    def enter(self) -> None:
+        """Put it up."""
+
+    def leave(self) -> None:
+        """Take it down: what was there before is there again."""
+
+    def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
+        """The simulation's main loop with this around it, in whatever thread that runs.
+
+        Where it runs in its user's thread, ``enter`` has already been called whenever it is resumed.
+        """
+
+
 class SimulationExit(SystemExit):
     """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught.
 
@@ -255,17 +279,18 @@ class GreenletDriver:
 def attended() -> bool:
     """Whether a simulation, or a mapping, runs around us in this thread."""
     thread = get_ident()
-    return thread in RUNNING or thread in EVALUATING
+    return thread in RUNNING or thread in EVALUATING or thread in PLUGGED
 
 
 @contextmanager
 def unattended() -> Iterator[None]:
     """Keep apart what runs in this thread from the simulation or mapping that runs around it.
 
-    Decision functions run their rule, and differences are asked for nobody, until an episode says otherwise.
+    Decision functions run their rule, differences are asked for nobody, and there are no plugins but those of the
+    whole process, until an episode says otherwise.
     """
     thread = get_ident()
-    ask, memory = RUNNING.pop(thread, None), EVALUATING.pop(thread, None)
+    ask, memory, plugins = RUNNING.pop(thread, None), EVALUATING.pop(thread, None), PLUGGED.pop(thread, None)
     try:
         yield
     finally:
@@ -273,3 +298,5 @@ def unattended() -> Iterator[None]:
             RUNNING[thread] = ask
         if memory is not None:
             EVALUATING[thread] = memory
+        if plugins is not None:
+            PLUGGED[thread] = plugins

@@ -24,7 +24,8 @@ Views read the records of agents; none of them computes an observation or a rewa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from threading import get_ident
 from typing import Any, Final
 
@@ -108,8 +109,8 @@ class Episode:
         self.clock = getattr(simulation, "time", None)
         for agent, binding in () if plan.unanswered else plan.roster.items():
             self.agents[agent] = Record(agent, binding, None, self.clock)
-        self._driver: Driver | None = GreenletDriver(simulation.run, plan.bindings)
-        with unattended():
+        self._driver: Driver | None = GreenletDriver(self._main_loop(), plan.bindings)
+        with self._kept_apart():
             try:
                 reply = None
                 while self.pending is None and not self.over:
@@ -127,6 +128,18 @@ class Episode:
                 f" {', '.join(binding.point.name for binding in plan.active)}; does the simulation call the"
                 " decision functions as attributes of their class or module?"
             )
+
+    def _main_loop(self) -> Callable[[], Any]:
+        run: Callable[[], Any] = self._simulation.run
+        return run
+
+    def _attended(self) -> bool:
+        """Whether another environment's simulation runs around us."""
+        return attended()
+
+    def _kept_apart(self) -> AbstractContextManager[None]:
+        """Keep what runs apart from such a simulation."""
+        return unattended()
 
     # -- decisions --------------------------------------------------------------------------------
 
@@ -146,7 +159,7 @@ class Episode:
         driver = self._driver
         if record is None or driver is None:
             raise self.nothing_pending()
-        if (RUNNING or EVALUATING) and attended():  # inside another environment's simulation
+        if (RUNNING or EVALUATING) and self._attended():  # inside another environment's simulation
             with unattended():
                 self.turn(action)
             return
@@ -435,7 +448,7 @@ class Episode:
         problems: list[BaseException] = []
         if driver is None:
             return problems
-        with unattended():
+        with self._kept_apart():
             try:
                 stop = getattr(self._simulation, "stop", None)
                 if stop is not None:

@@ -7,7 +7,7 @@ options. It holds no state of any episode, so that one plan serves any number of
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from functools import partial
@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from . import _spaces
-from ._driver import unattended
+from ._driver import Surrounding, unattended
 from ._points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, stand_ins
 from ._spaces import ILLEGAL
 from .decision import DecisionPoint, Definition, unwrapped
@@ -32,6 +32,7 @@ from .errors import (
     UnknownPointError,
     warn_user,
 )
+from .plugins import Plugged, Plugins
 from .simulation import RULE, make_simulation
 
 RENDER_MODES = ("ansi", "human", "rgb_array")
@@ -58,6 +59,8 @@ class Options:
             decision point (dotted name or decision function), to a callable of the observation, or of the
             observation and the info, that returns an action. ``RULE`` in place of the callable stands for the
             model's own rule.
+        plugins: Handlers for this environment's simulation alone: of each the handler, the target and the position,
+            as ``attach_handler`` takes them.
         flatten: Whether the joint view has one vector in place of dicts.
         state_space: The space to whose shape and dtype the environment's ``state()`` is cast; None: what the
             simulation's own ``state()`` returns is taken as it is.
@@ -69,6 +72,7 @@ class Options:
     undeclared: str = "error"
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
+    plugins: Iterable[Any] = ()
     flatten: bool = False
     state_space: spaces.Space[Any] | None = None
     render_mode: str | None = None
@@ -94,6 +98,11 @@ class Options:
         for key, policy in (self.policies or {}).items():
             if policy is not RULE and not callable(policy):
                 raise OptionValueError(f"the policy of {key!r} must be a callable or RULE, not {policy!r}")
+
+        if isinstance(self.plugins, (str, Mapping)) or not isinstance(self.plugins, Iterable):
+            raise OptionValueError(f"plugins must be a list of (handler, target, position), not {self.plugins!r}")
+        if not isinstance(self.plugins, (list, tuple)):
+            object.__setattr__(self, "plugins", tuple(self.plugins))  # an iterator is to serve more than once
 
     def amended(self, options: Mapping[str, Any]) -> Options:
         """The same options, but for those that are given.
@@ -317,6 +326,7 @@ class Plan:
         roster: By name: the agents that are known beforehand, in the order of the points.
         complete: Whether no others may join.
         unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
+        plugins: The handlers for its simulation alone; None if it has none.
         sites: Where decision functions must be set while the environment is in use.
     """
 
@@ -356,6 +366,7 @@ class Plan:
             for other in stand_ins(bound.point):
                 self.bindings.setdefault(other, bound)
         self._find_removals()
+        self.plugins = Plugins(options.plugins) if options.plugins else None
         self.unanswered = unanswered
         if not active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
@@ -366,6 +377,10 @@ class Plan:
     def possible_agents(self) -> list[str] | None:
         """The names of all agents that there may be; None where they are only known when they decide."""
         return list(self.roster) if self.complete else None
+
+    def surroundings(self) -> list[Surrounding]:
+        """What the simulation of one environment is to find around it, from the outermost to the innermost."""
+        return [] if self.plugins is None else [Plugged(self.plugins)]
 
     def _find_removals(self) -> None:
         for binding in dict.fromkeys(self.bindings.values()):
@@ -416,10 +431,12 @@ class Plan:
         Raises:
             SimulationError: The source makes none.
         """
-        try:
-            return self._spare.pop()
-        except IndexError:
-            return make_simulation(self.source)
+        if self._spare and not self.surroundings():  # which it was made without
+            try:
+                return self._spare.pop()
+            except IndexError:  # another thread was faster
+                pass
+        return make_simulation(self.source)
 
     def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
         """The same plan, with another definition of a point."""
@@ -437,7 +454,7 @@ class Plan:
     @property
     def stale(self) -> bool:
         """Whether a function that it patches has been replaced by another one since it was made."""
-        return any(site.stale for site in self.sites)
+        return any(site.stale for site in self.sites) or (self.plugins is not None and self.plugins.stale)
 
     @property
     def name(self) -> str:

@@ -1,24 +1,24 @@
-"""Finding decision points: what ``points=`` names, and patches for what no one has decorated.
+"""Finding decision points: what ``points=`` names.
 
-A *site* is the one place in a class or module at which a function is found. Where an environment names
-an undecorated function, a decision function is set there for as long as an environment needs it; for
-everybody else it runs what it replaced.
+Where an environment names an undecorated function, a decision function is set at its place for as long as an
+environment needs it: a *site*. For everybody else it runs what it replaced.
 """
 
 from __future__ import annotations
 
-import importlib
-import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from sys import modules
-from types import FunctionType, ModuleType
-from typing import Any, ClassVar
+from types import FunctionType
+from typing import Any, ClassVar, Final
 from weakref import WeakValueDictionary
 
+from ._patches import DECIDED, Place, Purpose, all_classes, found_at, held_at, owner_at_hand, plain, resolve, title
+from ._wrappers import beneath, exposure
 from .decision import DecisionPoint, Definition, point_of, registered, registered_names, unbind, unwrapped
 from .errors import DefinitionError, PatchError, UnknownPointError
+
+POINT: Final = Purpose("decision point", UnknownPointError, registered_names)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def find_point(key: Any, definition: Any = None) -> NamedPoint:
         UnknownPointError, DefinitionError, PatchError: As ``find_points``.
     """
     if definition is not None and not isinstance(definition, Definition):
-        raise DefinitionError(f"the definition of {_title(key)} must come from make_step, not {definition!r}")
+        raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {definition!r}")
     point, own, site = locate(key)
     definition = definition or own or point.definition
     if definition is None:
@@ -113,7 +113,11 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
     """
     if isinstance(key, str):
         return _locate_name(key)
-    function, _ = unbind(key)
+    given, _ = unbind(key)
+    place = getattr(exposure(given), "place", None)
+    if place is not None:  # fetched while handlers were set in front of it
+        return _locate_name(place.name) if place.stale else _look_at(place.name, place.owner, place.attribute)
+    function = beneath(given)
     known = point_of(function)
     if known is not None:
         site = Site.of(known[0])
@@ -123,19 +127,19 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
     name = f"{function.__module__}.{function.__qualname__}"
     owner: Any
     try:
-        owner, attribute = _resolve(name)
-        found = unwrapped(_held(owner, attribute)) is function
+        owner, attribute = resolve(name, POINT)
+        found = unwrapped(held_at(owner, attribute)) is function
     except (UnknownPointError, PatchError):
         found = False
     if not found:  # the function is at hand, though not by its name
-        owner, attribute = _owner_at_hand(function), function.__name__
+        owner, attribute = owner_at_hand(function), function.__name__
     return _look_at(name, owner, attribute)
 
 
 def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
     point = registered(name)
     try:
-        owner, attribute = _resolve(name)
+        owner, attribute = resolve(name, POINT)
     except (UnknownPointError, PatchError):
         if point is None:
             raise
@@ -148,16 +152,17 @@ def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None, Site | No
 
 
 def _is_decided(owner: Any, attribute: str) -> bool:
-    held = _held(owner, attribute)
-    return point_of(_plain(held)) is not None
+    held = held_at(owner, attribute)
+    return point_of(plain(held)) is not None
 
 
 def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
-    held = _held(owner, attribute)
-    known = point_of(_plain(held))
+    held = held_at(owner, attribute)
+    known = point_of(plain(held))
     if known is not None and attribute in vars(owner):
         return (*known, Site.of(known[0]))
     site = Site.at(name, owner, attribute)
+    known = known or point_of(plain(found_at(owner, attribute)))
     return site.point, (known[1] or known[0].definition) if known else None, site  # decorated in a base class
 
 
@@ -179,37 +184,20 @@ def stand_ins(point: DecisionPoint) -> list[DecisionPoint]:
 def _decorated_places(point: DecisionPoint) -> set[Any]:
     """The classes and modules that have a decision function of the point under the function's own name."""
     name, wrappers = point.rule.__name__, set(point.wrappers)
-    owners: list[Any] = [*_all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
-    found = ((owner, vars(owner).get(name)) for owner in owners)
-    return {owner for owner, held in found if isinstance(_plain(held), FunctionType) and _plain(held) in wrappers}
-
-
-def _all_classes(base: type = object) -> Iterator[type]:
-    """All classes that there are, or that derive from one."""
-    seen: set[type] = set()
-    left = [base]
-    while left:
-        owner = left.pop()
-        if owner not in seen:
-            seen.add(owner)
-            yield owner
-            left += type.__subclasses__(owner)
-
-
-def _plain(held: Any) -> Any:
-    """What a class or module holds, without its binding."""
-    return held.__func__ if isinstance(held, (staticmethod, classmethod)) else held
+    owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
+    found = ((owner, beneath(plain(vars(owner).get(name)))) for owner in owners)
+    return {owner for owner, function in found if isinstance(function, FunctionType) and function in wrappers}
 
 
 def have_instances(one: type, other: type) -> bool:
     """Whether some object can be an instance of both classes, of all classes that there are now."""
-    return any(issubclass(owner, other) for owner in _all_classes(one))
+    return any(issubclass(owner, other) for owner in all_classes(one))
 
 
 def owner_class(point: DecisionPoint) -> type | None:
     """The class that a point is a method of; None where it is none, or is not to be found by its name."""
     try:
-        owner, _ = _resolve(point.name)
+        owner, _ = resolve(point.name, POINT)
     except (UnknownPointError, PatchError):
         return None
     return owner if isinstance(owner, type) else None
@@ -228,103 +216,22 @@ def _all_registered() -> list[str]:
     return names
 
 
-def _title(key: Any) -> str:
-    return key if isinstance(key, str) else getattr(key, "__qualname__", repr(key))
-
-
-# -- names ----------------------------------------------------------------------------------------
-
-
-def _resolve(name: str) -> tuple[Any, str]:
-    """Find the class or module in which a dotted name ends, importing what must be imported."""
-    parts = name.split(".")
-    if len(parts) < 2 or not all(parts):
-        raise _unknown(name, "a dotted name is needed, such as package.module.Class.function")
-    module, rest = _longest_module(parts)
-    if module is None:
-        raise _unknown(name, f"there is no module {parts[0]!r}")
-    owner: Any = module
-    for part in rest[:-1]:
-        try:
-            owner = getattr(owner, part)
-        except AttributeError:
-            raise _unknown(name, f"{_title(owner)} has no {part!r}") from None
-    attribute = rest[-1]
-    if isinstance(owner, type) and attribute.startswith("__") and not attribute.endswith("__"):
-        attribute = f"_{owner.__name__.lstrip('_')}{attribute}"
-    if not isinstance(owner, (type, ModuleType)):
-        raise PatchError(f"{name} cannot be a decision point: {'.'.join(parts[:-1])} is no class or module")
-    if not hasattr(owner, attribute):
-        raise _unknown(name, f"{getattr(owner, '__name__', owner)} has no {attribute!r}")
-    return owner, attribute
-
-
-def _longest_module(parts: list[str]) -> tuple[ModuleType | None, list[str]]:
-    module: ModuleType | None = None
-    for length in range(1, len(parts)):
-        path = ".".join(parts[:length])
-        try:
-            found = importlib.import_module(path)
-        except ModuleNotFoundError as error:
-            if error.name is not None and (path == error.name or path.startswith(f"{error.name}.")):
-                return module, parts[length - 1 :]
-            raise  # the module is there, and imports one that is not
-        module = found
-    return module, parts[-1:]
-
-
-def _unknown(name: str, why: str) -> UnknownPointError:
-    close = get_close_matches(name, registered_names(), n=3, cutoff=0.6)
-    hint = f"; did you mean {' or '.join(close)}?" if close else ""
-    return UnknownPointError(f"the decision point {name!r} is not to be found: {why}{hint}")
-
-
-def _owner_at_hand(function: FunctionType) -> type:
-    """Find the class that holds a function which is not found by its name, as inside another function."""
-    for owner in _all_classes():
-        if _plain(vars(owner).get(function.__name__)) is function:
-            return owner
-    raise PatchError(
-        f"{function.__module__}.{function.__qualname__} is not what is found under that name, nor in any class;"
-        " name it where it is found, or decorate it with make_step"
-    )
-
-
-# -- sites ----------------------------------------------------------------------------------------
-
-
-def _held(owner: Any, attribute: str) -> Any:
-    """What a class or module holds under a name, as it holds it (a staticmethod stays one)."""
-    for place in owner.__mro__ if isinstance(owner, type) else (owner,):
-        if attribute in vars(place):
-            return vars(place)[attribute]
-    return getattr(owner, attribute, None)
-
-
 class Site:
     """A place at which a decision function is set while an environment needs it.
 
     There is one for each place, shared by all environments, however long any of them needs it.
     """
 
-    _all: ClassVar[WeakValueDictionary[tuple[Any, str], Site]] = WeakValueDictionary()
+    _all: ClassVar[WeakValueDictionary[Place, Site]] = WeakValueDictionary()
 
-    def __init__(self, name: str, owner: Any, attribute: str) -> None:
-        held = _held(owner, attribute)
-        function = _plain(held)
-        if not isinstance(function, FunctionType):
+    def __init__(self, place: Place) -> None:
+        if not isinstance(place.function, FunctionType):
             raise PatchError(
-                f"{name} cannot be a decision point: it is a {type(held).__name__} and no function written in"
-                " Python; name a function that it calls, or that calls it"
+                f"{place.name} cannot be a decision point: what it exposes is no function written in Python"
             )
-        self._name, self._owner, self._attribute = name, owner, attribute
-        self._held, self._inherited = held, attribute not in vars(owner)
-        self._binding = type(held) if held is not function else None
-        self._users = 0
-        rule = _next_in_line(owner, attribute, function, self._binding) if self._inherited else function
-        self.point = DecisionPoint(rule, name, bound=self._binding is not staticmethod, like=function)
-        wrapper = self.point.wrap(None)
-        self._wrapper: Any = wrapper if self._binding is None else self._binding(wrapper)
+        self._place = place
+        self.point = DecisionPoint(place.rule, place.name, bound=place.binding is not staticmethod, like=place.function)
+        self._wrapper = self.point.wrap(None)
 
     @classmethod
     def at(cls, name: str, owner: Any, attribute: str) -> Site:
@@ -333,11 +240,10 @@ class Site:
         Raises:
             PatchError: What stands there cannot be patched.
         """
-        # A function of a module may have names in several modules, and is one site all the same.
-        place = (owner, attribute) if isinstance(owner, type) else (_held(owner, attribute), "")
+        place = Place.at(name, owner, attribute, POINT)
         site = cls._all.get(place)
-        if site is None or site.stale:
-            site = cls._all[place] = cls(name, owner, attribute)
+        if site is None:
+            site = cls._all[place] = cls(place)
         return site
 
     @classmethod
@@ -347,9 +253,8 @@ class Site:
 
     @property
     def stale(self) -> bool:
-        """Whether something else has been set there, while no decision function was."""
-        there = vars(self._owner).get(self._attribute)
-        return self._users == 0 and there is not (None if self._inherited else self._held)
+        """Whether something else has been set there, while nothing of ours was."""
+        return self._place.stale
 
     def hold(self) -> None:
         """Have the decision function set until as many calls of ``let_go``.
@@ -357,69 +262,8 @@ class Site:
         Raises:
             PatchError: The place refuses, or something else has been set there meanwhile.
         """
-        if self.stale:
-            raise PatchError(f"{self._name} has been replaced since it was named as a decision point")
-        if self._users == 0:
-            self._set(self._held, self._wrapper)
-        self._users += 1
+        self._place.hold(DECIDED, lambda _: self._wrapper)
 
     def let_go(self) -> None:
-        """Undo one ``hold``; the last one puts back what stood there."""
-        self._users -= 1
-        if self._users == 0:
-            self._set(self._wrapper, self._held)
-
-    def _set(self, old: Any, new: Any) -> None:
-        if not isinstance(self._owner, type):
-            # A function of a module is found also where other modules imported it by name.
-            for module, name in _places_of(old):
-                setattr(module, name, new)
-            return
-        try:
-            if new is self._wrapper:
-                setattr(self._owner, self._attribute, new)
-            elif vars(self._owner).get(self._attribute) is not old:
-                return  # somebody has set something else since: leave it alone
-            elif self._inherited:
-                delattr(self._owner, self._attribute)
-            else:
-                setattr(self._owner, self._attribute, new)
-        except (TypeError, AttributeError) as error:
-            raise PatchError(f"{self._name} cannot be a decision point: {error}") from error
-
-
-def _places_of(function: Any) -> list[tuple[Any, str]]:
-    """All names of loaded modules under which a function is found."""
-    return [
-        (module, name)
-        for module in list(modules.values())
-        if isinstance(module, ModuleType)
-        for name, value in list(vars(module).items())
-        if value is function
-    ]
-
-
-def _next_in_line(owner: type, attribute: str, function: FunctionType, binding: type | None) -> Any:
-    """Make the rule of an inherited function: what the class would find without the patch, whenever it is called.
-
-    What is found is looked up at each call, so that a patch of the base class is not passed over.
-    """
-    if binding is None:
-
-        def rule(self: Any, /, *args: Any, **kwargs: Any) -> Any:
-            return getattr(super(owner, self), attribute)(*args, **kwargs)
-
-    elif issubclass(binding, classmethod):
-
-        def rule(cls: Any, /, *args: Any, **kwargs: Any) -> Any:
-            return getattr(super(owner, cls), attribute)(*args, **kwargs)
-
-    else:
-
-        def rule(*args: Any, **kwargs: Any) -> Any:  # type: ignore[misc]
-            return getattr(super(owner, owner), attribute)(*args, **kwargs)
-
-    rule.__name__, rule.__qualname__ = function.__name__, f"{owner.__qualname__}.{attribute}"
-    rule.__module__, rule.__doc__ = owner.__module__, function.__doc__
-    rule.__signature__ = inspect.signature(function)  # type: ignore[attr-defined]
-    return rule
+        """Undo one ``hold``; the last one takes the decision function away."""
+        self._place.let_go(DECIDED)

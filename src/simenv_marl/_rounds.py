@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from greenlet import getcurrent
 
-from ._driver import EVALUATING, RUNNING, attended, unattended
+from ._driver import EVALUATING, RUNNING, unattended
 from ._episode import UNNAMED, Episode
 from ._plan import Plan
 from ._record import Record, not_finite, number
@@ -57,7 +57,7 @@ class Rounds(Episode):
         pending = self.pending
         if pending is None or self._driver is None:
             raise self.nothing_pending()
-        if (RUNNING or EVALUATING) and attended():
+        if (RUNNING or EVALUATING) and self._attended():
             with unattended():
                 self.play(actions)
             return

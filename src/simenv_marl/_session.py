@@ -6,6 +6,7 @@ is abandoned in mid-episode goes at once and takes its session along.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Any, TypeVar
 from zlib import crc32
 
@@ -15,6 +16,7 @@ from gymnasium import spaces
 from ._driver import unattended
 from ._episode import Episode
 from ._plan import Plan
+from ._surroundings import Surroundings, surrounded
 from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
 from .simulation import resetter
 
@@ -43,9 +45,11 @@ class Session:
         self._closed = False
         self._starting = False
         self._held = False
+        self._plugins = plan.plugins
+        self._surroundings = Surroundings(plan.surroundings())
         self._hold_sites()
         try:
-            with unattended():
+            with self.at_work():
                 self.simulation = plan.make_simulation()
                 self._reset = resetter(self.simulation)
         except BaseException:
@@ -88,13 +92,19 @@ class Session:
         self._hold_sites()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
-            with unattended():
+            with self.at_work():
                 self._reset(self.seed, options)
         except BaseException as error:
             error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
-        self._episode = episode = kind(self.plan, self.simulation, self.seed)
+        begin: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
+        episode: AnyEpisode = begin(self.plan, self.simulation, self.seed)
+        self._episode = episode
         return episode
+
+    def at_work(self) -> AbstractContextManager[None]:
+        """Keep what the simulation does apart from whatever runs around it, and in its surroundings."""
+        return self._surroundings.entered() if self._surroundings else unattended()
 
     def end(self) -> None:
         """End the episode that runs, if one does.
@@ -124,7 +134,7 @@ class Session:
         if mode is None:
             warn_user(f"render() without a render_mode shows nothing; the simulation's are {self.plan.render_modes}")
             return None
-        with unattended():
+        with self.at_work():
             return self.simulation.render(mode)
 
     def close(self) -> None:
@@ -155,6 +165,8 @@ class Session:
             for site in self.plan.sites:
                 site.hold()
                 done.append(site)
+            if self._plugins is not None:
+                self._plugins.hold()
         except BaseException:
             for site in done:
                 site.let_go()
@@ -164,6 +176,8 @@ class Session:
     def _let_go_of_sites(self) -> None:
         if self._held:
             self._held = False
+            if self._plugins is not None:
+                self._plugins.let_go()
             for site in self.plan.sites:
                 site.let_go()
 

@@ -16,13 +16,14 @@ from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
 from threading import get_ident
 from types import FunctionType, MethodType
-from typing import Any, Final
+from typing import Any
 from weakref import WeakKeyDictionary, WeakSet, WeakValueDictionary
 
 import numpy as np
 from gymnasium import spaces
 
 from ._driver import EVALUATING, RUNNING
+from ._wrappers import DECISION, beneath, generate, is_alone, is_method, kind_of, stands_in, with_exposure
 from .errors import DefinitionError, PatchError
 
 Mapped = Callable[..., Any]
@@ -70,10 +71,13 @@ class Definition:
         Raises:
             PatchError: ``function`` is none of these.
         """
-        rule, binding = unbind(function)
+        given, binding = unbind(function)
+        rule = beneath(given)
+        if not isinstance(rule, FunctionType):
+            raise PatchError(f"{rule!r} cannot be a decision point: it is no function written in Python")
         known = point_of(rule)
         point = known[0] if known else DecisionPoint(rule, bound=binding is not staticmethod)
-        wrapper = point.wrap(self)
+        wrapper = with_exposure(point.wrap(self), given)  # handlers lie outside the decision
         point.definition = self
         _REGISTRY[point.name] = point
         return wrapper if binding is None else binding(wrapper)
@@ -260,21 +264,12 @@ class DecisionPoint:
         """
         self.rule = rule
         self.name = name or f"{rule.__module__}.{rule.__qualname__}"
-        self.bound = bound and "." in self.name.removeprefix(f"{rule.__module__}.").rpartition("<locals>.")[2]
+        self.bound = bound and is_method(rule, self.name)
         self.definition: Definition | None = None
-        like = like or rule
-        parameters = list(inspect.signature(rule, follow_wrapped=False).parameters.values())
-        self.alone = self.bound and len(parameters) == 1 and _is_required(parameters[0])
+        self.kind = kind_of(like or rule, self.name)
+        self.alone = is_alone(inspect.signature(rule, follow_wrapped=False), bound=self.bound)
         self.wrappers: WeakSet[FunctionType] = WeakSet()
         _FAMILIES.setdefault(rule, WeakSet()).add(self)
-        if inspect.isasyncgenfunction(like):
-            raise PatchError(f"{self.name} is an async generator function, which cannot return a decision")
-        if inspect.isgeneratorfunction(like):
-            self.kind = "generator"
-        elif inspect.iscoroutinefunction(like):
-            self.kind = "coroutine"
-        else:
-            self.kind = "function"
 
     def __repr__(self) -> str:
         return f"<DecisionPoint {self.name}>"
@@ -291,8 +286,23 @@ class DecisionPoint:
         Args:
             definition: What the decision function stands for where it is named as a point.
         """
-        wrapper = _generate(self, definition)
-        update_wrapper(wrapper, self.rule)
+        wrapper = generate(
+            self.rule,
+            inspect.signature(self.rule, follow_wrapped=False),
+            what=DECISION,
+            name=self.name,
+            kind=self.kind,
+            alone=self.alone,
+            guard="RUNNING",
+            ask="RUNNING.get(get_ident(), unattended)(point, {}, {})",
+            namespace={
+                "RUNNING": RUNNING,
+                "get_ident": get_ident,
+                "point": self,
+                "unattended": _run_rule,
+                "definition": definition,
+            },
+        )
         self.wrappers.add(wrapper)
         return wrapper
 
@@ -303,15 +313,15 @@ class DecisionPoint:
 
 def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
     """The point of a decision function and the definition that it was made with; None for anything else."""
-    # Looked up where nothing can copy it to: other decorators take over a function's attributes.
-    if isinstance(function, FunctionType) and function.__code__.co_filename.startswith("<decision function "):
+    function = beneath(function)
+    if stands_in(function, DECISION):
         return function.__globals__["point"], function.__globals__["definition"]
     return None
 
 
 def unwrapped(function: Any) -> Any:
-    """The rule of a decision function; any other function as it is, without its binding."""
-    function = getattr(function, "__func__", function)
+    """The rule of a decision function; any other function as it is, without its binding and its handlers."""
+    function = beneath(getattr(function, "__func__", function))
     known = point_of(function)
     return known[0].rule if known else function
 
@@ -360,98 +370,6 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
             return function, staticmethod
         return function, None
     raise PatchError(f"{function!r} cannot be a decision point: it is no function written in Python")
-
-
-# -- decision functions ---------------------------------------------------------------------------
-
-_ABSENT: Final = object()
-
-_CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
-
-# What a call costs where no simulation runs behind an environment is decided here. A method that takes
-# nothing but ``self`` costs two plain calls. Where arguments can be passed by keyword it costs three,
-# because mappings are to receive them as they were passed.
-_WITHOUT_ARGUMENTS = """
-{define} decide({names}):
-    if not RUNNING:
-        return {rule}
-    return {ask}
-"""
-_WITH_ARGUMENTS = """
-{define} decide({positional}, /, **kwargs):
-    if RUNNING or kwargs or {last} is ABSENT:
-        args = {passed}
-        if not RUNNING:
-            return {rule_as_passed}
-        if kwargs or len(args) < {required}:
-            bind(*args, **kwargs)
-        return {ask}
-    return {rule}
-"""
-_VARIADIC = """
-{define} decide(*args, **kwargs):
-    if not RUNNING:
-        return {rule_as_passed}
-    bind(*args, **kwargs)
-    return {ask}
-"""
-
-
-def _generate(point: DecisionPoint, definition: Definition | None) -> FunctionType:
-    """Write a decision function of a point, with parameters that fit the rule's."""
-    signature = inspect.signature(point.rule, follow_wrapped=False)
-    parameters = list(signature.parameters.values())
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    names = [f"_{number}" for number in range(len(positional))]
-    call = _CALL[point.kind].format
-    ask = "RUNNING.get(get_ident(), unattended)(point, {}, {})".format
-    values = {
-        "define": "async def" if point.kind == "coroutine" else "def",
-        "names": ", ".join(names),
-        "rule": call(f"rule({', '.join(names)})"),
-        "rule_as_passed": call("rule(*args, **kwargs)"),
-        "ask": call(ask("args", "kwargs")),
-    }
-    if point.alone or not parameters:
-        template = _WITHOUT_ARGUMENTS
-        values["ask"] = call(ask("(_0,)" if names else "()", "NOTHING"))
-    elif positional and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        template = _WITH_ARGUMENTS
-        required = sum(p.default is p.empty for p in positional)
-        if any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in parameters):
-            required = len(names) + 1  # a call without keywords is wrong
-        passed = "()"
-        for number, name in enumerate(names):
-            passed = f"({', '.join(names[: number + 1])},) if {name} is not ABSENT else {passed}"
-        values |= {
-            "positional": ", ".join(f"{name}=ABSENT" for name in names),
-            "passed": passed,
-            "last": names[-1],
-            "required": str(required),
-        }
-    else:
-        template = _VARIADIC
-    namespace: dict[str, Any] = {
-        "RUNNING": RUNNING,
-        "ABSENT": _ABSENT,
-        "NOTHING": {},  # shared by all calls: it is only ever unpacked
-        "bind": signature.bind,
-        "get_ident": get_ident,
-        "point": point,
-        "rule": point.rule,
-        "unattended": _run_rule,
-        "definition": definition,
-        "__name__": __name__,
-    }
-    exec(compile(template.format(**values), f"<decision function {point.name}>", "exec"), namespace)
-    function: FunctionType = namespace["decide"]
-    function.__code__ = function.__code__.replace(co_name=point.rule.__name__)  # what tracebacks show
-    return function
-
-
-def _is_required(parameter: inspect.Parameter) -> bool:
-    positional = parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-    return positional and parameter.default is parameter.empty
 
 
 def _run_rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

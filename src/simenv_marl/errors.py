@@ -6,7 +6,9 @@
     |-- DefinitionError      (ValueError)    a definition that cannot work
     |-- SimulationError      (TypeError)     something that is no simulation
     |-- UnknownPointError    (LookupError)   a decision point that is not to be found
-    |-- PatchError           (TypeError)     a function that cannot be made a decision point
+    |-- PatchError           (TypeError)     a function that cannot be made a decision point or exposed
+    |-- UnknownTargetError   (LookupError)   a function to extend that is not to be found
+    |-- HandlerError         (ValueError)    a handler that does not fit, or is not attached
     |-- AgentError           (ValueError)    names of agents that clash or are none
     |-- UnknownAgentError    (LookupError)   an agent that the environment does not know
     |-- ViewError            (ValueError)    a view that these decision points do not allow
@@ -38,6 +40,7 @@ __all__ = [
     "CopyError",
     "DefinitionError",
     "EpisodeOverError",
+    "HandlerError",
     "InvalidActionError",
     "MaskError",
     "NoDecisionError",
@@ -53,6 +56,7 @@ __all__ = [
     "UnknownAgentError",
     "UnknownOptionError",
     "UnknownPointError",
+    "UnknownTargetError",
     "ViewError",
     "WrongThreadError",
 ]
@@ -85,7 +89,15 @@ class UnknownPointError(SimEnvError, LookupError):
 
 
 class PatchError(SimEnvError, TypeError):
-    """A function was named that cannot be made a decision point."""
+    """A function was named that cannot be made a decision point, or be exposed to plugins."""
+
+
+class UnknownTargetError(SimEnvError, LookupError):
+    """A function was to be extended that is not to be found."""
+
+
+class HandlerError(SimEnvError, ValueError):
+    """A handler cannot be called like its target, there is no such position, or it is not attached."""
 
 
 class AgentError(SimEnvError, ValueError):

@@ -11,12 +11,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 
-from .._driver import unattended
 from .._episode import Episode
 from .._plan import Binding, Plan
 from .._session import AnyEpisode, Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast
 from ..errors import CopyError, UnknownAgentError, UnknownOptionError
+from ..plugins import Entry
 
 
 class View:
@@ -66,6 +66,12 @@ class View:
         return self._session.simulation
 
     @property
+    def plugins(self) -> list[Entry]:
+        """Of each handler of the option ``plugins``: the handler, the dotted name of its target, its position."""
+        plugins = self._plan.plugins
+        return [] if plugins is None else plugins.entries
+
+    @property
     def state_space(self) -> spaces.Space[Any] | None:
         """The space of ``state()``, where the environment was made with one."""
         return self._plan.options.state_space
@@ -82,7 +88,7 @@ class View:
         tell = getattr(self.simulation, "state", None)
         if not callable(tell):
             raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
-        with unattended():
+        with self._session.at_work():
             value = tell()
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 

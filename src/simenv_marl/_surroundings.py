@@ -1,0 +1,97 @@
+"""What an environment's simulation finds around it whenever it is at work.
+
+An environment whose options ask for surroundings enters them before anything runs for it, and leaves them
+afterwards: for each turn, and not for each switch to the simulation. All others pay nothing for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from typing import Any
+
+from ._driver import Surrounding, attended, unattended
+from ._episode import Episode
+from ._plan import Plan
+from ._rounds import Rounds
+
+
+class Surroundings:
+    """The surroundings of one environment's simulation, from the outermost to the innermost."""
+
+    def __init__(self, surroundings: list[Surrounding]) -> None:
+        self._surroundings = surroundings
+
+    def __bool__(self) -> bool:
+        return bool(self._surroundings)
+
+    @contextmanager
+    def entered(self) -> Iterator[None]:
+        """Keep what runs apart from whatever runs around it, and in these surroundings."""
+        if attended():
+            with unattended():
+                yield from self._enter()
+        else:
+            yield from self._enter()
+
+    def _enter(self) -> Iterator[None]:
+        done = []
+        try:
+            for surrounding in self._surroundings:
+                surrounding.enter()
+                done.append(surrounding)
+            yield
+        finally:
+            for surrounding in reversed(done):
+                surrounding.leave()
+
+    def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
+        """A simulation's main loop in these surroundings, in whatever thread it runs."""
+        for surrounding in reversed(self._surroundings):
+            run = surrounding.around(run)
+        return run
+
+
+class Surrounded(Episode):
+    """An episode of a simulation that has surroundings, played in turns or in rounds."""
+
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None, surroundings: Surroundings) -> None:
+        """Begin an episode, as ``Episode`` does."""
+        self._surroundings = surroundings
+        super().__init__(plan, simulation, seed)
+        clock = self.clock
+        if clock is not None:
+            self.clock = lambda: self._tell(clock)
+
+    def _tell(self, clock: Callable[[], float]) -> float:
+        with self._surroundings.entered():
+            return clock()
+
+    def _main_loop(self) -> Callable[[], Any]:
+        return self._surroundings.around(super()._main_loop())
+
+    def _attended(self) -> bool:
+        return False  # it has been kept apart before it entered its surroundings
+
+    def _kept_apart(self) -> AbstractContextManager[None]:
+        return self._surroundings.entered()
+
+    def turn(self, action: Any) -> None:
+        """Answer the pending decision, as ``Episode.turn`` does."""
+        with self._surroundings.entered():
+            super().turn(action)
+
+
+class SurroundedRounds(Surrounded, Rounds):
+    """The same in rounds."""
+
+    def play(self, actions: Mapping[str, Any]) -> None:
+        """Answer the decisions of a round, as ``Rounds.play`` does."""
+        with self._surroundings.entered():
+            super().play(actions)
+
+
+def surrounded(kind: type[Episode], surroundings: Surroundings) -> Callable[..., Episode]:
+    """What begins an episode that is played like those of a kind, in surroundings."""
+    return partial(SurroundedRounds if issubclass(kind, Rounds) else Surrounded, surroundings=surroundings)

@@ -1,0 +1,668 @@
+"""Section 8: plugins of one environment alone, and handlers around decisions."""
+
+import gc
+
+import mesa
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import simenv_marl
+from simenv_marl import (
+    RULE,
+    ChangedArgs,
+    ChangedResult,
+    HandlerError,
+    OptionValueError,
+    UnknownTargetError,
+    aec_env,
+    attached_handlers,
+    difference,
+    expose_to_plugins,
+    generate_env,
+    handlers,
+    joint_env,
+    parallel_env,
+    remove_handler,
+    simulate,
+    single_env,
+    trace,
+)
+
+from .foreign import market, shop
+from .foreign.market import Broker, Trader
+from .models import alive, calling, decision, decisions, define, notes, play, script, stacks
+
+MARKET = "tests.foreign.market"
+HERE = __name__
+BID = f"{MARKET}.Trader.bid"
+
+
+@pytest.fixture(autouse=True)
+def _nothing_stays_attached():
+    places = [market, shop, Trader, Broker, House]
+    before = [held(place) for place in places]
+    yield
+    gc.collect()
+    assert attached_handlers() == []
+    for place, then in zip(places, before, strict=True):
+        now = held(place)
+        assert now.keys() == then.keys()
+        assert all(now[name] is then[name] for name in now)
+
+
+def held(place):
+    return {name: value for name, value in vars(place).items() if not name.startswith("__") or name == "__init__"}
+
+
+class House:
+    """A greenhouse whose ventilation nobody has thought of as a decision."""
+
+    step = 0
+
+    def __init__(self):
+        self.log = []
+
+    def reset(self, seed=None):
+        self.log.append(self.word())
+
+    def run(self):
+        for self.step in range(3):
+            self.log.append(self.word())
+            self.water()
+            self.log.append(self.word())
+
+    @define(agent="waterer_0", observation_space_mapping=lambda self: [len(self.word()), self.step])
+    def water(self):
+        return 0
+
+    def word(self):
+        return "plain"
+
+    def stop(self):
+        self.log.append(self.word())
+
+    def time(self):
+        self.word()
+        return float(self.step)
+
+    def state(self):
+        return [len(self.word())]
+
+    render_modes = ("ansi",)
+
+    def render(self, mode):
+        return self.word()
+
+
+WORD = f"{HERE}.House.word"
+
+
+def says(word):
+    return (lambda self: word, WORD, "instead")
+
+
+# -- one environment alone ------------------------------------------------------------------------
+
+
+def test_plugins_apply_wherever_the_environments_simulation_is_at_work():
+    env = single_env(House, House.water, plugins=[says("mine")], render_mode="ansi")
+    simulation = env.unwrapped.simulation
+    observation, _ = env.reset()
+    assert simulation.word() == "plain"
+    assert observation.tolist() == [4, 0]
+    observation, *_ = env.step(1)
+    assert observation.tolist() == [4, 1]
+    assert env.render() == "mine"
+    assert env.unwrapped.state().tolist() == [4]
+    env.close()
+    assert simulation.log == ["mine"] * 5
+    assert simulation.word() == "plain"
+
+
+def test_construction_is_extended_too():
+    env = single_env(
+        House,
+        House.water,
+        plugins=[(lambda self: self.log.append("made"), f"{HERE}.House.__init__", "after")],
+    )
+    assert env.unwrapped.simulation.log == ["made"]
+    assert House().log == []
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env, generate_env])
+def test_every_view_takes_plugins(make):
+    env = make(House, House.water, plugins=[says("mine")])
+    if make is generate_env:
+        env = env()
+    env.reset(seed=1)
+    action = {"waterer_0": 1} if make in (parallel_env, joint_env) else 1
+    env.step(action)
+    log = env.unwrapped.simulation.log
+    assert set(log) == {"mine"}
+    assert len(log) == 4
+    assert [entry[1:] for entry in attached_handlers(env)] == [(WORD, "instead")]
+    env.close()
+
+
+def test_simulate_takes_plugins():
+    done = simulate(House, points=House.water, plugins=[says("mine")])
+    assert done.log == ["mine"] * 7
+    assert simulate(House, points=House.water).log == ["plain"] * 7
+
+
+@pytest.mark.parametrize("rounds", [False, True])
+def test_environments_with_opposite_plugins_are_interleaved(rounds):
+    make, action = (parallel_env, {"waterer_0": 1}) if rounds else (single_env, 1)
+    envs = [make(House, House.water, plugins=[says(word)]) for word in ("one", "two")] + [make(House, House.water)]
+    for env in envs:
+        env.reset()
+    for _ in range(2):
+        for env in envs:
+            env.step(action)
+            assert House().word() == "plain"
+    for env, word in zip(envs, ("one", "two", "plain"), strict=True):
+        assert env.unwrapped.simulation.log == [word] * 6
+    for env in envs:
+        env.close()
+
+
+def test_handlers_of_the_process_run_before_the_environments():
+    log = []
+    entries = [
+        (lambda self, name=name, position=position: log.append((position, name)), WORD, position)
+        for name in ("process", "environment")
+        for position in ("before", "after")
+    ]
+    env = single_env(House, House.water, plugins=entries[2:])
+    with handlers(*entries[:2]):
+        env.reset()
+    assert log[:4] == [
+        ("before", "process"),
+        ("before", "environment"),
+        ("after", "process"),
+        ("after", "environment"),
+    ]
+    with handlers(says("process")):
+        env.reset()
+        assert env.unwrapped.simulation.log[-1] == "process"
+        own = single_env(House, House.water, plugins=[says("environment")])
+        own.reset()
+        assert own.unwrapped.simulation.log[-1] == "environment"
+        assert House().word() == "process"
+    env.close()
+    own.close()
+
+
+def test_nothing_is_patched_but_while_there_is_an_environment():
+    before = vars(House)["word"]
+    made = generate_env(House, House.water, plugins=[says("mine")])
+    assert vars(House)["word"] is before
+    one, two = made(), made(plugins=[])
+    assert vars(House)["word"] is not before
+    two.reset()
+    assert set(two.unwrapped.simulation.log) == {"plain"}
+    two.close()
+    one.reset()
+    one.close()
+    assert vars(House)["word"] is before
+    one.reset()
+    assert set(one.unwrapped.simulation.log[-2:]) == {"mine"}
+    del one
+    gc.collect()
+    assert vars(House)["word"] is before
+
+
+def test_an_environment_stepped_from_inside_another_one_does_not_see_its_plugins():
+    inner = single_env(House, House.water)
+    inner.reset()
+
+    def step(*args):
+        inner.step(1)
+        return 1
+
+    other = decision(agent="other_0")
+
+    def main(simulation):
+        simulation.log.append(House().word())
+        other()
+        inner.step(1)
+        House.water(House())
+
+    env = aec_env(script(main), [other, House.water], plugins=[says("mine")], policies={House.water: step})
+    env.reset()
+    env.step(1)
+    assert env.unwrapped.simulation.log == ["mine"]
+    assert inner.unwrapped.simulation.log == ["plain"] * 6
+    env.close()
+    inner.close()
+
+
+@pytest.mark.parametrize(
+    ("plugins", "error"),
+    [
+        ("text", OptionValueError),
+        (3, OptionValueError),
+        ({WORD: print}, OptionValueError),
+        ([WORD], HandlerError),
+        ([(print, WORD)], HandlerError),
+        ([(print, WORD, "during")], HandlerError),
+        ([(lambda: 0, WORD, "before")], HandlerError),
+        ([says("good"), (print, f"{HERE}.House.missing", "before")], UnknownTargetError),
+    ],
+)
+def test_plugins_are_checked_when_the_environment_is_made(plugins, error):
+    for make in (single_env, generate_env):
+        with pytest.raises(error):
+            make(House, House.water, plugins=plugins)
+
+
+def test_a_plugins_error_surfaces_from_step_and_the_next_reset_works():
+    env = single_env(House, House.water, plugins=[(fail_once(), WORD, "before")])
+    env.reset()
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(1)
+    assert "in the handler" in notes(caught.value)
+    assert "waterer_0" in notes(caught.value)
+    env.reset()
+    env.step(1)
+    env.close()
+    assert simenv_marl._driver.PLUGGED == simenv_marl._driver.EVALUATING == {}
+
+
+def fail_once():
+    calls = []
+
+    def fail(self):
+        calls.append(self)
+        if len(calls) == 3 + 2:
+            raise ZeroDivisionError
+
+    return fail
+
+
+def test_nothing_is_left_behind():
+    env = single_env(House, House.water, plugins=[says("mine")])
+    before = stacks()
+    for end in ("close", "reset", "collect"):
+        env.reset()
+        env.step(1)
+        if end == "close":
+            env.close()
+    del env
+    gc.collect()
+    assert stacks() <= before
+    assert alive(House) == 0
+    assert simenv_marl._driver.PLUGGED == simenv_marl._driver.EVALUATING == {}
+
+
+# -- decisions in plugins -------------------------------------------------------------------------
+
+
+@define(agent="ventilator_0", observation_space_mapping=lambda self: [self.step, 0])
+def ventilate(self):
+    return "rule"
+
+
+def ask_for_the_word(self):
+    return f"asked {ventilate(self)}"
+
+
+@pytest.mark.parametrize(("handler", "prefix"), [(ventilate, ""), (ask_for_the_word, "asked ")])
+def test_the_papers_extrapolation(handler, prefix):
+    env = aec_env(House, [House.water, ventilate], plugins=[(handler, WORD, "instead")])
+    turns = play(env, {"waterer_0": 1, "ventilator_0": 7})
+    assert decisions(turns) == ["ventilator_0", "waterer_0", "ventilator_0"] * 3
+    log = env.unwrapped.simulation.log
+    assert log[0] == f"{prefix}rule"  # during reset the rule decides
+    assert [str(word) for word in log[1:]] == [f"{prefix}7"] * 6
+    env.close()
+    together = joint_env(House, [House.water, ventilate], plugins=[(handler, WORD, "instead")])
+    together.reset()
+    *_, info = together.step({"waterer_0": 1, "ventilator_0": 7})
+    assert info["acted"] == {"waterer_0": True, "ventilator_0": True}
+    together.close()
+
+
+def bidding():
+    return calling(lambda: Trader().bid("tea"), lambda: Broker().bid("tea", limit=6))
+
+
+@pytest.mark.parametrize("how", ["process", "environment", "exposed"])
+@pytest.mark.parametrize("order", ["handlers first", "points first"])
+def test_handlers_lie_outside_the_decision(how, order):
+    seen, decided = [], []
+
+    def before(self, good, limit=5):
+        return ChangedArgs(self, good.upper(), limit=limit + 1)
+
+    def after(self, good, limit=5, *, _result):
+        decided.append(_result)
+        return ChangedResult(_result * 10)
+
+    points = {BID: define(observation_space_mapping=lambda self, good, limit=5: seen.append((good, limit)) or [0, 0])}
+    entries = [(before, BID, "before"), (after, BID, "after")]
+    original = vars(Trader)["bid"]
+    if how == "exposed":
+        Trader.bid = expose_to_plugins(Trader.bid)
+    try:
+        if how == "environment":
+            env = aec_env(bidding(), points, plugins=entries)
+            play(env, 4)
+        elif order == "handlers first":
+            with handlers(*entries):
+                env = aec_env(bidding(), points)
+                play(env, 4)
+        else:
+            env = aec_env(bidding(), points)
+            env.reset()
+            seen.clear()
+            with handlers(*entries):
+                play(env, 4)
+        assert env.unwrapped.simulation.log == [40, 40]
+        assert decided == [4, 4]
+        assert ("TEA", 6) in seen
+        assert ("TEA", 7) in seen
+        env.close()
+        assert Trader().bid("tea") == 5
+    finally:
+        Trader.bid = original
+
+
+@pytest.mark.parametrize("first", ["handlers", "points"])
+@pytest.mark.parametrize("last", ["handlers", "points"])
+@pytest.mark.parametrize("name", [BID, f"{MARKET}.price", f"{MARKET}.Broker.bid", f"{MARKET}.Trader.rounded"])
+def test_patches_come_and_go_in_any_order(first, last, name):
+    owner, _, attribute = name.rpartition(".")
+    place = market if owner == MARKET else getattr(market, owner.rpartition(".")[2])
+    call = {
+        BID: lambda: Trader().bid("tea"),
+        f"{MARKET}.price": lambda: shop.total("tea"),
+        f"{MARKET}.Broker.bid": lambda: Broker().bid("tea"),
+        f"{MARKET}.Trader.rounded": lambda: Trader.rounded(2.5),
+    }[name]
+    before, plain = dict(held(place)), call()
+    log = []
+    attached = handlers((lambda *args, **kwargs: log.append(1), name, "before"))
+    env_class = generate_env(calling(call), {name: define()}, view="aec")
+    if first == "handlers":
+        attached.__enter__()
+        env = env_class()
+    else:
+        env = env_class()
+        attached.__enter__()
+    play(env, 4)
+    assert env.unwrapped.simulation.log == [4]
+    assert log == [1]
+    if last == "points":
+        attached.__exit__(None, None, None)
+        play(env, 4)
+        assert env.unwrapped.simulation.log == [4]
+        assert log == [1]
+        env.close()
+    else:
+        env.close()
+        assert call() == plain
+        assert log == [1, 1]
+        attached.__exit__(None, None, None)
+    now = held(place)
+    assert now.keys() == before.keys()
+    assert all(now[key] is before[key] for key in before)
+    assert call() == plain
+
+
+def test_points_find_functions_that_handlers_stand_in_front_of():
+    with handlers(
+        (lambda *args, **kwargs: None, BID, "before"), (lambda *a, **k: None, f"{MARKET}.Broker.bid", "after")
+    ):
+        for key in (Trader.bid, Broker.bid, BID, f"{MARKET}.Broker.bid"):
+            env = aec_env(calling(lambda: Broker().bid("tea")), {key: define()})
+            play(env, 3)
+            assert env.unwrapped.simulation.log == [3]
+            env.close()
+        fetched = Trader.bid
+    env = aec_env(bidding(), {fetched: define()})
+    play(env, 3)
+    assert env.unwrapped.simulation.log == [3, 3]
+    env.close()
+
+
+def test_an_inherited_decorated_method_keeps_its_definition_under_handlers():
+    class Shed(House):
+        pass
+
+    with handlers((lambda self: None, Shed.water, "before")):
+        env = aec_env(Shed, Shed.water)
+        assert decisions(play(env, 1)) == ["waterer_0"] * 3
+        env.close()
+
+
+def test_exposing_what_an_environment_has_patched_outlasts_it():
+    original = vars(Trader)["bid"]
+    env = aec_env(bidding(), {BID: define()})
+    try:
+        Trader.bid = expose_to_plugins(Trader.bid)
+        with handlers((lambda *args, **kwargs: ChangedResult(kwargs["_result"] * 2), Trader.bid, "after")):
+            play(env, 4)
+            assert env.unwrapped.simulation.log == [8, 8]
+        env.close()
+        assert Trader().bid("tea") == 5
+        with handlers((lambda *args, **kwargs: 1, Trader.bid, "instead")):
+            assert Trader().bid("tea") == 1
+    finally:
+        Trader.bid = original
+
+
+def test_decision_functions_can_be_named_whether_they_are_exposed_or_not():
+    class Model:
+        @expose_to_plugins
+        @define()
+        def over(self):
+            return "rule"
+
+        @define()
+        @expose_to_plugins
+        def under(self):
+            return "rule"
+
+    model, log = Model(), []
+    env = aec_env(calling(lambda: model.over(), lambda: model.under()), [Model.over, Model.under])
+    with handlers(
+        (lambda self: log.append("over"), Model.over, "before"),
+        (lambda self, _result: log.append(_result), Model.under, "after"),
+    ):
+        assert decisions(play(env, 4)) == ["over_0", "under_0"]
+    assert log == ["over", 4]
+    env.close()
+
+
+# -- ends -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("end", ["close", "reset", "collect"])
+def test_an_episode_that_ends_inside_an_exposed_call_passes_its_handlers(end):
+    log = []
+    choose = decision()
+
+    @expose_to_plugins
+    def day():
+        try:
+            return choose()
+        finally:
+            log.append("unwound")
+
+    def main(simulation):
+        day()
+
+    env = aec_env(
+        script(main),
+        choose,
+        plugins=[(lambda: log.append("before"), day, "before"), (lambda: log.append("after"), day, "after")],
+    )
+    with handlers((lambda: log.append("everybody"), day, "after")):
+        env.reset()
+        assert log == ["before"]
+        if end == "close":
+            env.close()
+        elif end == "reset":
+            env.reset()
+            env.close()
+        else:
+            del env
+            gc.collect()
+    assert log == ["before", "unwound"] * (2 if end == "reset" else 1)
+
+
+def test_generators_suspended_over_decisions():
+    choose = decision()
+
+    @expose_to_plugins
+    def days(number):
+        for day in range(number):
+            yield (day, choose())
+
+    def main(simulation):
+        simulation.log += days(3)
+
+    def env(factor):
+        after = lambda number, _result: ChangedResult((_result[0] * factor, _result[1]))  # noqa: E731
+        return aec_env(script(main), choose, plugins=[(after, days, "after_next")])
+
+    one, two, none = env(10), env(100), aec_env(script(main), choose)
+    for each in (one, two, none):
+        each.reset()
+    for action in range(3):
+        for each in (one, two, none):
+            each.step(action)
+    assert one.unwrapped.simulation.log == [(0, 0), (10, 1), (20, 2)]
+    assert two.unwrapped.simulation.log == [(0, 0), (100, 1), (200, 2)]
+    assert none.unwrapped.simulation.log == [(0, 0), (1, 1), (2, 2)]
+
+
+def test_a_plugin_may_remove_everybodys_handlers_in_mid_episode():
+    log = []
+
+    def remove(self):
+        if any(position == "after" for _, _, position in attached_handlers()):
+            remove_handler(WORD, "after")
+
+    env = single_env(House, House.water, plugins=[(remove, WORD, "before")])
+    simenv_marl.attach_handler(lambda self: log.append(1), WORD, "after")
+    env.reset()
+    env.step(1)
+    env.close()
+    assert log == [1]
+
+
+# -- other people's models ------------------------------------------------------------------------
+
+
+class Sheep(mesa.Agent):
+    def __init__(self, model):
+        super().__init__(model)
+        self.name = f"sheep_{self.unique_id}"
+
+    def step(self):
+        if self.graze() == 3:
+            self.remove()
+
+    @define(agent=lambda self: self.name, removed_by="mesa.agent.Agent.remove")
+    def graze(self):
+        return 0
+
+
+class Meadow(mesa.Model):
+    def __init__(self, seed=None):
+        super().__init__(seed=seed)
+        Sheep.create_agents(self, 2)
+
+
+class Days:
+    def reset(self, seed=None):
+        self.model = Meadow(seed=seed)
+
+    def run(self):
+        for _ in range(2):
+            self.model.agents.do("step")
+
+
+@pytest.mark.parametrize("how", ["process", "environment"])
+def test_a_removal_may_have_handlers(how):
+    removed = []
+    entries = [(lambda self: removed.append(self.name), "mesa.agent.Agent.remove", "after")]
+    if how == "environment":
+        env = aec_env(Days, Sheep.graze, plugins=entries)
+        turns = play(env, {"sheep_1": 3, "sheep_2": 1})
+    else:
+        env = aec_env(Days, Sheep.graze)
+        with handlers(*entries):
+            turns = play(env, {"sheep_1": 3, "sheep_2": 1})
+    assert decisions(turns) == ["sheep_1", "sheep_2", "sheep_2"]
+    assert [turn.agent for turn in turns if turn.terminated] == ["sheep_1", "sheep_2"]
+    assert removed == ["sheep_1"]
+    env.close()
+    assert not hasattr(mesa.agent.Agent.remove, "__wrapped__")
+
+
+def test_with_handlers_that_change_nothing_rule_is_the_plain_run():
+    class Walk:
+        def __init__(self):
+            self.path = []
+
+        def reset(self, seed=None):
+            self.generator = np.random.default_rng(seed)
+
+        def run(self):
+            for _ in range(20):
+                self.path.append(self.stride())
+
+        @define(observation_space=spaces.Box(-9, 9, (1,)), observation_space_mapping=lambda self: [len(self.path)])
+        def stride(self):
+            return self.generator.integers(10)
+
+    plain = Walk()
+    plain.reset(seed=4)
+    plain.run()
+    nothing = [(lambda self: None, Walk.stride, "before"), (lambda self, _result: None, Walk.stride, "after")]
+    env = single_env(Walk, Walk.stride, plugins=nothing)
+    env.reset(seed=4)
+    while not env.step(RULE)[2]:
+        pass
+    assert env.unwrapped.simulation.path == plain.path
+
+
+def test_differences_are_the_same_with_plugins():
+    class Meter:
+        def reset(self):
+            self.used = 0
+
+        def run(self):
+            for _ in range(3):
+                self.used += self.use()
+
+        @define(reward_mapping=difference(lambda self: self.used))
+        def use(self):
+            return 0
+
+    rewards = []
+    for plugins in ([], [(lambda self: None, Meter.use, "before")]):
+        env = single_env(Meter, Meter.use, plugins=plugins)
+        env.reset()
+        rewards.append([env.step(action)[1] for action in (1, 5, 2)])
+        env.close()
+    assert rewards == [[1.0, 5.0, 2.0]] * 2
+
+
+def test_calls_of_an_episode_are_traced():
+    env = single_env(House, House.water, plugins=[says("mine")])
+    with trace(WORD, House.water) as calls:
+        env.reset()
+        env.step(7)
+    short = [(call.target.rpartition(".")[2], call.result) for call in calls]
+    assert ("word", "'mine'") in short
+    assert ("water", "7") in short
+    assert short[-1] == ("word", "'mine'")
+    waters = [call for call in calls if call.target.endswith("water")]
+    assert waters[-1].result is None
+    env.close()
+    assert waters[-1].result.startswith("raised SimulationExit")

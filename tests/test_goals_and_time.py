@@ -581,8 +581,11 @@ def test_rendering(make):
 def test_rendering_for_people(make, capsys):
     env = painted(make, render_mode="human")
     env.reset()
+    assert capsys.readouterr().out == "now 0\n"
+    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    assert capsys.readouterr().out == "now 4\n"
     assert env.render() is None
-    assert capsys.readouterr().out.endswith("now 0\n")
+    assert capsys.readouterr().out == "now 4\n"
 
 
 @EVERY_VIEW

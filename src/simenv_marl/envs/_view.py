@@ -44,6 +44,7 @@ class View:
         self._episode: Episode | None = None
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
+        self._shows = self.render_mode == "human"  # after every reset and step, without being asked to
 
     @staticmethod
     def check(plan: Plan) -> None:
@@ -93,7 +94,10 @@ class View:
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 
     def render(self) -> Any:
-        """Render the simulation in ``render_mode``; without one, None and a warning."""
+        """Render the simulation in ``render_mode``; without one, None and a warning.
+
+        In the mode "human" every ``reset`` and ``step`` does so by itself.
+        """
         return self._session.render()
 
     def close(self) -> None:

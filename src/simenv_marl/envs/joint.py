@@ -86,6 +86,8 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             seed_space(self.observation_space, seed, "joint")
             seed_space(self.action_space, seed, "joint")
         self._time = None
+        if self._shows:
+            self.render()
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -114,6 +116,8 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
         reward = 0.0
         for record in (*episode.parting, *episode.agents.values()):
             reward += record.reward
+        if self._shows:
+            self.render()
         return self._observe(), reward, episode.terminated, episode.truncated, self._info()
 
     def _split(self, action: Any) -> Mapping[str, Any]:

@@ -58,6 +58,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         """
         self._episode = episode = self._start(seed, options, Rounds)
         self.agents = list(episode.agents)
+        if self._shows:
+            self.render()
         records = episode.agents.values()
         return (
             {record.agent: self._hand_out(record) for record in records},
@@ -120,6 +122,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         if pending is not None:
             pending.info["deciding"] = True
         self.agents = [] if episode.over else list(episode.agents)
+        if self._shows:
+            self.render()
         return results
 
     def _clear(self) -> None:

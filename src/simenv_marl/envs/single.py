@@ -79,6 +79,8 @@ class SimulationEnv(View, gym.Env[Any, Any]):
             seed_space(self.observation_space, seed, self._agent)
             seed_space(self.action_space, seed, self._agent)
         self._record = record = episode.agents[self._agent]
+        if self._shows:
+            self.render()
         return record.observation, record.info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -99,6 +101,8 @@ class SimulationEnv(View, gym.Env[Any, Any]):
         if episode is None:
             raise self._session.not_running()
         episode.turn(action)
+        if self._shows:
+            self.render()
         record: Record = self._record
         return (
             record.observation,

@@ -5,8 +5,10 @@ The layers, each importing only from those above it::
     errors        the tree of errors
     simulation    what a simulation is; RULE and TRUNCATED
     _spaces       casting observations to spaces, checking actions against them
-    _driver       switching between a simulation's stack and its user's
+    _driver       what runs around us: simulations, mappings, threads that simulations have started
     decision      make_step: definitions, decision points, decision functions
+    _greenlets    switching between a simulation's stack and its user's, in one thread
+    _threads      the same, between a thread of the simulation's and its user's
     _points       what ``points=`` names, and patches for what nobody has decorated
     _plan         what an environment is made of, checked before anything runs
     _record       what an episode knows of one agent; rewards and observations

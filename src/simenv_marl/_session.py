@@ -12,7 +12,7 @@ from zlib import crc32
 import numpy as np
 from gymnasium import spaces
 
-from ._driver import unattended
+from ._driver import Offspring, preparing, unattended
 from ._episode import Episode
 from ._plan import Plan
 from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
@@ -41,9 +41,10 @@ class Session:
         self._closed = False
         self._starting = False
         self._held = False
+        self._offspring = Offspring()
         self._hold_sites()
         try:
-            with unattended():
+            with preparing(self._offspring):
                 self.simulation = make_simulation(plan.source)
                 self._reset = resetter(self.simulation)
         except BaseException:
@@ -83,12 +84,14 @@ class Session:
         self._hold_sites()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
-            with unattended():
+            with preparing(self._offspring):
                 self._reset(self.seed, options)
         except BaseException as error:
             error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
-        self._episode = episode = Episode(self.plan, self.simulation, self.seed, rounds=rounds)
+        self._episode = episode = Episode(
+            self.plan, self.simulation, self.seed, rounds=rounds, offspring=self._offspring
+        )
         return episode
 
     def end(self) -> None:

@@ -59,10 +59,10 @@ class ThreadDriver(Watchful):
         thread = get_ident()
         RUNNING[thread] = self.ask
         try:
-            end = context.run(self._live, run)
+            self._end = context.run(self._live, run)  # not in this frame too, to which the frames of an error lead back
         finally:
             RUNNING.pop(thread, None)
-        self._end = self._event = end
+        self._event = self._end
         _wake(self._arrived)
 
     def ask(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Mapping
+from time import sleep
 from typing import Any, NamedTuple
 
 import greenlet
@@ -139,7 +140,15 @@ def alive(kind: type) -> int:
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
-def stacks() -> int:
-    """How many greenlets there are, that of the thread itself included."""
-    greenlet.getcurrent()
-    return alive(greenlet.greenlet)
+def stacks(expected: int | None = None) -> int:
+    """How many greenlets there are, that of the thread itself included.
+
+    Where a thread has used some, the last one goes a moment after the thread: what is expected is waited for.
+    """
+    for _ in range(20):
+        greenlet.getcurrent()
+        number = alive(greenlet.greenlet)
+        if expected is None or number == expected:
+            break
+        sleep(0.01)
+    return number

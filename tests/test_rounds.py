@@ -1036,6 +1036,7 @@ def test_an_environment_is_not_used_while_it_asks_who_is_expected():
         env.step({"being_0": 1, "being_1": 1})
 
 
+@pytest.mark.greenlet("threads of their own may be used from any other")
 @pytest.mark.parametrize("make", [parallel_env, joint_env])
 def test_rounds_are_played_in_the_thread_of_the_episode(make):
     ant, bee = points()

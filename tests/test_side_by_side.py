@@ -529,7 +529,7 @@ def test_greenlets_of_the_model_may_decide(how):
         env.close()
     error = None
     del env
-    assert stacks() == before
+    assert stacks(before) == before
     assert sorted(unwound) == ["a", "b"]
 
 

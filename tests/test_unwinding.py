@@ -251,8 +251,8 @@ def test_many_episodes_leave_nothing_behind(view):
 
     decide = decision(lambda witness: 0, agent="a_0", observation_space_mapping=lambda witness: [0, 0])
     env = view(script(main), decide)
-    threads = threading.active_count()
     env.reset()
+    threads = threading.active_count()
     before = stacks(), alive(Witness)
     for number in range(50):
         env.reset()
@@ -521,6 +521,7 @@ def test_an_environment_whose_thread_has_ended_can_be_reset():
     env.close()
 
 
+@pytest.mark.greenlet("threads of their own unwind at once, wherever their environment is dropped")
 def test_an_environment_that_is_dropped_in_another_thread_unwinds_in_its_own():
     log = []
 

@@ -5,9 +5,11 @@ The layers, each importing only from those above it::
     errors        the tree of errors
     simulation    what a simulation is; RULE and TRUNCATED
     _spaces       casting observations to spaces, checking actions against them
-    _driver       switching between a simulation's stack and its user's
+    _driver       what runs around us: simulations, mappings, plugins, threads that simulations have started
     _wrappers     functions that stand in front of others: decision functions, exposed functions
     decision      make_step: definitions, decision points, decision functions
+    _greenlets    switching between a simulation's stack and its user's, in one thread
+    _threads      the same, between a thread of the simulation's and its user's
     _patches      places in a model, and what is to stand there for a while
     _handlers     handlers, and the calls in which they take part
     _iterables    iterables whose items are handed out with handlers

@@ -1,4 +1,4 @@
-"""Switching between a simulation's stack and its user's: who runs, and how a decision crosses over.
+"""Between a simulation's stack and its user's: who runs, and how a decision crosses over.
 
 On the user's side a driver has two moves: ``resume`` hands a reply to the simulation and returns what comes
 from it next, and ``throw`` raises ``SimulationExit`` in it instead. On the simulation's side its ``ask`` is
@@ -6,33 +6,28 @@ what decision functions call: it hands the call over and carries out the reply. 
 simulation is an *event*, a tuple of three: a decision (its binding, args, kwargs), or ``FINISHED`` or
 ``FAILED`` (with what ``run`` has returned or raised, and None).
 
-While a simulation runs, ``RUNNING`` holds the ``ask`` of its driver for its thread. It is empty whenever no
-simulation runs behind an environment, so that a decision function which is called outside any environment
-finds that out by one test.
+While a simulation runs, ``RUNNING`` holds the ``ask`` of its driver for its thread. A thread that a simulation
+has started has an entry of its own, its ``Offspring``, which refuses to decide. Else ``RUNNING`` is empty, so
+that a decision function which is called outside any environment finds that out by one test.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from contextvars import copy_context
-from functools import partial
-from sys import modules
-from threading import get_ident, local
+from functools import wraps
+from threading import Thread, get_ident
 from typing import Any, Final, Protocol
-from weakref import ref
-
-from greenlet import getcurrent, greenlet
 
 from .errors import WrongThreadError
-from .simulation import RULE, Sentinel
+from .simulation import Sentinel
 
 Ask = Callable[[Any, tuple[Any, ...], dict[str, Any]], Any]
 """Decides a call of a decision point: of the point, and of the call's arguments."""
 
 RUNNING: dict[int, Ask] = {}
-"""By thread: whom decision functions ask there. Touched by drivers and ``unattended`` alone."""
-
+"""By thread: whom decision functions ask there. Touched by drivers and by this module alone."""
 
 EVALUATING: dict[int, dict[Any, Any]] = {}
 """By thread: what differences remember for the agent whose mapping is being evaluated there."""
@@ -78,8 +73,17 @@ class Bound(Protocol):
         """Turns a reply and the call's arguments into what the call returns; None: the reply is that."""
 
 
+class Refused:
+    """Stands for the binding of every decision once one was refused; the event tells the user."""
+
+    deliver = None
+
+
 FINISHED: Final = Sentinel("FINISHED")
 FAILED: Final = Sentinel("FAILED")
+STUCK: Final = Sentinel("STUCK")
+"""What ``throw`` returns where nothing comes from the simulation any more."""
+REFUSED: Final = Refused()
 
 Event = tuple[Any, Any, Any]
 
@@ -88,12 +92,14 @@ class Driver(Protocol):
     """What an episode needs of a driver.
 
     Attributes:
-        resume: Lets the simulation go on with a reply; returns the event that comes from it next.
-        caller: On whose stack that may be called without ``enter`` before.
+        caller: On whose stack ``resume`` may be called without ``enter`` before.
     """
 
-    resume: Callable[[Any], Event]
     caller: Any
+
+    @property
+    def resume(self) -> Callable[[Any], Event]:
+        """Lets the simulation go on with a reply; returns the event that comes from it next."""
 
     def enter(self) -> None:
         """Make ready to be resumed from here.
@@ -114,166 +120,161 @@ class Driver(Protocol):
     def forget(self) -> None:
         """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
 
+    def give_up(self) -> None:
+        """Leave a simulation that does not unwind where it is."""
 
-LOOPS: Final = "asyncio.events"
-"""What knows the event loop that runs in a thread, whichever stack it runs on: a simulation's and its user's are to be
-kept apart. Where nobody has imported it, nobody runs a loop."""
-
-
-class _Home:
-    """Stands for a thread; unlike the thread's number it is never given to another one."""
+    def refusal(self) -> WrongThreadError:
+        """The error that tells the user of a decision that was refused to a thread of the simulation's."""
 
 
-_homes = local()
+class Watchful:
+    """What all drivers do about the threads that their simulation starts."""
 
+    __slots__ = ("_bindings", "_refused", "offspring")
 
-def _home() -> _Home:
-    try:
-        home: _Home = _homes.home
-    except AttributeError:
-        home = _homes.home = _Home()
-    return home
-
-
-class GreenletDriver:
-    """Runs a simulation on a greenlet of the thread in which it is made."""
-
-    __slots__ = (
-        "_ask", "_bindings", "_body", "_get_loop", "_home", "_inside", "_switch_out", "_thread", "_users_loop",
-        "caller", "resume",
-    )  # fmt: skip
-
-    def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Bound]) -> None:
-        """Prepare a greenlet; the first ``resume`` starts it.
-
-        Args:
-            run: The simulation's main loop.
-            bindings: The decision points that are handed over; all others run their rule.
-        """
+    def __init__(self, bindings: Mapping[Any, Bound], offspring: Offspring) -> None:
         self._bindings = bindings
-        self._ask: Ask | None = self.ask
-        self._thread = get_ident()
-        self._home = ref(_home())
-        self._get_loop: Any = None  # found where asyncio has been imported
-        self._users_loop: Any = None
-        self._body = greenlet(self._run)
-        # A new greenlet has an empty context; a model expects the one that its user has set up.
-        self._body.gr_context = copy_context()
-        self._inside: Any = self._body
-        self.resume: Callable[[Any], Event] = partial(self._body.switch, run)
-        self.caller: Any = getcurrent()
-        self._switch_out = self.caller.switch
+        self._refused: WrongThreadError | None = None
+        self.offspring = offspring
+        offspring.driver = self
 
-    def _run(self, run: Callable[[], Any], _: Any) -> Event:
-        self._inside = None  # the first decision sets ``resume`` to what resumes it
-        self._go_in(None)
+    def decides(self, point: Any) -> bool:
+        """Whether calls of a decision point are handed over."""
+        return point in self._bindings
+
+    def refuse(self, point: Any) -> WrongThreadError:
+        """Refuse a decision, for the user to be told at the simulation's next event; return the error for the caller.
+
+        Called in whichever thread has asked.
+        """
+        error = WrongThreadError(
+            f"{point.name} was called in a thread that the simulation has started, where nobody can be asked: the"
+            " simulation itself goes on meanwhile. Call it where run() runs, and have the thread wait for the answer"
+        )
+        if self._refused is None:
+            self._refused = error
+            self._bindings = dict.fromkeys(self._bindings, REFUSED)
+        return error
+
+    def refusal(self) -> WrongThreadError:
+        """The error that tells the user of a decision that was refused to a thread of the simulation's."""
+        refused, self._refused = self._refused, None
+        error = WrongThreadError(*(() if refused is None else refused.args))
+        error.__cause__ = refused
+        return error
+
+    def _live(self, run: Callable[[], Any]) -> Event:
+        """In the simulation: run it to its end; return the event that this is."""
         try:
-            return FINISHED, run(), None
+            result = run()
         except BaseException as error:
+            if self._refused is not None and self._refused is not error:
+                if isinstance(error, SimulationExit):
+                    return FAILED, self.refusal(), None
+                error.add_note(f"simenv_marl: and before that a decision was refused: {self._refused}")
             return FAILED, error, None
-        finally:
-            self._go_out()
+        return (FINISHED, result, None) if self._refused is None else (FAILED, self.refusal(), None)
 
-    def ask(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """In the simulation: decide a call of a decision point."""
-        binding = self._bindings.get(point)
-        if binding is None:
-            return point.rule(*args, **kwargs)
-        if getcurrent() is not self._inside:
-            self._come_back_here()
-        switch_out, thread, deliver, loop = self._switch_out, self._thread, binding.deliver, None
-        # What ``_go_out`` and ``_go_in`` do, without the calls.
-        get_loop = self._get_loop
-        if get_loop is None and LOOPS in modules:
-            get_loop = self._get_loop = modules[LOOPS]._get_running_loop
-        if get_loop is not None:
-            loop = get_loop()
-            if loop is not None or self._users_loop is not None:
-                self._leave_loop()
-        del RUNNING[thread]
-        try:
-            reply = switch_out(binding, args, kwargs)
-        except BaseException:
-            self._go_in(loop)
-            raise
-        RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
-        if get_loop is not None and (loop is not None or get_loop() is not None):
-            self._enter_loop(loop)
-        if reply is RULE:
-            return point.rule(*args, **kwargs) if kwargs else point.rule(*args)
-        return reply if deliver is None else deliver(reply, *args, **kwargs)
+    def _disown(self) -> None:
+        """Have nothing to do any more with threads that the simulation has started."""
+        self._bindings = {}
+        if self.offspring.driver is self:
+            self.offspring.driver = None
 
-    def _come_back_here(self) -> None:
-        """A model may switch stacks of its own: remember the one that asks."""
-        # The stack that asks must not refer to itself, which nobody could collect.
-        self._inside = getcurrent()
-        self.resume = self._inside.switch
 
-    def _go_in(self, loop: Any) -> None:
-        """The simulation goes on, in the event loop in which it was."""
-        if self._ask is not None:  # else it is forgotten, and unwinds without having been asked to
-            RUNNING[self._thread] = self._ask
-            if LOOPS in modules:
-                self._enter_loop(loop)
+# -- threads that simulations start ---------------------------------------------------------------
 
-    def _go_out(self) -> None:
-        """The simulation's user goes on, in the event loop in which that was."""
-        if self._ask is not None:
-            if LOOPS in modules:
-                self._leave_loop()
-            del RUNNING[self._thread]
 
-    def _leave_loop(self) -> Any:
-        events = modules[LOOPS]
-        loop = events._get_running_loop()
-        if loop is not None or self._users_loop is not None:
-            events._set_running_loop(self._users_loop)
-            self._users_loop = None
-        return loop
+class Offspring:
+    """The threads that one simulation has started, over all its episodes. As an ``Ask``, it is theirs.
 
-    def _enter_loop(self, loop: Any) -> None:
-        events = modules[LOOPS]
-        self._users_loop = events._get_running_loop()
-        if loop is not None or self._users_loop is not None:
-            events._set_running_loop(loop)
+    Attributes:
+        driver: Of the episode that is going on; None between episodes, when decision functions run their rule.
+    """
 
-    def enter(self) -> None:
-        """Make ready to be resumed from here.
+    __slots__ = ("driver",)
+
+    def __init__(self) -> None:
+        watch_threads()
+        self.driver: Watchful | None = None
+
+    def __call__(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Refuse a decision that the environment would have to make.
 
         Raises:
-            WrongThreadError: The simulation lives in another thread.
+            WrongThreadError: It is one.
         """
-        caller = getcurrent()
-        if caller is self.caller:
+        driver = self.driver
+        if driver is not None and driver.decides(point):
+            raise driver.refuse(point)
+        return point.rule(*args, **kwargs)
+
+
+def watch_threads() -> None:
+    """Find out, from now on, which threads are started by simulations.
+
+    Threads do not know by whom they were started, and inherit nothing that would tell.
+    """
+    if _watching:
+        return
+    _watching.append(True)
+    original = Thread.start
+
+    @wraps(original)
+    def start(self: Thread) -> None:
+        ask: Any = RUNNING.get(get_ident()) if RUNNING else None
+        if ask is None:
+            original(self)
             return
-        if not self.reachable():
-            raise WrongThreadError(
-                "a simulation on a greenlet can only be stepped, reset and closed in mid-episode from the thread"
-                " that has begun the episode"
-            )
-        self.caller, self._switch_out = caller, caller.switch
-        self._body.parent = caller  # where the simulation's end arrives
+        disown = _adopt(self, ask if type(ask) is Offspring else ask.__self__.offspring)
+        try:
+            original(self)
+        except BaseException:
+            disown()
+            raise
 
-    def throw(self) -> Event:
-        """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
-        self.enter()
-        if self._body.dead:
-            return FINISHED, None, None
-        event: Event = self._inside.throw(SimulationExit())
-        return event
+    Thread.start = start  # type: ignore[method-assign]
 
-    def reachable(self) -> bool:
-        """Whether the simulation can be resumed from here."""
-        return self._home() is _home()
 
-    def lost(self) -> bool:
-        """Whether the thread has ended in which alone the simulation could be resumed."""
-        return self._home() is None
+_watching: list[bool] = []
 
-    def forget(self) -> None:
-        """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
-        self._ask = None
-        del self._bindings, self._body, self._inside, self._switch_out, self.caller, self.resume
+
+def _adopt(thread: Thread, offspring: Offspring) -> Callable[[], None]:
+    """Enter a thread that is about to be started as one of a simulation's. Returns what undoes that."""
+    run, own = thread.run, vars(thread).get("run")
+
+    def adopted() -> None:
+        disown()
+        ident = get_ident()
+        RUNNING[ident] = offspring
+        try:
+            run()
+        finally:
+            RUNNING.pop(ident, None)
+
+    def disown() -> None:
+        if vars(thread).get("run") is adopted:
+            del thread.run
+            if own is not None:
+                thread.run = own  # type: ignore[method-assign]
+
+    thread.run = adopted  # type: ignore[method-assign]
+    return disown
+
+
+def _alone() -> None:
+    """In the child of a fork, where no other thread is."""
+    thread = get_ident()
+    for book in (RUNNING, EVALUATING):
+        for other in [other for other in book if other != thread]:
+            del book[other]
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_alone)
+
+
+# -- what runs around us --------------------------------------------------------------------------
 
 
 def attended() -> bool:
@@ -300,3 +301,14 @@ def unattended() -> Iterator[None]:
             EVALUATING[thread] = memory
         if plugins is not None:
             PLUGGED[thread] = plugins
+
+
+@contextmanager
+def preparing(offspring: Offspring) -> Iterator[None]:
+    """Make or reset a simulation, ``unattended``: nothing is decided, but threads that are started are its own."""
+    thread = get_ident()
+    RUNNING[thread] = offspring
+    try:
+        yield
+    finally:
+        RUNNING.pop(thread, None)

@@ -24,7 +24,7 @@ Views read the records of agents; none of them computes an observation or a rewa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from threading import get_ident
 from typing import Any, Final
@@ -35,22 +35,25 @@ from ._driver import (
     EVALUATING,
     FAILED,
     FINISHED,
+    REFUSED,
     RUNNING,
+    STUCK,
     Driver,
-    GreenletDriver,
+    Offspring,
     SimulationExit,
     attended,
     unattended,
 )
+from ._greenlets import GreenletDriver
 from ._plan import Binding, Plan, Removal
 from ._record import Record, not_finite, number
+from ._threads import SECONDS_TO_UNWIND, ThreadDriver
 from .decision import DIFFERENCES
 from .errors import (
     AgentError,
     EpisodeOverError,
     NoDecisionError,
     ReentrancyError,
-    WrongThreadError,
     warn_user,
 )
 from .simulation import RULE, TRUNCATED, Sentinel
@@ -62,8 +65,7 @@ its processes at each try."""
 UNNAMED: Final = Sentinel("UNNAMED")
 NAMED_AT_CALL: Final = Sentinel("NAMED_AT_CALL")
 
-_given_up: list[Driver] = []
-"""Simulations that refused to unwind: dropping them would resume them at some random moment."""
+DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {"greenlet": GreenletDriver, "thread": ThreadDriver}
 
 
 class Episode:
@@ -81,13 +83,14 @@ class Episode:
         clock: Returns the simulation's time; None where it has none.
     """
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None) -> None:
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None, offspring: Offspring | None = None) -> None:
         """Begin an episode of a simulation that has been reset: run it to its first decision.
 
         Args:
             plan: What the environment is made of.
             simulation: The simulation.
             seed: What it was reset with, for those who read an error's notes.
+            offspring: The threads that the simulation has started so far; None: it was never used before.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
@@ -109,7 +112,8 @@ class Episode:
         self.clock = getattr(simulation, "time", None)
         for agent, binding in () if plan.unanswered else plan.roster.items():
             self.agents[agent] = Record(agent, binding, None, self.clock)
-        self._driver: Driver | None = GreenletDriver(self._main_loop(), plan.bindings)
+        make_driver = DRIVERS[plan.options.driver]
+        self._driver: Driver | None = make_driver(self._main_loop(), plan.bindings, offspring or Offspring())
         with self._kept_apart():
             try:
                 reply = None
@@ -240,6 +244,9 @@ class Episode:
         if type(binding) is not Binding:
             if type(binding) is Removal:
                 return self._release(binding, args, kwargs)
+            if binding is REFUSED and self._driver is not None:
+                self._failed_in_model = True
+                raise self._driver.refusal()
             result = [args]
             args = None  # this frame must not hold an error that is about to have it in its traceback
             return self._end(binding, result)
@@ -421,14 +428,13 @@ class Episode:
             WrongThreadError: It is suspended in another thread.
             BaseException: What the simulation raises in its ``stop`` or while it unwinds.
         """
-        if self.pending is None and not self.over:
-            raise self.nothing_pending()
         if self._driver is not None and self._driver.lost():
             self._let_go_of_driver()
-        if self._driver is not None and not self._driver.reachable():
-            raise WrongThreadError(
-                "the simulation is suspended in another thread, and only there it can be closed or reset"
-            )
+            self.over = True
+        if self.pending is None and not self.over:
+            raise self.nothing_pending()
+        if self._driver is not None:
+            self._driver.enter()
         self.pending, self.over = None, True
         for problem in self._unwind():
             self._annotate(problem)
@@ -436,6 +442,8 @@ class Episode:
 
     def abandon(self) -> None:
         """Unwind the simulation when its environment is gone, from wherever that is noticed."""
+        if self.pending is None and not self.over:
+            return  # the process ends while it is moving in another thread, which ends with it
         self.pending, self.over = None, True
         if self._driver is not None and not self._driver.reachable():
             self._let_go_of_driver()  # its own thread unwinds it, as soon as that switches again
@@ -457,18 +465,23 @@ class Episode:
                 problems.append(error)
             for _ in range(UNWINDING_TRIES):
                 kind, value, _ = driver.throw()
+                if kind is STUCK:
+                    break
                 if kind is FAILED and not _is_exit(value):
                     problems.append(value)
                 if kind is FAILED or kind is FINISHED:
                     self._let_go_of_driver()
                     return problems
-        _given_up.append(driver)
+        driver.give_up()
         self._driver = None
-        warn_user(
-            f"{type(self._simulation).__name__} refuses to end: it went on after {UNWINDING_TRIES} times"
-            " SimulationExit was raised in it; it is left suspended. Let it re-raise what it does not know.",
-            ResourceWarning,
+        refusal = (
+            f"has neither decided anything nor ended in {SECONDS_TO_UNWIND} s; it is left running in its thread, and at"
+            " its next decision SimulationExit is raised in it"
+            if kind is STUCK
+            else f"refuses to end: it went on after {UNWINDING_TRIES} times SimulationExit was raised in it; it is left"
+            " suspended. Let it re-raise what it does not know"
         )
+        warn_user(f"{type(self._simulation).__name__} {refusal}.", ResourceWarning)
         return problems
 
     def _let_go_of_driver(self) -> None:

@@ -51,7 +51,8 @@ class Options:
     """The options that every view takes.
 
     Attributes:
-        driver: What switches between the simulation and its user: "greenlet".
+        driver: What switches between the simulation and its user: "greenlet", or "thread" for what cannot live
+            on a greenlet and for environments that are used from changing threads.
         possible_agents: The roster, where agents are named by a callable: their names, or a dict from
             decision point to names. Declared agents are there from ``reset`` on.
         undeclared: What a decision of an agent outside the roster becomes: "error", or "rule".
@@ -79,8 +80,8 @@ class Options:
     render_mode: str | None = None
 
     def __post_init__(self) -> None:
-        if self.driver != "greenlet":
-            raise OptionValueError(f'driver must be "greenlet", not {self.driver!r}')
+        if self.driver not in ("greenlet", "thread"):
+            raise OptionValueError(f'driver must be "greenlet" or "thread", not {self.driver!r}')
         if isinstance(self.possible_agents, str):
             raise OptionValueError(
                 f"possible_agents must be a list of names, not the one name {self.possible_agents!r}"

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from greenlet import getcurrent
 
-from ._driver import EVALUATING, RUNNING, unattended
+from ._driver import EVALUATING, RUNNING, Offspring, unattended
 from ._episode import UNNAMED, Episode
 from ._plan import Plan
 from ._record import Record, not_finite, number
@@ -27,7 +27,7 @@ MISSING: Final = Sentinel("MISSING")
 class Rounds(Episode):
     """An episode that is played round by round, and not turn by turn."""
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None) -> None:
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None, offspring: Offspring | None = None) -> None:
         """Begin an episode, as ``Episode`` does; then reward and observe all agents for the first time."""
         # By binding, how its agents are named, where nothing but the mappings is to be seen to.
         self._quick: dict[Any, Any] = {}
@@ -37,7 +37,7 @@ class Rounds(Episode):
                 for binding in plan.active
                 if binding.name_agent is not None and binding.legal is None and binding.point.alone
             }
-        super().__init__(plan, simulation, seed)
+        super().__init__(plan, simulation, seed, offspring)
 
     def play(self, actions: Mapping[str, Any]) -> None:
         """Answer decisions with actions, each once, up to the first whose action is missing; or to the end.

@@ -13,7 +13,7 @@ from zlib import crc32
 import numpy as np
 from gymnasium import spaces
 
-from ._driver import unattended
+from ._driver import Offspring, preparing, unattended
 from ._episode import Episode
 from ._plan import Plan
 from ._surroundings import Surroundings, surrounded
@@ -47,9 +47,10 @@ class Session:
         self._held = False
         self._plugins = plan.plugins
         self._surroundings = Surroundings(plan.surroundings())
+        self._offspring = Offspring()
         self._hold_sites()
         try:
-            with self.at_work():
+            with self.at_work(), preparing(self._offspring):
                 self.simulation = plan.make_simulation()
                 self._reset = resetter(self.simulation)
         except BaseException:
@@ -92,13 +93,13 @@ class Session:
         self._hold_sites()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
-            with self.at_work():
+            with self.at_work(), preparing(self._offspring):
                 self._reset(self.seed, options)
         except BaseException as error:
             error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
         begin: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
-        episode: AnyEpisode = begin(self.plan, self.simulation, self.seed)
+        episode: AnyEpisode = begin(self.plan, self.simulation, self.seed, self._offspring)
         self._episode = episode
         return episode
 

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Any
 
-from ._driver import Surrounding, attended, unattended
+from ._driver import Offspring, Surrounding, attended, unattended
 from ._episode import Episode
 from ._plan import Plan
 from ._rounds import Rounds
@@ -56,10 +56,18 @@ class Surroundings:
 class Surrounded(Episode):
     """An episode of a simulation that has surroundings, played in turns or in rounds."""
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None, surroundings: Surroundings) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        simulation: Any,
+        seed: int | None,
+        offspring: Offspring | None = None,
+        *,
+        surroundings: Surroundings,
+    ) -> None:
         """Begin an episode, as ``Episode`` does."""
         self._surroundings = surroundings
-        super().__init__(plan, simulation, seed)
+        super().__init__(plan, simulation, seed, offspring)
         clock = self.clock
         if clock is not None:
             self.clock = lambda: self._tell(clock)

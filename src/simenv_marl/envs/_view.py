@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import copy
+import os
 import weakref
 from collections.abc import Callable
+from functools import wraps
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -16,7 +19,7 @@ from .._plan import Binding, Plan
 from .._provenance import describe
 from .._session import AnyEpisode, Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast
-from ..errors import CopyError, UnknownAgentError, UnknownOptionError
+from ..errors import CopyError, ReentrancyError, UnknownAgentError, UnknownOptionError
 from ..plugins import Entry
 
 
@@ -39,6 +42,9 @@ class View:
         """
         self.check(plan)
         super().__init__()
+        if plan.options.driver == "thread":
+            self.__class__ = _one_at_a_time(type(self))
+            self._claim = _Claim()
         self._plan = plan
         self._session = Session(plan)
         self._finalizer = weakref.finalize(self, self._session.abandon)
@@ -223,3 +229,48 @@ class AgentsView(View):
         if record is None or record.observation is None:
             return blank(self._binding(agent).definition.observation_space)
         return duplicate(record.observation)
+
+
+# -- many threads ---------------------------------------------------------------------------------
+
+
+class _Claim:
+    """Makes sure that one thread at a time uses an environment. Within it, episodes see to that themselves."""
+
+    def __init__(self) -> None:
+        self._lock, self._process = RLock(), os.getpid()
+
+    def __enter__(self) -> None:
+        if self._process != os.getpid():  # a fork: whoever may have held the lock is not in this process
+            self.__init__()  # type: ignore[misc]
+        if not self._lock.acquire(blocking=False):
+            raise ReentrancyError(
+                "the environment was used while another thread was stepping, resetting or closing it; any thread may"
+                " use it, but one at a time"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+
+def _one_at_a_time(view: type[View]) -> type[View]:
+    """The same class of environments, but for changing threads: what moves the simulation claims it before.
+
+    A class of its own, so that environments which stay in their thread have nothing to pay for it.
+    """
+    made: type[View] | None = vars(view).get("_claiming")
+    if made is None:
+        claiming = {name: _claiming(getattr(view, name)) for name in ("reset", "step", "close")}
+        same = {name: getattr(view, name) for name in ("__module__", "__qualname__", "__doc__")}
+        made = type(view.__name__, (view,), claiming | same)
+        view._claiming = made  # type: ignore[attr-defined]
+    return made
+
+
+def _claiming(method: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(method)
+    def claim(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with self._claim:
+            return method(self, *args, **kwargs)
+
+    return claim

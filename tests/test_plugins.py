@@ -66,8 +66,7 @@ class Greenhouse:
         return amount * (2 if twice else 1)
 
     def days(self, number):
-        for day in range(number):
-            yield day
+        yield from range(number)
         return "over"
 
     async def wire(self, amount):
@@ -639,9 +638,14 @@ def test_whatever_can_be_called_with_the_arguments_is_accepted(handler):
 def test_removing_what_is_not_attached_is_refused(target, position, handler):
     with handlers((two, two, "after")), pytest.raises(HandlerError):
         remove_handler(target, position, handler)
-    with pytest.raises(UnknownTargetError, match="did you mean"):
-        local_function = expose_to_plugins(plus_one)
-        attach_handler(print, local_function.__module__ + ".plus_ome", "before")
+
+
+def test_a_slip_of_the_pen_gets_a_hint():
+    exposed = local()
+    name = f"{HERE}.plus_ome"
+    with pytest.raises(UnknownTargetError, match=r"did you mean .*counting"):
+        attach_handler(print, name.replace("plus_ome", "countin"), "before")
+    assert exposed(1) == 1
 
 
 def test_errors_survive_pickling():

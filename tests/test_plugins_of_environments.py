@@ -373,7 +373,7 @@ def test_handlers_lie_outside_the_decision(how, order):
 @pytest.mark.parametrize("last", ["handlers", "points"])
 @pytest.mark.parametrize("name", [BID, f"{MARKET}.price", f"{MARKET}.Broker.bid", f"{MARKET}.Trader.rounded"])
 def test_patches_come_and_go_in_any_order(first, last, name):
-    owner, _, attribute = name.rpartition(".")
+    owner = name.rpartition(".")[0]
     place = market if owner == MARKET else getattr(market, owner.rpartition(".")[2])
     call = {
         BID: lambda: Trader().bid("tea"),

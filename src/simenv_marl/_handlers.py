@@ -374,10 +374,11 @@ def _find(slot: Slot) -> Handlers | None:
     return slot.get(PLUGGED.get(get_ident())) or slot.get(None)
 
 
-def _call(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    found = slot.get(PLUGGED.get(get_ident())) or slot.get(None)
-    if found is None:
-        return rule(*args, **kwargs)
+_NONE_HERE: Final = "(found := SLOT.get(PLUGGED.get(get_ident())) or SLOT.get(None)) is None"
+"""What ``_find`` finds out, without the call."""
+
+
+def _call(found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     if not found.recorders:
         return found.call(rule, args, kwargs)
     with found.recording(args, kwargs) as results:
@@ -385,19 +386,15 @@ def _call(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) 
     return results[0]
 
 
-def _iterate(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Generator[Any, Any, Any]:
-    found = _find(slot)
-    if found is None:
-        return (yield from rule(*args, **kwargs))
+def _iterate(
+    found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Generator[Any, Any, Any]:
     with found.recording(args, kwargs) as results:
         results.append((yield from found.iterate(slot, rule, args, kwargs)))
     return results[0]
 
 
-async def _wait(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    found = _find(slot)
-    if found is None:
-        return await rule(*args, **kwargs)
+async def _wait(found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     with found.recording(args, kwargs) as results:
         results.append(await found.wait(rule, args, kwargs))
     return results[0]
@@ -541,8 +538,15 @@ class FunctionTarget(Target):
             kind=self._kind,
             alone=self._alone,
             guard="SLOT",
-            ask="handled(SLOT, rule, {}, {})",
-            namespace={"SLOT": self.slot, "target": self, "handled": _HANDLED[self._kind]},
+            ask="handled(found, SLOT, rule, {}, {})",
+            unless=_NONE_HERE,
+            namespace={
+                "SLOT": self.slot,
+                "PLUGGED": PLUGGED,
+                "get_ident": get_ident,
+                "target": self,
+                "handled": _HANDLED[self._kind],
+            },
         )
 
 

@@ -429,6 +429,7 @@ class Target:
         self.attached: list[Attached] = []
         self._of_environments: dict[Any, list[Attached]] = {}
         self._recorders: list[Record] = []
+        self._changes = 0
         Target.all.add(self)
 
     def __repr__(self) -> str:
@@ -484,14 +485,20 @@ class Target:
         self.let_go()
 
     def _make_ready(self) -> None:
-        slot: Slot = {}
-        if self.attached or self._recorders:
-            slot[None] = Handlers(self.name, self.attached, self._recorders)
-        for plugins, own in self._of_environments.items():
-            slot[plugins] = Handlers(self.name, [*self.attached, *own], self._recorders)
-        self.slot.update(slot)  # never empty in between: a call may be looking in another thread
-        for plugins in self.slot.keys() - slot.keys():
-            del self.slot[plugins]
+        self._changes += 1
+        changes = 0
+        # The collector may come in between and close an environment, whose handlers go then.
+        while changes != self._changes:
+            changes = self._changes
+            slot: Slot = {}
+            if self.attached or self._recorders:
+                slot[None] = Handlers(self.name, self.attached, self._recorders)
+            for plugins, own in list(self._of_environments.items()):
+                slot[plugins] = Handlers(self.name, [*self.attached, *own], self._recorders)
+            self.slot.update(slot)  # never empty in between: a call may be looking in another thread
+            for plugins in list(self.slot):
+                if plugins not in slot:
+                    self.slot.pop(plugins, None)
 
 
 class FunctionTarget(Target):

@@ -20,6 +20,9 @@ EXPOSED: Final = "exposed function"
 
 _ABSENT: Final = object()
 
+_TAKEN: Final = ("ABSENT", "NOTHING", "bind", "found", "rule")
+"""Names that mean something in what is written below."""
+
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 
 # What a call costs where nobody asks and nothing is attached is decided here. A method that takes nothing but
@@ -105,7 +108,7 @@ def generate(
     parameters = list(signature.parameters.values()) if signature is not None else []
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
-    if alone and positional[0].name not in {*namespace, "rule", "bind", "ABSENT", "NOTHING"}:
+    if alone and positional[0].name not in {*namespace, *_TAKEN}:
         names = [positional[0].name]  # by which a staticmethod's may be passed all the same
     call = _CALL[kind].format
     values = {

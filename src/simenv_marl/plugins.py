@@ -42,7 +42,7 @@ Entry = tuple[Callable[..., Any], Any, str]
 
 def exposed_functions() -> list[str]:
     """The names of all that is exposed to plugins, or has handlers attached to it."""
-    return sorted(target.name for target in list(Target.all) if target.place is None or target.slot)
+    return sorted({target.name for target in Target.all if target.place is None or target.slot})
 
 
 def decision_points() -> list[str]:

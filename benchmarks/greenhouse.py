@@ -18,12 +18,40 @@ from examples.greenhouse_coop.env import (
 )
 from examples.greenhouse_coop.model import Greenhouse
 
-from benchmarks.measure import Contender
+from benchmarks.measure import Contender, Section, ratio, side_by_side
 
 WATER = np.array([0.065], np.float32)
 """An action that keeps the plants alive for the whole episode, so that all of its days are alike."""
 
 AIR = np.array([0.2], np.float32)
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure in so many rounds, of an episode each."""
+    times = side_by_side(
+        {
+            "watering, plain loop": plain_days(PlainWatering),
+            "watering, single environment": single_days(),
+            "both, plain loop": plain_days(PlainCoop),
+            "both, AEC environment": aec_days(),
+        },
+        rounds,
+    )
+    section = Section("Greenhouse of 200 plants", "microseconds per day")
+    section.ratio(
+        "days/s through the single environment / plain loop with the same mappings",
+        ratio(times, "watering, plain loop", "watering, single environment"),
+        bar=0.95,
+        aim=0.98,
+        digits=3,
+    )
+    section.ratio(
+        "the same with two agents, two decisions a day, in the AEC environment",
+        ratio(times, "both, plain loop", "both, AEC environment"),
+        digits=3,
+    )
+    section.times(times)
+    return section
 
 
 class PlainWatering(Greenhouse):

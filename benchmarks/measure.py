@@ -22,6 +22,8 @@ Contender = Callable[[], float]
 
 Times = dict[str, list[float]]
 
+PACKAGES = ("greenlet", "gymnasium", "pettingzoo", "mesa", "numpy")
+
 
 def timed(loop: Callable[[int], None], number: int) -> Contender:
     """Make a contender of a loop that is told how often to go round."""
@@ -56,12 +58,45 @@ def ratio(times: Times, over: str, *under: str) -> float:
     return statistics.median(top / sum(bottom) for top, bottom in zip(times[over], sums, strict=True))
 
 
+class Section:
+    """What one module has measured: ratios, with what the project holds itself to, and the times behind them.
+
+    Attributes:
+        title: What it is about.
+        unit: What the times are.
+        ratios, rows: The rows of its two tables.
+        remarks: What else is to be said.
+    """
+
+    def __init__(self, title: str, unit: str) -> None:
+        self.title, self.unit = title, unit
+        self.ratios: list[list[str]] = []
+        self.rows: list[list[str]] = []
+        self.remarks: list[str] = []
+
+    def ratio(
+        self, what: str, value: float, bar: float | None = None, aim: float | None = None, digits: int = 2
+    ) -> None:
+        """Add a ratio; its bar, if it is to stay below (or above) one; and what it would better be."""
+        limits = ["" if limit is None else f"{limit:g}" for limit in (bar, aim)]
+        self.ratios.append([what, f"{value:.{digits}f}", *limits])
+
+    def time(self, what: str, value: float, digits: int = 2) -> None:
+        """Add a time."""
+        self.rows.append([what, f"{value:.{digits}f}"])
+
+    def times(self, times: Times) -> None:
+        """Add the medians of measured times."""
+        for name, values in times.items():
+            self.time(name, statistics.median(values))
+
+
 class Report:
     """Tables for the terminal and, the same, in Markdown."""
 
     def __init__(self, title: str) -> None:
         self._console = Console()
-        packages = ", ".join(f"{name} {version(name)}" for name in ("greenlet", "gymnasium", "pettingzoo", "numpy"))
+        packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
         self._lines = [
             f"Measured with CPython {platform.python_version()} on {platform.machine()} ({_processor()}), one core,"
             f" {packages}.",
@@ -69,7 +104,15 @@ class Report:
         self._console.rule(title)
         self._console.print(self._lines[0])
 
-    def table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
+    def add(self, section: Section) -> None:
+        """Tell what a section has measured."""
+        self._table(f"{section.title}: ratios", ["what", "ratio", "bar", "aim"], section.ratios)
+        self._table(f"{section.title}: {section.unit}", ["what", "time"], section.rows)
+        for remark in section.remarks:
+            self._console.print(remark)
+            self._lines += ["", remark]
+
+    def _table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
         table = Table(*columns, title=title)
         for row in rows:
             table.add_row(*row)

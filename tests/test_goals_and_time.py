@@ -460,6 +460,19 @@ def test_policies_know_the_time():
     assert [info["time"] for info in seen] == [1.0, 3.0]
 
 
+@pytest.mark.parametrize("action", [1, RULE])
+def test_policies_know_how_much_time_has_gone_by(action):
+    """Since the decision before, whether the policy has taken that or left it to the rule."""
+    ant, seen = decision(agent="ant_0"), []
+
+    def policy(observation, info):
+        seen.append(info["elapsed"])
+        return action
+
+    simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy})
+    assert seen == [0.0, 2.0, 4.0]
+
+
 def test_without_a_clock_there_is_no_time():
     ant = decision(agent="ant_0")
     assert single_env(calling(ant), ant).reset()[1] == {}
@@ -568,8 +581,11 @@ def test_rendering(make):
 def test_rendering_for_people(make, capsys):
     env = painted(make, render_mode="human")
     env.reset()
+    assert capsys.readouterr().out == "now 0\n"
+    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    assert capsys.readouterr().out == "now 4\n"
     assert env.render() is None
-    assert capsys.readouterr().out.endswith("now 0\n")
+    assert capsys.readouterr().out == "now 4\n"
 
 
 @EVERY_VIEW

@@ -776,6 +776,13 @@ def test_a_bare_name_means_the_agent_of_its_first_argument(removed_by):
     assert [turn.agent for turn in turns] == ["being_0"] * 3
 
 
+def test_a_bare_name_that_can_never_mean_an_agent_is_warned_of():
+    """A method of something else is called on that, and not on an entity."""
+    with pytest.warns(UserWarning, match=r"leave.*no Being.*ends no agent.*callable"):
+        env = aec_env(script(lambda simulation: Being(0).act()), beings(removed_by=f"{HERE}.Other.leave"))
+    assert len(play(env, 1)) == 2
+
+
 def test_a_callable_names_who_is_removed():
     def main(simulation):
         crowd = [Being(number) for number in range(3)]

@@ -287,6 +287,48 @@ def test_names_of_points_become_camel_case(register):
     made(ids[0]).reset()
 
 
+def test_a_point_may_be_called_joint(register):
+    """The id of the joint view is taken; names that only differ in how they are written are told apart, too."""
+
+    class Robot:
+        @define(agent="joint_0", observation_space_mapping=lambda it: [0, 1], reward_mapping=lambda it: 0.0)
+        def joint(self):
+            return 0
+
+        @define(agent="grip_0", observation_space_mapping=lambda it: [0, 2], reward_mapping=lambda it: 0.0)
+        def open_grip(self):
+            return 0
+
+        @define(agent="grip_1", observation_space_mapping=lambda it: [0, 3], reward_mapping=lambda it: 0.0)
+        def openGrip(self):  # noqa: N802
+            return 0
+
+    robot = Robot()
+    points = [Robot.joint, Robot.open_grip, Robot.openGrip]
+    ids = register(calling(robot.joint, robot.open_grip, robot.openGrip), points, name="robots")
+    assert ids[0] == "robots/RobotJoint-v0"
+    assert "robots/Joint-v0" in ids
+    assert len(set(ids)) == len(ids) == 5
+    assert [made(identity).reset()[0].tolist() for identity in ids[:3]] == [[0, 1], [0, 2], [0, 3]]
+
+
+def test_an_entitys_policy_stands_in_the_single_view_of_another_point(register):
+    @define(agent="ant_0")
+    def choose():
+        return 0
+
+    def main(simulation):
+        choose()
+        simulation.log.append(Being(1).act())
+
+    points = {choose: define(agent="ant_0"), **beings()}
+    ids = register(script(main), points, name="entities", policies={"being_1": lambda observation: 7})
+    env = made(ids[0])
+    env.reset()
+    env.step(1)
+    assert env.simulation.log == [7]
+
+
 @pytest.mark.parametrize(
     ("changes", "error"),
     [

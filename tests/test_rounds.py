@@ -1506,3 +1506,21 @@ def test_episodes_repeat_themselves():
     first, second = episode(), episode()
     assert len(first) == len(second)
     assert all(data_equivalence(one, other) for one, other in zip(first, second, strict=True))
+
+
+def test_what_cannot_be_observed_anew_is_never_the_same_object():
+    """An agent whose entity the model has let go of keeps its observation, whatever its user does to it."""
+
+    def main(simulation):
+        one, other = Being(0), Being(1)
+        one.act()
+        del one
+        for _ in range(5):
+            other.act()
+
+    env = parallel_env(script(main), beings(removed_by=()), possible_agents=["being_0", "being_1"])
+    env.reset()
+    for _ in range(4):
+        observations, *_ = env.step({"being_0": 1, "being_1": 1})
+        assert observations["being_0"].tolist() == [0, 0]
+        observations["being_0"][:] = 99

@@ -1,5 +1,7 @@
 """Policies back in the model: ``simulate``."""
 
+import weakref
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -276,3 +278,68 @@ def test_some_by_their_policies_and_the_rest_by_their_rule(design, seed):
         turns = play(env, lambda agent, env: 3 if agent in chosen else RULE, seed=seed)
         assert env.simulation.trace == plain.trace
         assert decisions(turns) == [agent for agent in plain.decisions if agent != "overseer_0"]
+
+
+# -- who answers for whom -------------------------------------------------------------------------
+
+
+def test_whoever_is_named_is_answered_by_what_is_named_for_it():
+    """An agent's own policy comes before that of its point, and so before its point's rule."""
+
+    def main(simulation):
+        for number in (0, 1):
+            simulation.log.append(Being(number).act())
+
+    own = {"being_1": lambda observation: 5}
+    assert simulate(script(main), {Being.act: lambda observation: 3} | own, points=beings()).log == [3, 5]
+    assert simulate(script(main), {Being.act: RULE} | own, points=beings()).log == ["rule", 5]
+    assert simulate(script(main), {Being.act: lambda observation: 3, "being_1": RULE}, points=beings()).log == [
+        3,
+        "rule",
+    ]
+    ant = decision(agent="ant_0")
+    assert simulate(calling(ant), {ant: RULE, "ant_0": lambda observation: 5}, points=ant).log == [5]
+    assert simulate(calling(ant), {ant: lambda observation: 3, "ant_0": RULE}, points=ant).log == ["rule"]
+
+
+def test_agents_of_policies_are_no_agents_of_the_environment_whatever_else_is_named():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    policies = {ant: RULE, "ant_0": lambda observation: 5}
+    env = aec_env(calling(ant, bee), [ant, bee], policies=policies)
+    assert env.possible_agents == ["bee_0"]
+    env.reset()
+    env.step(1)
+    assert env.simulation.log == [5, 1]
+
+
+@pytest.mark.parametrize("key", [Being.act, f"{HERE}.Being.act", "being_0"])
+def test_simulations_of_their_own_definitions(key):
+    """Definitions that only the simulation itself knows are found, by whatever name a policy is given."""
+
+    def make():
+        simulation = script(lambda simulation: simulation.log.append(Being(0).act()))()
+        simulation.points = beings()
+        return simulation
+
+    assert simulate(make, {key: lambda observation: 3}).log == [3]
+
+
+@pytest.mark.parametrize("action", [1, RULE])
+def test_policies_keep_nobody_alive(action):
+    """What the model lets go of after a decision is gone at once."""
+
+    def main(simulation):
+        for number in range(3):
+            being = Being(number)
+            being.act()
+            watched = weakref.ref(being)
+            del being
+            simulation.log.append(watched() is None)
+
+    points = beings(observation_space_mapping=lambda being: [0.0, 0.0])
+    assert simulate(script(main), {Being.act: lambda observation: action}, points=points).log == [True] * 3
+    points |= {Other.act: beings(agent="other_0", removed_by=())[Being.act]}
+    env = aec_env(script(main), points, policies={Being.act: lambda observation: action})
+    with pytest.raises(SimEnvError):  # nobody else decides
+        env.reset()
+    assert env.simulation.log == [True] * 3

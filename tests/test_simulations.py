@@ -20,6 +20,7 @@ from simenv_marl import (
     single_env,
 )
 
+from .many_worlds import beings
 from .models import Script, calling, decision, decisions, define, play, script
 
 # -- sources --------------------------------------------------------------------------------------
@@ -78,8 +79,8 @@ def test_classes_and_factories_make_one_simulation_for_each_environment(kind):
 
 @pytest.mark.parametrize("view", ["aec", "single"])
 def test_a_simulation_is_made_once_and_reset_for_each_episode(view):
-    env_class = generate_env(lambda: Simulation(), Model.decide, view=view)
     before = Simulation.made
+    env_class = generate_env(lambda: Simulation(), Model.decide, view=view)
     env = env_class()
     assert Simulation.made == before + 1
     simulation = env.unwrapped.simulation
@@ -526,3 +527,36 @@ def test_decisions_called_from_rules_are_decisions_like_any_other():
     turns = play(env, iter([RULE, 4, 5]))
     assert decisions(turns) == ["outer_0", "inner_0", "outer_0"]
     assert env.unwrapped.simulation.log == [("outer", 4), 5]
+
+
+# -- how often it is made -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("points", [None, "given"])
+def test_a_factory_makes_one_simulation_for_each_environment(points):
+    made = []
+    ant = decision(agent="ant_0")
+
+    def factory():
+        made.append(calling(ant)())
+        made[-1].points = ant
+        return made[-1]
+
+    env = aec_env(factory, points and ant)
+    env.reset()
+    env.reset()
+    assert made == [env.simulation]
+    cls = generate_env(factory, points and ant)
+    envs = [cls(), cls(), cls(max_steps=3)]
+    assert made[1:] == [env.simulation for env in envs]
+
+
+def test_rosters_may_be_iterators():
+    def main(simulation):
+        return None
+
+    cls = generate_env(script(main), beings(), possible_agents=(f"being_{number}" for number in range(2)))
+    assert cls().possible_agents == cls().possible_agents == ["being_0", "being_1"]
+    (point,) = beings()
+    cls = generate_env(script(main), beings(), possible_agents={point: (f"being_{number}" for number in range(2))})
+    assert cls().possible_agents == cls().possible_agents == ["being_0", "being_1"]

@@ -16,6 +16,7 @@ The layers, each importing only from those above it::
     _plan         what an environment is made of, checked before anything runs
     _record       what an episode knows of one agent; rewards and observations
     _episode      what happens when: decisions, rewards, observations, ends, errors
+    _rounds       the same in rounds, in which all agents may act
     _surroundings what an environment's simulation finds around it whenever it is at work
     _session      a simulation over all episodes of one environment
     policies      policies back in the model's own loop

@@ -24,7 +24,7 @@ Views read the records of agents; none of them computes an observation or a rewa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from threading import get_ident
 from typing import Any, Final
@@ -50,7 +50,6 @@ from .errors import (
     EpisodeOverError,
     NoDecisionError,
     ReentrancyError,
-    UnknownAgentError,
     WrongThreadError,
     warn_user,
 )
@@ -60,7 +59,6 @@ UNWINDING_TRIES: Final = 1000
 """How often a simulation that is to be unwound may decide or swallow before it is given up. A SimPy model loses one of
 its processes at each try."""
 
-MISSING: Final = Sentinel("MISSING")
 UNNAMED: Final = Sentinel("UNNAMED")
 NAMED_AT_CALL: Final = Sentinel("NAMED_AT_CALL")
 
@@ -83,15 +81,13 @@ class Episode:
         clock: Returns the simulation's time; None where it has none.
     """
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None, *, rounds: bool = False) -> None:
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None) -> None:
         """Begin an episode of a simulation that has been reset: run it to its first decision.
 
         Args:
             plan: What the environment is made of.
             simulation: The simulation.
             seed: What it was reset with, for those who read an error's notes.
-            rounds: Whether agents are rewarded and observed all together, at the end of ``play``, and not
-                each at its own decisions, at the end of ``turn``.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
@@ -110,7 +106,6 @@ class Episode:
         self._plan, self._simulation, self._seed = plan, simulation, seed
         self._max_turns = plan.options.max_steps or -1  # never reached
         self._failed_in_model = False
-        self._rounds = rounds
         self.clock = getattr(simulation, "time", None)
         for agent, binding in () if plan.unanswered else plan.roster.items():
             self.agents[agent] = Record(agent, binding, None, self.clock)
@@ -123,8 +118,6 @@ class Episode:
                 if not self.over:
                     pending, self.pending = self.pending, None
                     self._foresee(pending)
-                    if rounds:
-                        self._settle_all(pending)
                     self.pending = pending
             except BaseException as error:
                 self._fail(error)
@@ -222,7 +215,7 @@ class Episode:
                     record.reward = reward
                     record.observation = cast(observe(first))
                     if DIFFERENCES:
-                        del EVALUATING[get_ident()]
+                        EVALUATING.pop(get_ident(), None)
                     record.info = {}
                     self.pending = record
                     return
@@ -261,17 +254,19 @@ class Episode:
         if record.policy is not None:
             return self._consult(record, args, kwargs)
         record.hold(args, kwargs)
-        if self._rounds:
-            record.arise(args, kwargs)
-        elif self.turns == self._max_turns:
-            self._finish(truncated=True)
-            return None
-        else:
-            record.settle(args, kwargs)
-            if self.clock is None and binding.legal is None and binding.point.alone:
-                self._swift[binding] = NAMED_AT_CALL if binding.agent is None else record
-        self.pending = record
+        self._arise(record, args, kwargs)
         return None
+
+    def _arise(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """A decision of the environment's user has arisen."""
+        if self.turns == self._max_turns:
+            self._finish(truncated=True)
+            return
+        record.settle(args, kwargs)
+        binding = record.binding
+        if self.clock is None and binding.legal is None and binding.point.alone:
+            self._swift[binding] = NAMED_AT_CALL if binding.agent is None else record
+        self.pending = record
 
     def _meet(self, agent: Any, binding: Binding) -> Record:
         """Find or make the record of an agent that is not known as one of the environment's own here."""
@@ -284,7 +279,7 @@ class Episode:
                     f"the agent {agent!r} decides at {binding.point.name} after its end; let agent= give each entity"
                     " a name of its own, and removed_by= name what really ends it"
                 )
-            policy = binding.policy or self._plan.policies.get(agent)
+            policy = self._plan.policies.get(agent) or binding.policy
             if policy is None and self._plan.unanswered:
                 policy = RULE
             elif policy is None and self._plan.complete:
@@ -311,157 +306,43 @@ class Episode:
         if record.policy is RULE:
             return RULE
         record.observe(args, kwargs)
-        action = record.policy(record.observation, record.info)
-        if action is RULE:
-            return RULE
-        choices = record.choices
+        action, choices = record.policy(record.observation, record.info), record.choices
         record.follow_up()
-        return record.binding.reply(action, record.agent, record.mask, choices)
+        return RULE if action is RULE else record.binding.reply(action, record.agent, record.mask, choices)
 
     def record(self, agent: str) -> Record | None:
         """What is known of an agent of the environment, whether it lives or is gone."""
         return self.agents.get(agent) or self.gone.get(agent)
 
-    # -- rounds -----------------------------------------------------------------------------------
-
-    def play(self, actions: Mapping[str, Any]) -> None:
-        """Answer decisions with actions, each once, up to the first whose action is missing; or to the end.
-
-        Then all live agents are rewarded and observed.
-
-        Args:
-            actions: By agent: an action, or ``RULE``.
-
-        Raises:
-            UnknownAgentError: An action is for nobody who lives. Nothing has moved.
-            InvalidActionError: An action is not legal. Nothing has moved. One that only becomes illegal by
-                its turn counts as missing.
-            EpisodeOverError: No decision is pending.
-            BaseException: Whatever the model, a mapping or a policy raises.
-        """
-        record, driver = self.pending, self._driver
-        if record is None or driver is None:
-            raise self.nothing_pending()
-        if (RUNNING or EVALUATING) and self._attended():
-            with unattended():
-                self.play(actions)
-            return
-        driver.enter()
-        left = self._checked(actions, record)
-        if actions:
-            self.turns += 1
-        for other in (*self.agents.values(), *self.parting):
-            other.acted = False
-        self.parting = []
-        try:
-            while record is not None and (reply := self._round_reply(record, left)) is not MISSING:
-                self.pending, record = None, None
-                while self.pending is None and not self.over:
-                    resume = driver.resume
-                    reply = self._take(*resume(reply))
-                record = self.pending
-            if self.over:
-                return
-            # Whoever steps an environment from inside a mapping is told so, as in mid-round.
-            pending, self.pending = self.pending, None
-            self._foresee(pending)
-            if self.turns == self._max_turns and actions:
-                self._finish(truncated=True)
-            else:
-                self._settle_all(pending)
-                self.pending = pending
-        except BaseException as error:
-            self._fail(error)
-            raise
-
-    def _checked(self, actions: Mapping[str, Any], pending: Record) -> dict[str, Any]:
-        """The actions, checked as far as they can be before anything moves."""
-        checked = {}
-        for agent, action in actions.items():
-            record = self.agents.get(agent)
-            if record is None:
-                raise UnknownAgentError(f"there is an action for {agent!r}, which is no live agent: {self._names()}")
-            mask = pending.mask if record is pending else None
-            checked[agent] = action if action is RULE else record.binding.checked(action, agent, mask)
-        return checked
-
-    def _round_reply(self, record: Record, left: dict[str, Any]) -> Any:
-        """The reply to a decision of a round, ``MISSING`` if there is no legal action for it any more."""
-        action = left.get(record.agent, MISSING)
-        if action is MISSING:
-            return MISSING
-        binding = record.binding
-        if action is not RULE:
-            if record.mask is not None and not binding.allowed(action, record.mask):
-                return MISSING
-            action = binding.convert(action) if record.choices is None else [record.choices[action]]
-        del left[record.agent]
-        self._latest = record
-        record.acted = True
-        if not record.decided:  # seen for the first time, and acting at once
-            arguments = record.arguments()
-            assert arguments is not None
-            record.join(*arguments)
-        if record.followed_up:
-            record.follow_up()
-        return action
-
-    def _settle_all(self, pending: Record | None) -> None:
-        """Reward and observe all live agents, as far as the calls are known on which they decide."""
-        thread = get_ident()
-        plain = {binding for binding in self._plan.active if binding.legal is None and self.clock is None}
-        for record in self.agents.values():
-            arguments = record.arguments()
-            if arguments is None:
-                record.reward, record.info = 0.0, {}
-                continue
-            self._latest = record
-            args, kwargs = arguments
-            binding = record.binding
-            if kwargs or len(args) != 1 or not record.decided or binding not in plain:
-                record.settle(args, kwargs)
-                if record is not pending:
-                    record.choices = None  # which are asked for again when it decides
-                continue
-            # The same, for the calls of most models: of one argument, with nothing but the mappings to be seen to.
-            (first,) = args
-            reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
-            EVALUATING[thread] = record.memory
-            reward = reward_mapping(first)
-            if type(reward) is not float:
-                reward = number(reward)
-            if reward - reward != 0.0:
-                raise not_finite(record, reward)
-            record.reward = reward
-            record.observation = cast(observe(first))
-            record.info = {}
-        EVALUATING.pop(thread, None)
+    # -- agents announced beforehand --------------------------------------------------------------
 
     def _foresee(self, pending: Record | None) -> None:
         """Get to know agents before they decide, where the simulation knows the calls to come."""
+        for record, args in self._announced():
+            if record is not pending and not record.decided:
+                record.hold(args, {})
+                record.observe(args, {})
+                record.choices = None  # which are asked for again when it decides
+
+    def _announced(self) -> Iterator[tuple[Record, tuple[Any, ...]]]:
+        """The live agents that the simulation says are going to decide, with the arguments of their calls."""
         expected = getattr(self._simulation, "expected_calls", None)
         if expected is None:
             return
+        agents = self.agents
         for binding in self._plan.active:
             name_agent = binding.name_agent
-            seen = {pending}  # of several calls the next one counts
             for call in expected(binding.point.name):
-                args = tuple(call)
+                args = call if type(call) is tuple else tuple(call)
                 agent = binding.agent if name_agent is None else name_agent(*args)
-                record = self.agents.get(agent) if type(agent) is str else None
+                record = agents.get(agent) if type(agent) is str else None
                 if record is None or record.binding is not binding:
                     if agent is None or agent in self.gone or agent in self._answered:
                         continue
                     record = self._meet(agent, binding)
                     if record.policy is not None:
                         continue
-                if record in seen or (record.decided and not self._rounds):
-                    continue
-                seen.add(record)
-                record.hold(args, {})
-                if not self._rounds:
-                    record.observe(args, {})
-                    record.choices = None
+                yield record, args
 
     def _names(self) -> str:
         names = list(self.agents)

@@ -122,10 +122,10 @@ def owner_at_hand(function: FunctionType) -> type:
     )
 
 
-def all_classes() -> Iterator[type]:
-    """All classes that there are."""
+def all_classes(base: type = object) -> Iterator[type]:
+    """All classes that there are, or that derive from one."""
     seen: set[type] = set()
-    left = [object]
+    left = [base]
     while left:
         owner = left.pop()
         if owner not in seen:

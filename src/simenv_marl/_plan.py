@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from . import _spaces
 from ._driver import Surrounding, unattended
-from ._points import NamedPoint, Site, find_point, find_points, locate, owner_class, stand_ins
+from ._points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, stand_ins
 from ._spaces import ILLEGAL
 from .decision import DecisionPoint, Definition, unwrapped
 from .errors import (
@@ -30,6 +30,7 @@ from .errors import (
     SimEnvError,
     UnknownOptionError,
     UnknownPointError,
+    warn_user,
 )
 from .plugins import Plugged, Plugins
 from .simulation import RULE, make_simulation
@@ -61,7 +62,8 @@ class Options:
         plugins: Handlers for this environment's simulation alone: of each the handler, the target and the position,
             as ``attach_handler`` takes them.
         flatten: Whether the joint view has one vector in place of dicts.
-        state_space: The space of the environment's ``state()``; None: whatever the simulation's is.
+        state_space: The space to whose shape and dtype the environment's ``state()`` is cast; None: what the
+            simulation's own ``state()`` returns is taken as it is.
         render_mode: What ``render`` returns; one of the simulation's ``render_modes``.
     """
 
@@ -91,6 +93,8 @@ class Options:
             raise OptionValueError(f"max_steps must be a positive integer or None, not {steps!r}")
         if self.policies is not None and not isinstance(self.policies, Mapping):
             raise OptionValueError(f"policies must be a dict from agents or points to callables, not {self.policies!r}")
+        if self.possible_agents is not None:  # it may be an iterator, and is read by every environment
+            object.__setattr__(self, "possible_agents", _listed(self.possible_agents))
         for key, policy in (self.policies or {}).items():
             if policy is not RULE and not callable(policy):
                 raise OptionValueError(f"the policy of {key!r} must be a callable or RULE, not {policy!r}")
@@ -114,6 +118,17 @@ class Options:
                 hint = f"; did you mean {close[0]!r}?" if close else ""
                 raise UnknownOptionError(f"there is no option {name!r}{hint} (the options are {', '.join(known)})")
         return replace(self, **options)
+
+
+def _listed(names: Any) -> Any:
+    if isinstance(names, Mapping):
+        return {key: _listed(value) for key, value in names.items()}
+    try:
+        return list(names)
+    except TypeError:
+        raise OptionValueError(
+            f"possible_agents must be names, or a dict from points to names, not {names!r}"
+        ) from None
 
 
 # -- bindings -------------------------------------------------------------------------------------
@@ -323,8 +338,10 @@ class Plan:
         render_modes: list[str],
         *,
         unanswered: bool = False,
+        spare: list[Any] | None = None,
     ) -> None:
         self.source, self.options, self._named = source, options, named
+        self._spare = [] if spare is None else spare  # the simulation that was looked at, until an environment takes it
         self.render_modes = render_modes
         if options.render_mode is not None and options.render_mode not in render_modes:
             raise OptionValueError(
@@ -337,8 +354,9 @@ class Plan:
         active: list[Binding] = []
         for point, agent in zip(everything, _name_agents(everything), strict=True):
             policy = by_point.get(point.point)
-            if policy is RULE:
-                continue
+            excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
+            if policy is RULE and not excepted:
+                continue  # nobody needs to be asked
             binding = self.bindings[point.point] = Binding(point, agent, policy)
             if policy is None and agent not in self.policies:
                 active.append(binding)
@@ -372,7 +390,14 @@ class Plan:
                 removal = self.bindings.setdefault(point, Removal(point))
                 if not isinstance(removal, Removal):
                     raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
-                removal.of.append((binding, agent, owner_class(binding.point)))
+                owner, remover = owner_class(binding.point), owner_class(point)
+                if agent is None and point.bound and owner and remover and not have_instances(owner, remover):
+                    warn_user(
+                        f"{name}, which removed_by= of {binding.point.name} names, is called on a {remover.__name__},"
+                        f" which is no {owner.__name__}, and so ends no agent; give a dict from {name!r} to a callable"
+                        " of the call's arguments that names the agent"
+                    )
+                removal.of.append((binding, agent, owner))
                 if site is not None and site not in self.sites:
                     self.sites.append(site)
 
@@ -390,19 +415,33 @@ class Plan:
             SimEnvError: Something in them cannot work; the leaf says what.
         """
         checked = Options().amended(options)
-        model = source
+        model, spare = source, []
         plain_factory = not isinstance(source, type) and not hasattr(source, "run")
         if plain_factory or (points is None and getattr(source, "points", None) is None):
             with unattended():
                 model = make_simulation(source)
+            spare.append(model)
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
-        named = [] if unanswered and points == () else find_points(points, model)
-        return cls(source, named, checked, list(modes), unanswered=unanswered)
+        named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
+        return cls(source, named, checked, list(modes), unanswered=unanswered, spare=spare)
+
+    def make_simulation(self) -> Any:
+        """Make a simulation for one environment.
+
+        Raises:
+            SimulationError: The source makes none.
+        """
+        if self._spare and not self.surroundings():  # which it was made without
+            try:
+                return self._spare.pop()
+            except IndexError:  # another thread was faster
+                pass
+        return make_simulation(self.source)
 
     def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
         """The same plan, with another definition of a point."""
         named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
-        return Plan(self.source, named, self.options, self.render_modes)
+        return Plan(self.source, named, self.options, self.render_modes, spare=self._spare)
 
     def declared(self, roster: Mapping[str, Binding]) -> Plan:
         """The same plan, with a roster of agents that has been found out."""
@@ -427,7 +466,12 @@ class Plan:
         """The same plan, but for the options that are given."""
         if not options:
             return self
-        return Plan(self.source, self._named, self.options.amended(options), self.render_modes)
+        return Plan(self.source, self._named, self.options.amended(options), self.render_modes, spare=self._spare)
+
+
+def _names_agents(policies: Mapping[Any, Any] | None) -> bool:
+    """Whether some policy's key names no point by itself, so that the agents of all points are to be known."""
+    return any(isinstance(key, str) and "." not in key for key in policies or {})
 
 
 def _name_agents(named: list[NamedPoint]) -> list[str | None]:
@@ -462,7 +506,7 @@ def _call_the_roll(active: list[Binding], declared: Any) -> tuple[dict[str, Bind
                     f"possible_agents names {key!r}, which is no active decision point whose agents are named by a"
                     f" callable; those are {[b.point.name for b in named]}"
                 )
-            names[point] = list(value)
+            names[point] = value
     elif declared is not None:
         others = [name for name in declared if name not in [b.agent for b in active]]
         if len(named) > 1 or (others and not named):

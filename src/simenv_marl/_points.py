@@ -36,13 +36,14 @@ class NamedPoint:
     site: Site | None
 
 
-def find_points(points: Any, simulation: Any) -> list[NamedPoint]:
+def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[NamedPoint]:
     """Find all that ``points=`` names.
 
     Args:
         points: A dotted name, a function, a list of these, or a dict from these to definitions. None: the
             attribute ``points`` of the simulation, else all decorated points.
         simulation: The simulation.
+        required: Whether all decorated points are meant where nobody names any, and not none.
 
     Returns:
         The points, in the order in which they were named.
@@ -55,6 +56,8 @@ def find_points(points: Any, simulation: Any) -> list[NamedPoint]:
     if points is None:
         points = getattr(simulation, "points", None)
     if points is None:
+        if not required:
+            return []
         points = _all_registered()
     if isinstance(points, Mapping):
         found = [find_point(key, definition) for key, definition in points.items()]
@@ -184,6 +187,11 @@ def _decorated_places(point: DecisionPoint) -> set[Any]:
     owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
     found = ((owner, beneath(plain(vars(owner).get(name)))) for owner in owners)
     return {owner for owner, function in found if isinstance(function, FunctionType) and function in wrappers}
+
+
+def have_instances(one: type, other: type) -> bool:
+    """Whether some object can be an instance of both classes, of all classes that there are now."""
+    return any(issubclass(owner, other) for owner in all_classes(one))
 
 
 def owner_class(point: DecisionPoint) -> type | None:

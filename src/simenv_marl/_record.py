@@ -13,6 +13,7 @@ import numpy as np
 from . import _spaces
 from ._driver import EVALUATING
 from ._plan import Binding
+from .decision import DIFFERENCES
 from .errors import MaskError, RewardError
 
 
@@ -81,14 +82,14 @@ class Record:
         """
         self._args, self._kwargs = args, kwargs
         if args and self.binding.agent is None:
-            first = args[0]
-            if self._weakly is None or self._weakly() is not first:
+            first, weakly = args[0], self._weakly
+            if weakly is None or weakly() is not first:
                 try:
-                    self._weakly = ref(first)
+                    self._weakly = weakly = ref(first)
                 except TypeError:
                     self._weakly = None
                     return
-            self._args = (self._weakly, *args[1:])
+            self._args = (weakly,) if len(args) == 1 else (weakly, *args[1:])
 
     def forget(self) -> None:
         """Let go of the arguments; the agent has no more to observe."""
@@ -108,12 +109,11 @@ class Record:
             ObservationError: The observation does not fit its space.
             MaskError: The mask does not fit the action space.
         """
-        binding = self.binding
         if self.decided:
-            EVALUATING[get_ident()] = self.memory
-            reward_mapping = binding.reward
+            if DIFFERENCES:
+                EVALUATING[get_ident()] = self.memory
+            reward_mapping = self.binding.reward
             reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-            del EVALUATING[get_ident()]
             if type(reward) is not float:
                 reward = number(reward)
             if reward - reward != 0.0:
@@ -125,15 +125,19 @@ class Record:
 
     def join(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Ask for the first reward, which is dropped: nothing was done yet that could be rewarded."""
-        EVALUATING[get_ident()] = self.memory
-        self.binding.reward(*args, **kwargs)
-        del EVALUATING[get_ident()]
+        if DIFFERENCES:
+            EVALUATING[get_ident()] = self.memory
+        reward_mapping = self.binding.reward
+        reward_mapping(*args, **kwargs)
+        if DIFFERENCES:
+            EVALUATING.pop(get_ident(), None)
         self.decided = True
 
     def observe(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
         """Find out the legal actions and the time, and observe. The arguments are those of ``settle``."""
         binding = self.binding
-        EVALUATING[get_ident()] = self.memory
+        if DIFFERENCES:
+            EVALUATING[get_ident()] = self.memory
         if binding.legal is None and self.clock is None:
             cast, observe = binding.cast, binding.observe
             self.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
@@ -146,7 +150,8 @@ class Record:
             if self.clock is not None:
                 info |= self._passed(self.clock())
             self.observation = binding.observation(args, kwargs, self.mask)
-        del EVALUATING[get_ident()]
+        if DIFFERENCES:
+            EVALUATING.pop(get_ident(), None)
 
     def arise(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Find out what must be known of a decision in mid-round. The arguments are those of ``settle``."""

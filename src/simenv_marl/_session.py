@@ -7,8 +7,7 @@ is abandoned in mid-episode goes at once and takes its session along.
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 from zlib import crc32
 
 import numpy as np
@@ -17,9 +16,11 @@ from gymnasium import spaces
 from ._driver import unattended
 from ._episode import Episode
 from ._plan import Plan
-from ._surroundings import SurroundedEpisode, Surroundings
+from ._surroundings import Surroundings, surrounded
 from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
-from .simulation import make_simulation, resetter
+from .simulation import resetter
+
+AnyEpisode = TypeVar("AnyEpisode", bound=Episode)
 
 
 class Session:
@@ -49,7 +50,7 @@ class Session:
         self._hold_sites()
         try:
             with self.at_work():
-                self.simulation = make_simulation(plan.source)
+                self.simulation = plan.make_simulation()
                 self._reset = resetter(self.simulation)
         except BaseException:
             self._let_go_of_sites()
@@ -60,16 +61,15 @@ class Session:
         seed: int | None,
         options: dict[str, Any] | None,
         generator: np.random.Generator,
-        *,
-        rounds: bool = False,
-    ) -> Episode:
+        kind: type[AnyEpisode],
+    ) -> AnyEpisode:
         """End the episode that runs, reset the simulation, and run it to its first decision.
 
         Args:
             seed: The seed to reset it with; None: one is drawn.
             options: What the environment's ``reset`` was given.
             generator: What a seed is drawn from.
-            rounds: Whether the episode is played in rounds or in turns.
+            kind: How the episode is played: in turns or in rounds.
 
         Raises:
             NoDecisionError: The simulation ended without one.
@@ -78,13 +78,17 @@ class Session:
         self.end()
         self._closed, self._starting = False, True
         try:
-            return self._begin(seed, options, generator, rounds)
+            return self._begin(seed, options, generator, kind)
         finally:
             self._starting = False
 
     def _begin(
-        self, seed: int | None, options: dict[str, Any] | None, generator: np.random.Generator, rounds: bool
-    ) -> Episode:
+        self,
+        seed: int | None,
+        options: dict[str, Any] | None,
+        generator: np.random.Generator,
+        kind: type[AnyEpisode],
+    ) -> AnyEpisode:
         self._hold_sites()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
@@ -93,8 +97,8 @@ class Session:
         except BaseException as error:
             error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
-        begin: Any = partial(SurroundedEpisode, surroundings=self._surroundings) if self._surroundings else Episode
-        episode: Episode = begin(self.plan, self.simulation, self.seed, rounds=rounds)
+        begin: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
+        episode: AnyEpisode = begin(self.plan, self.simulation, self.seed)
         self._episode = episode
         return episode
 

@@ -92,6 +92,10 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
     assert space.dtype is not None
     if space.dtype.kind in "iu" and array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ObservationError(f"the observation {value!r} is not finite, which {space.dtype} cannot hold")
+    if space.dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, space.dtype):
+        limits = np.iinfo(space.dtype)
+        if array.min() < limits.min or array.max() > limits.max:
+            raise ObservationError(f"the observation {value!r} has numbers that {space.dtype} cannot hold")
     return array.astype(space.dtype, copy=True)
 
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Any
 
 from ._driver import Surrounding, attended, unattended
 from ._episode import Episode
 from ._plan import Plan
+from ._rounds import Rounds
 
 
 class Surroundings:
@@ -58,15 +60,13 @@ class Surroundings:
         return run
 
 
-class SurroundedEpisode(Episode):
-    """An episode of a simulation that has surroundings."""
+class Surrounded(Episode):
+    """An episode of a simulation that has surroundings, played in turns or in rounds."""
 
-    def __init__(
-        self, plan: Plan, simulation: Any, seed: int | None, *, surroundings: Surroundings, rounds: bool = False
-    ) -> None:
+    def __init__(self, plan: Plan, simulation: Any, seed: int | None, surroundings: Surroundings) -> None:
         """Begin an episode, as ``Episode`` does."""
         self._surroundings = surroundings
-        super().__init__(plan, simulation, seed, rounds=rounds)
+        super().__init__(plan, simulation, seed)
         clock = self.clock
         if clock is not None:
             self.clock = lambda: self._tell(clock)
@@ -93,11 +93,20 @@ class SurroundedEpisode(Episode):
         surroundings = self._surroundings
         surroundings.enter()
         try:
-            Episode.turn(self, action)
+            super().turn(action)
         finally:
             surroundings.leave()
 
+
+class SurroundedRounds(Surrounded, Rounds):
+    """The same in rounds."""
+
     def play(self, actions: Mapping[str, Any]) -> None:
-        """Answer the decisions of a round, as ``Episode.play`` does."""
+        """Answer the decisions of a round, as ``Rounds.play`` does."""
         with self._surroundings.entered():
-            Episode.play(self, actions)
+            super().play(actions)
+
+
+def surrounded(kind: type[Episode], surroundings: Surroundings) -> Callable[..., Episode]:
+    """What begins an episode that is played like those of a kind, in surroundings."""
+    return partial(SurroundedRounds if issubclass(kind, Rounds) else Surrounded, surroundings=surroundings)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ._episode import Episode
 from ._plan import Plan
 from ._session import Session, checked_seed
 
@@ -36,13 +37,10 @@ def simulate(
         SimEnvError: Something in it cannot work; the leaf says what.
         BaseException: Whatever the model, a mapping or a policy raises.
     """
-    if points is None and not hasattr(simulation, "points"):
-        names = [key for key in policies or {} if isinstance(key, str) and "." not in key]
-        points = None if names else ()  # agents are to be found among all points; points name themselves
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
     session = Session(plan)
     try:
-        session.start(checked_seed(seed), None, np.random.default_rng())
+        session.start(checked_seed(seed), None, np.random.default_rng(), Episode)
         return session.simulation
     finally:
         session.close()

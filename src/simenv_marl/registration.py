@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from dataclasses import dataclass
 from typing import Any
@@ -58,10 +59,8 @@ def register_simulation(
     _RECIPES[where["recipe"]] = _Recipe(simulation, points, options, flatten, [b.point.name for b in plan.active])
     made: list[str] = []
     named = [binding.point.name for binding in plan.active if binding.agent is not None]
-    functions = [point.rpartition(".")[2] for point in named]
-    for point, function in zip(named, functions, strict=True):
-        parts = [function] if functions.count(function) == 1 else point.split(".")[-2:]
-        made.append(f"{name}/{''.join(map(_camel, parts))}-v{version}")
+    for point, title in zip(named, _titles(named), strict=True):
+        made.append(f"{name}/{title}-v{version}")
         _register_gymnasium(made[-1], "make_single", **where, point=point)
     made.append(f"{name}/Joint-v{version}")
     _register_gymnasium(made[-1], "make_joint", **where)
@@ -74,8 +73,20 @@ def register_simulation(
     return made
 
 
-def _camel(name: str) -> str:
-    return "".join(part[:1].upper() + part[1:] for part in name.split("_"))
+def _titles(points: list[str]) -> list[str]:
+    """What decision points are called in ids: the function's name, with its class where that alone is taken."""
+    whole = [re.sub(r"[^\w.]", "", point) for point in points]
+    styles = [[_camel(point, 1) for point in points], [_camel(point, 2) for point in points], whole]
+    return [
+        next(style[number] for style in styles if [*style, "Joint"].count(style[number]) == 1)
+        for number in range(len(points))
+    ]
+
+
+def _camel(point: str, parts: int) -> str:
+    """The last parts of a dotted name in CamelCase."""
+    words = [word for part in point.split(".")[-parts:] for word in part.split("_")]
+    return "".join(word[:1].upper() + word[1:] for word in words)
 
 
 def _register_gymnasium(identity: str, maker: str, **kwargs: Any) -> None:

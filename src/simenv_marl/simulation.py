@@ -44,6 +44,8 @@ class SimulationInterface(ABC):
       name, a decision function, a list of these, or a dict from these to definitions).
     - ``expected_calls(self, point)``: the argument tuples with which the decision point of that dotted
       name is going to be called, so that agents can be observed before their first decision.
+    - ``time(self)``: its clock, from which ``info["time"]`` and ``info["elapsed"]`` come.
+    - ``state(self)``: all that a centralised critic may see, as an array.
     - ``render(self, mode)``: a picture of the present state, for a ``mode`` out of ``render_modes``.
     """
 

@@ -13,7 +13,7 @@ from gymnasium.utils import seeding
 
 from .._episode import Episode
 from .._plan import Binding, Plan
-from .._session import Session, checked_seed, seed_space
+from .._session import AnyEpisode, Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast
 from ..errors import CopyError, UnknownAgentError, UnknownOptionError
 from ..plugins import Entry
@@ -44,6 +44,7 @@ class View:
         self._episode: Episode | None = None
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
+        self._shows = self.render_mode == "human"  # after every reset and step, without being asked to
 
     @staticmethod
     def check(plan: Plan) -> None:
@@ -93,7 +94,10 @@ class View:
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 
     def render(self) -> Any:
-        """Render the simulation in ``render_mode``; without one, None and a warning."""
+        """Render the simulation in ``render_mode``; without one, None and a warning.
+
+        In the mode "human" every ``reset`` and ``step`` does so by itself.
+        """
         return self._session.render()
 
     def close(self) -> None:
@@ -151,13 +155,13 @@ class AgentsView(View):
         self._observation_spaces: dict[str, spaces.Space[Any]] = {}
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
 
-    def _start(self, seed: int | None, options: dict[str, Any] | None, *, rounds: bool) -> Episode:
+    def _start(self, seed: int | None, options: dict[str, Any] | None, kind: type[AnyEpisode]) -> AnyEpisode:
         """End the episode that runs, begin another, and seed the agents' spaces."""
         seed = checked_seed(seed)
         self._make_way()
         if seed is not None or self._generator is None:
             self._generator, _ = seeding.np_random(seed)
-        episode = self._session.start(seed, options, self._generator, rounds=rounds)
+        episode = self._session.start(seed, options, self._generator, kind)
         if not self._plan.complete:  # names that may never come again
             self._observation_spaces, self._action_spaces = {}, {}
         elif seed is not None:

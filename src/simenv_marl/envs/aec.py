@@ -56,8 +56,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = episode = self._start(seed, options, rounds=False)
+        self._episode = episode = self._start(seed, options, Episode)
         self._enter(episode)
+        if self._shows:
+            self.render()
 
     def step(self, action: Any) -> None:
         """Answer the decision of ``agent_selection`` and run to the next one.
@@ -91,6 +93,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             self._enter(episode)
         else:
             self._select(record)
+        if self._shows:
+            self.render()
 
     def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """What ``agent_selection`` needs to decide.

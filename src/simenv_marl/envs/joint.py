@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .._plan import Plan
+from .._rounds import Rounds
 from .._session import checked_seed, seed_space
 from .._spaces import blank, duplicate
 from ..errors import InvalidActionError, ViewError
@@ -30,6 +31,8 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             ``Box`` of all of them, one behind the other (the paper's two-dimensional action space).
     """
 
+    _episode: Rounds | None
+
     def __init__(self, plan: Plan) -> None:
         """Make the environment of a plan.
 
@@ -40,7 +43,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
         super().__init__(plan)
         roster = dict(plan.roster)
         if not plan.complete:
-            with_seed = self._session.start(0, None, np.random.default_rng(0), rounds=True)
+            with_seed = self._session.start(0, None, np.random.default_rng(0), Rounds)
             roster = {agent: record.binding for agent, record in with_seed.agents.items()}
             self._session.close()
             self._plan = self._session.plan = plan.declared(roster)
@@ -78,11 +81,13 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
         seed = checked_seed(seed)
         self._make_way()
         gym.Env.reset(self, seed=seed)
-        self._episode = self._session.start(seed, options, self.np_random, rounds=True)
+        self._episode = self._session.start(seed, options, self.np_random, Rounds)
         if seed is not None:
             seed_space(self.observation_space, seed, "joint")
             seed_space(self.action_space, seed, "joint")
         self._time = None
+        if self._shows:
+            self.render()
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -111,6 +116,8 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
         reward = 0.0
         for record in (*episode.parting, *episode.agents.values()):
             reward += record.reward
+        if self._shows:
+            self.render()
         return self._observe(), reward, episode.terminated, episode.truncated, self._info()
 
     def _split(self, action: Any) -> Mapping[str, Any]:

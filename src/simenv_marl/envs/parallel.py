@@ -9,6 +9,7 @@ from pettingzoo import ParallelEnv
 
 from .._plan import Plan
 from .._record import Record
+from .._rounds import Rounds
 from .._spaces import blank, duplicate
 from ..simulation import Sentinel
 from ._view import AgentsView
@@ -26,6 +27,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     Attributes:
         agents: The live agents.
     """
+
+    _episode: Rounds | None
 
     def __init__(self, plan: Plan) -> None:
         """Make the environment of a plan.
@@ -53,8 +56,10 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = episode = self._start(seed, options, rounds=True)
+        self._episode = episode = self._start(seed, options, Rounds)
         self.agents = list(episode.agents)
+        if self._shows:
+            self.render()
         records = episode.agents.values()
         return (
             {record.agent: self._hand_out(record) for record in records},
@@ -96,15 +101,29 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         results: Results = {}, {}, {}, {}, {}
         observations, rewards, terminations, truncations, infos = results
         terminated, truncated, pending = episode.terminated, episode.truncated, episode.pending
-        for agent, record in (*((record.agent, record) for record in episode.parting), *episode.agents.items()):
-            ended, info = record.ended, record.info
+        for record in episode.parting:
+            agent = record.agent
             observations[agent] = self._hand_out(record)
             rewards[agent] = record.reward
-            terminations[agent] = ended or terminated
-            truncations[agent] = truncated and not ended
-            info["deciding"], info["acted"] = record is pending, record.acted
+            terminations[agent], truncations[agent] = True, False
+            infos[agent] = info = record.info
+            info["deciding"], info["acted"] = False, record.acted
+        for agent, record in episode.agents.items():
+            observation, info = record.observation, record.info
+            if observation is None or record.handed_out is observation:
+                observation = self._hand_out(record)
+            else:
+                record.handed_out = observation
+            observations[agent] = observation
+            rewards[agent] = record.reward
+            terminations[agent], truncations[agent] = terminated, truncated
+            info["deciding"], info["acted"] = False, record.acted
             infos[agent] = info
+        if pending is not None:
+            pending.info["deciding"] = True
         self.agents = [] if episode.over else list(episode.agents)
+        if self._shows:
+            self.render()
         return results
 
     def _clear(self) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
 from .._session import checked_seed, seed_space
@@ -73,11 +74,13 @@ class SimulationEnv(View, gym.Env[Any, Any]):
         seed = checked_seed(seed)
         self._make_way()
         gym.Env.reset(self, seed=seed)
-        self._episode = episode = self._session.start(seed, options, self.np_random)
+        self._episode = episode = self._session.start(seed, options, self.np_random, Episode)
         if seed is not None:
             seed_space(self.observation_space, seed, self._agent)
             seed_space(self.action_space, seed, self._agent)
         self._record = record = episode.agents[self._agent]
+        if self._shows:
+            self.render()
         return record.observation, record.info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -98,6 +101,8 @@ class SimulationEnv(View, gym.Env[Any, Any]):
         if episode is None:
             raise self._session.not_running()
         episode.turn(action)
+        if self._shows:
+            self.render()
         record: Record = self._record
         return (
             record.observation,

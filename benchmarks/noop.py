@@ -1,0 +1,119 @@
+"""Simulations that do nothing, so that the machinery is all that remains; and loops over environments of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE, State
+from benchmarks.measure import Contender, timed
+from simenv_marl import make_step
+
+DEFINITION: dict[str, Any] = {
+    "observation_space": OBSERVATION_SPACE,
+    "observation_space_mapping": lambda entity: entity.observe(),
+    "action_space": ACTION_SPACE,
+    "action_space_mapping": lambda action: action,
+    "reward_mapping": lambda entity: 1.0,
+}
+
+
+class Model(State):
+    """Two decisions that change nothing."""
+
+    @make_step(**DEFINITION, agent="agent_0")
+    def left(self) -> int:
+        return 0
+
+    @make_step(**DEFINITION, agent="agent_1")
+    def right(self) -> int:
+        return 0
+
+
+class Turns:
+    """Two agents, turn by turn, without an end."""
+
+    def reset(self) -> None:
+        self.model = Model()
+
+    def run(self) -> None:
+        model = self.model
+        while True:
+            model.left()
+            model.right()
+
+
+class Alone(Turns):
+    """One agent, without an end."""
+
+    def run(self) -> None:
+        model = self.model
+        while True:
+            model.left()
+
+
+class Entity(State):
+    """One of many, an agent of its own."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.name = f"entity_{number}"
+
+    @make_step(**DEFINITION, agent=lambda entity: entity.name)
+    def decide(self) -> int:
+        return 0
+
+
+class Crowd:
+    """Many agents, round after round; without an end, or for one round."""
+
+    def __init__(self, size: int, rounds: int | None = None) -> None:
+        self.size, self.rounds = size, rounds
+
+    def reset(self) -> None:
+        self.entities = [Entity(number) for number in range(self.size)]
+
+    def names(self) -> list[str]:
+        """The names of all agents, in the order in which they decide."""
+        return [f"entity_{number}" for number in range(self.size)]
+
+    def run(self) -> None:
+        done = 0
+        while done != self.rounds:
+            for entity in self.entities:
+                entity.decide()
+            done += 1
+
+
+class ForetoldCrowd(Crowd):
+    """The same, and it knows who is going to decide."""
+
+    def expected_calls(self, point: str) -> list[tuple[Entity]]:
+        return [(entity,) for entity in self.entities]
+
+
+# -- contenders -----------------------------------------------------------------------------------
+
+
+def aec(env: Any, number: int) -> Contender:
+    """``last`` and ``step`` of an AEC environment that does not end."""
+    env.reset(seed=0)
+
+    def loop(number: int) -> None:
+        last, step = env.last, env.step
+        for _ in range(number):
+            last()
+            step(1)
+
+    return timed(loop, number)
+
+
+def single(env: Any, number: int) -> Contender:
+    """``step`` of a Gymnasium environment that does not end."""
+    env.reset(seed=0)
+
+    def loop(number: int) -> None:
+        step = env.step
+        for _ in range(number):
+            step(1)
+
+    return timed(loop, number)

@@ -1,0 +1,233 @@
+"""What a model of somebody else keeps of its speed: Mesa's wolves and sheep, as they come.
+
+With ``RULE`` throughout, so that what runs is the same simulation as without an environment, tick for tick.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from greenlet import getcurrent, greenlet
+from gymnasium import spaces
+from mesa.examples.advanced.wolf_sheep.agents import Sheep, Wolf
+from mesa.examples.advanced.wolf_sheep.model import WolfSheep
+from mesa.experimental.devs import ABMSimulator
+from numpy.typing import NDArray
+
+from benchmarks.measure import Contender, Section, ratio, side_by_side
+from simenv_marl import RULE, TRUNCATED, Definition, SimulationInterface, aec_env, make_step, parallel_env
+
+SEED = 5
+TICKS = 25
+KINDS: dict[str, Any] = {"wolf": Wolf, "sheep": Sheep}
+
+
+class Meadow(SimulationInterface):
+    """The model for so many ticks.
+
+    Attributes:
+        counts: How many wolves and sheep there were after each tick.
+    """
+
+    def reset(self, seed: int | None = None) -> None:
+        self.simulator = ABMSimulator()
+        self.model = WolfSheep(simulator=self.simulator, seed=seed)
+        self.counts: list[tuple[int, int]] = []
+
+    def run(self) -> Any:
+        for _ in range(TICKS):
+            self.simulator.run_for(1)
+            living = self.model.agents_by_type
+            self.counts.append((len(living[Wolf]), len(living[Sheep])))
+        return TRUNCATED
+
+    def expected_calls(self, point: str) -> list[tuple[Any]]:
+        living = self.model.agents_by_type
+        return [(animal,) for kind in KINDS.values() if point == name_of(kind) for animal in living.get(kind, ())]
+
+    def outcome(self) -> Any:
+        """All that the decisions of a run have led to."""
+        animals = [
+            (animal.unique_id, animal.energy, animal.cell.coordinate)
+            for kind in KINDS.values()
+            for animal in self.model.agents_by_type.get(kind, ())
+        ]
+        return self.counts, animals, self.model.random.getstate()
+
+
+def name_of(kind: type) -> str:
+    """The name of a kind's decision point."""
+    return f"{kind.__module__}.{kind.__qualname__}.move"
+
+
+def observe(animal: Any) -> NDArray[np.float32]:
+    return np.array((animal.energy, animal.p_reproduce), np.float32)
+
+
+def reward(animal: Any) -> float:
+    return float(animal.energy)
+
+
+def move(action: int, animal: Any) -> None:
+    cells = list(animal.cell.neighborhood)
+    animal.cell = cells[action % len(cells)]
+
+
+def definition(word: str) -> Definition:
+    return make_step(
+        observation_space=spaces.Box(-np.inf, np.inf, (2,), np.float32),
+        observation_space_mapping=observe,
+        action_space=spaces.Discrete(4),
+        apply=move,
+        reward_mapping=reward,
+        agent=lambda animal: f"{word}_{animal.unique_id}",
+        removed_by="mesa.agent.Agent.remove",
+    )
+
+
+POINTS = {name_of(kind): definition(word) for word, kind in KINDS.items()}
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure in so many rounds, of an episode each."""
+    expected, ticks, _ = plain()
+    _, decisions, _ = crossing()
+
+    def contender(run: Callable[[], tuple[Any, int, float]], count: int) -> Contender:
+        def checked() -> float:
+            outcome, counted, seconds = run()
+            assert outcome == expected
+            assert counted == count
+            gc.collect()  # the model's cycles, which nobody collects meanwhile
+            return seconds / decisions * 1e6
+
+        return checked
+
+    times = side_by_side(
+        {
+            "plain": contender(plain, ticks),
+            "AEC": contender(aec, decisions),
+            "AEC, without last": contender(lambda: aec(look=False), decisions),
+            "parallel": contender(parallel, ticks),
+            "only the crossing": contender(crossing, decisions),
+            "the crossing and the mappings": contender(lambda: crossing(mappings=True), decisions),
+        },
+        rounds,
+    )
+    section = Section(
+        "Mesa's WolfSheep, unmodified, RULE throughout", "microseconds per decision, the model's included"
+    )
+    section.ratio("AEC: speed / the plain model's", ratio(times, "plain", "AEC"), bar=0.7, aim=0.8)
+    section.ratio("AEC without last(), whose results RULE does not need", ratio(times, "plain", "AEC, without last"))
+    section.ratio(
+        "parallel with expected_calls: speed / the plain model's", ratio(times, "plain", "parallel"), 0.6, 0.75
+    )
+    section.ratio(
+        "the least that suspends and resumes each decision, a bare greenlet: speed / the plain model's",
+        ratio(times, "plain", "only the crossing"),
+    )
+    section.ratio(
+        "the same with agents named, rewarded and observed: speed / the plain model's",
+        ratio(times, "plain", "the crossing and the mappings"),
+    )
+    for view in ("AEC", "parallel"):
+        section.ratio(
+            f"{view}: speed / that of the crossing and the mappings",
+            ratio(times, "the crossing and the mappings", view),
+        )
+    section.times(times)
+    section.remarks.append(
+        f"{ticks} ticks with {decisions:,} decisions; every run ends with the same animals in the same places and"
+        f" the same state of the generator, and the parallel one takes {ticks} steps."
+    )
+    return section
+
+
+# -- runs: each returns the outcome, how many decisions, steps or ticks it took, and seconds -------------------
+
+
+def plain() -> tuple[Any, int, float]:
+    """The model by itself."""
+    simulation = Meadow()
+    simulation.reset(SEED)
+    started = time.perf_counter()
+    simulation.run()
+    seconds = time.perf_counter() - started
+    return simulation.outcome(), len(simulation.counts), seconds
+
+
+def aec(*, look: bool = True) -> tuple[Any, int, float]:
+    """An AEC environment, in the loop of PettingZoo's documentation or in the shortest one."""
+    env: Any = aec_env(Meadow, POINTS)
+    env.reset(seed=SEED)
+    decisions = 0
+    last, step = env.last, env.step
+    started = time.perf_counter()
+    for agent in env.agent_iter():
+        if look:
+            _, _, terminated, truncated, _ = last()
+            over = terminated or truncated
+        else:
+            over = env.terminations[agent] or env.truncations[agent]
+        if over:
+            step(None)
+        else:
+            step(RULE)
+            decisions += 1
+    seconds = time.perf_counter() - started
+    env.close()
+    return env.simulation.outcome(), decisions, seconds
+
+
+def parallel() -> tuple[Any, int, float]:
+    """A parallel environment, all actions at once."""
+    env: Any = parallel_env(Meadow, POINTS)
+    env.reset(seed=SEED)
+    steps = 0
+    started = time.perf_counter()
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, RULE))
+        steps += 1
+    seconds = time.perf_counter() - started
+    env.close()
+    return env.simulation.outcome(), steps, seconds
+
+
+def crossing(*, mappings: bool = False) -> tuple[Any, int, float]:
+    """No environment: each decision is suspended and resumed, and does nothing else but, on demand, the mappings."""
+    simulation = Meadow()
+    simulation.reset(SEED)
+    rules = {kind: kind.move for kind in KINDS.values()}
+    out = getcurrent().switch
+
+    def suspended(rule: Callable[[Any], None], word: str) -> Callable[[Any], None]:
+        def decide(animal: Any) -> None:
+            out((word, animal))
+            rule(animal)
+
+        return decide
+
+    for word, kind in KINDS.items():
+        kind.move = suspended(rules[kind], word)
+    inside = greenlet(simulation.run)
+    decisions = 0
+    try:
+        started = time.perf_counter()
+        asked = inside.switch()
+        while asked is not TRUNCATED:
+            decisions += 1
+            if mappings:
+                word, animal = asked
+                f"{word}_{animal.unique_id}"
+                reward(animal)
+                observe(animal)
+            asked = inside.switch()
+        seconds = time.perf_counter() - started
+    finally:
+        for kind, rule in rules.items():
+            kind.move = rule
+    return simulation.outcome(), decisions, seconds

@@ -20,6 +20,7 @@ from simenv_marl import (
     PatchError,
     SimEnvError,
     UnknownTargetError,
+    aec_env,
     attach_handler,
     attached_handlers,
     decision_points,
@@ -32,7 +33,7 @@ from simenv_marl import (
 
 from .foreign import market, shop
 from .foreign.market import Broker, Cautious, Dealer, Junior, Trader
-from .models import define, notes
+from .models import calling, define, notes, play
 
 MARKET = "tests.foreign.market"
 HERE = __name__
@@ -549,6 +550,12 @@ def test_modules_that_are_imported_meanwhile_are_restored_too():
         del sys.modules["late_shop"]
 
 
+def test_what_was_exposed_inside_a_function_has_its_name_all_the_same():
+    first, function = local(), local()
+    with handlers((lambda value, more=0: 9, f"{HERE}.local.<locals>.function", "instead")):
+        assert (first(1), function(1)) == (1, 9)
+
+
 def test_builtins_can_be_exposed_as_themselves():
     length = expose_to_plugins(len)
     with handlers((lambda thing, **kwargs: ChangedResult(kwargs["_result"] + 1), length, "after")):
@@ -1043,6 +1050,26 @@ def test_handlers_lie_outside_whichever_decorator_came_first(order):
         assert decided(1) == 2
     assert decided(1) == 1
     assert inspect.unwrap(decided) is choose
+
+
+def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside():
+    original = vars(Trader)["bid"]
+    log = []
+    try:
+        with handlers((lambda *args, **kwargs: log.append(1), f"{MARKET}.Trader.bid", "before")):
+            Trader.bid = define()(Trader.bid)
+            assert Trader().bid("tea") == 5
+        with handlers(
+            (lambda *args, **kwargs: log.append(2), f"{MARKET}.Trader.bid", "before"),
+            (lambda *args, **kwargs: log.append(3), Trader.bid, "before"),
+        ):
+            env = aec_env(calling(lambda: Trader().bid("tea")), Trader.bid)
+            play(env, 4)
+            assert env.unwrapped.simulation.log == [4]
+            env.close()
+        assert log == [1, 2, 3]
+    finally:
+        Trader.bid = original
 
 
 # -- copies ---------------------------------------------------------------------------------------

@@ -196,7 +196,13 @@ def find_target(target: Any) -> Target:
         PatchError: It is not exposed, and cannot be patched.
     """
     if isinstance(target, str):
-        owner, attribute = resolve(target, TARGET)
+        try:
+            owner, attribute = resolve(target, TARGET)
+        except (UnknownTargetError, PatchError):
+            named = [other for other in Target.all if other.name == target and other.place is None]
+            if not named:
+                raise
+            return max(named, key=lambda other: other.number)  # exposed inside a function, under the latest's name
         return _look_at(target, owner, attribute)
     if isinstance(target, type):
         return _class_target(target)

@@ -537,6 +537,34 @@ def test_an_exposed_function_of_a_module_is_extended_where_others_had_imported_i
         market.price = before
 
 
+def test_an_exposed_function_outlives_its_place():
+    before = market.price
+    market.price = exposed = expose_to_plugins(market.price)
+    try:
+        with handlers((lambda good, *, rebate=0: 1, exposed, "instead")):
+            assert shop.total("tea") == 1
+    finally:
+        market.price = before
+    with handlers((lambda good, *, rebate=0: 1, exposed, "instead")):
+        assert (exposed("tea"), shop.total("tea")) == (1, 10)
+    with handlers((lambda good, *, rebate=0: 1, f"{MARKET}.price", "instead")):
+        assert (exposed("tea"), shop.total("tea")) == (10, 1)
+
+
+@pytest.mark.parametrize("parameter", ["found", "rule", "args", "self", "SLOT"])
+def test_parameters_may_have_any_name(parameter):
+    scope = {"expose_to_plugins": expose_to_plugins}
+    exec(
+        f"class Model:\n    @staticmethod\n    @expose_to_plugins\n    def function({parameter}): return {parameter}",
+        scope,
+    )
+    function, log = scope["Model"].function, []
+    for attached in ([], [(lambda *args, **kwargs: log.append(1), function, "before")]):
+        with handlers(*attached):
+            assert function(3) == function(**{parameter: 4}) - 1 == 3
+    assert log == [1, 1]
+
+
 def test_modules_that_are_imported_meanwhile_are_restored_too():
     before = market.price
     late = types.ModuleType("late_shop")

@@ -360,6 +360,64 @@ def test_nested_environments_have_each_their_own():
     inner.close()
 
 
+def test_a_class_of_environments_outlives_the_exposing_of_a_target():
+    made = generate_env(House, House.water, plugins=[says("mine")])
+    before = House.word
+    House.word = expose_to_plugins(House.word)
+    try:
+        env = made()
+        env.reset()
+        assert set(env.unwrapped.simulation.log) == {"mine"}
+    finally:
+        House.word = before
+    env.step(1)
+    assert env.unwrapped.simulation.log[-2:] == ["plain", "plain"]
+    env.close()
+    assert House.word is before
+
+
+def test_the_simulations_own_methods_can_be_extended():
+    def run(self):
+        self.log += [choose(), choose()]
+        return simenv_marl.TRUNCATED
+
+    choose = decision()
+    plugins = [
+        (run, f"{HERE}.House.run", "instead"),
+        (lambda self, seed=None: ChangedArgs(self, seed=77), f"{HERE}.House.reset", "before"),
+        (lambda self, seed=None: self.log.append(seed), f"{HERE}.House.reset", "after"),
+    ]
+    env = aec_env(House, choose, plugins=plugins)
+    turns = play(env, 3)
+    assert env.unwrapped.simulation.log == ["plain", 77, 3, 3]
+    assert turns[-1].truncated
+    env.close()
+
+
+def test_iterables_of_a_copied_simulation_have_their_plugins():
+    class Shelf:
+        def __init__(self):
+            self.items = expose_to_plugins([1, 2])
+
+        def reset(self):
+            self.log = []
+
+        def run(self):
+            for item in self.items:
+                self.log.append((item, choose()))
+
+    choose, shelf = decision(), Shelf()
+    five = [(lambda items, _result: ChangedResult(_result * 5), shelf.items, "after_next")]
+    env, plain = aec_env(shelf, choose, plugins=five), aec_env(shelf, choose)
+    for each in (env, plain):
+        each.reset()
+    for action in (7, 8):
+        for each in (env, plain):
+            each.step(action)
+    assert env.unwrapped.simulation.log == [(5, 7), (10, 8)]
+    assert plain.unwrapped.simulation.log == [(1, 7), (2, 8)]
+
+
 # -- decisions in plugins -------------------------------------------------------------------------
 
 

@@ -108,8 +108,10 @@ def generate(
     parameters = list(signature.parameters.values()) if signature is not None else []
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
-    if alone and positional[0].name not in {*namespace, *_TAKEN}:
-        names = [positional[0].name]  # by which a staticmethod's may be passed all the same
+    # Under its own name, by which it may be passed all the same where a staticmethod looks like a method.
+    alone = alone and positional[0].name not in {*namespace, *_TAKEN}
+    if alone:
+        names = [positional[0].name]
     call = _CALL[kind].format
     values = {
         "define": "async def" if kind == "coroutine" else "def",

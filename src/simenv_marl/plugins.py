@@ -236,6 +236,7 @@ def _at_hand(target: Target) -> Target:
 def _everywhere(target: Target) -> Target:
     """See to it that an exposed function of a module is found where others had imported it before."""
     if target.place is None and not target.slot and isinstance(target, FunctionTarget):
+        target.patches = []
         owner: Any = None
         with suppress(SimEnvError, ImportError):
             owner, attribute = resolve(target.name, TARGET)

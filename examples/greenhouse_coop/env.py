@@ -112,19 +112,19 @@ def reward(greenhouse: Greenhouse) -> float:
     return greenhouse.alive / len(greenhouse.pots) - float(_water_since(greenhouse)) / 1000
 
 
-def _fraction(action: Any) -> float:
+def to_fraction(action: Any) -> float:
     """The action as a python number, which keeps NumPy's slower ones out of the model."""
     return min(max(float(action.item() if isinstance(action, np.ndarray) else action), 0.0), 1.0)
 
 
 def to_litres(action: Any) -> float:
     """What the waterer's action decides: litres to pour."""
-    return MOST_WATER * _fraction(action)
+    return MOST_WATER * to_fraction(action)
 
 
 def exchange_air(action: Any, greenhouse: Greenhouse) -> None:
     """What the ventilator's action does in place of the model's fixed 20 %: exchange that fraction of the air."""
-    fraction = _fraction(action)
+    fraction = to_fraction(action)
     greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
 
 

@@ -13,8 +13,10 @@ The layers, each importing only from those above it::
     _iterables    iterables whose items are handed out with handlers
     plugins       handlers for everybody, for a while, for one environment; traces
     _points       what ``points=`` names
+    variants      a model with all that an experiment changes, under one name
     _plan         what an environment is made of, checked before anything runs
     _record       what an episode knows of one agent; rewards and observations
+    _provenance   what an environment was made of, for results files
     _episode      what happens when: decisions, rewards, observations, ends, errors
     _rounds       the same in rounds, in which all agents may act
     _surroundings what an environment's simulation finds around it whenever it is at work
@@ -26,6 +28,7 @@ The layers, each importing only from those above it::
 
 from . import errors
 from ._handlers import Call, ChangedArgs, ChangedResult
+from ._provenance import provenance
 from .decision import Definition, difference, make_step
 from .envs import (
     SimulationAECEnv,
@@ -52,6 +55,7 @@ from .plugins import (
 from .policies import simulate
 from .registration import register_simulation
 from .simulation import RULE, TRUNCATED, SimulationInterface
+from .variants import Variant
 
 __version__ = "0.1.0"
 
@@ -67,6 +71,7 @@ __all__ = [
     "SimulationInterface",
     "SimulationJointEnv",
     "SimulationParallelEnv",
+    "Variant",
     "aec_env",
     "attach_handler",
     "attached_handlers",
@@ -80,6 +85,7 @@ __all__ = [
     "joint_env",
     "make_step",
     "parallel_env",
+    "provenance",
     "register_simulation",
     "remove_handler",
     "simulate",

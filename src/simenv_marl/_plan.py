@@ -34,6 +34,7 @@ from .errors import (
 )
 from .plugins import Plugged, Plugins
 from .simulation import RULE, make_simulation
+from .variants import Variant
 
 RENDER_MODES = ("ansi", "human", "rgb_array")
 """What a simulation with a method ``render`` is taken to render, unless it has ``render_modes``."""
@@ -318,6 +319,7 @@ class Plan:
 
     Attributes:
         source: Of what its simulation is made.
+        variant: The variant that it is made of; None if it is of none.
         options: Its options.
         render_modes: What its simulation can be rendered as.
         bindings: The decision points that do not run their rule, with all that is known of them.
@@ -338,8 +340,10 @@ class Plan:
         *,
         unanswered: bool = False,
         spare: list[Any] | None = None,
+        variant: Variant | None = None,
     ) -> None:
         self.source, self.options, self._named = source, options, named
+        self.variant = variant
         self._spare = [] if spare is None else spare  # the simulation that was looked at, until an environment takes it
         self.render_modes = render_modes
         if options.render_mode is not None and options.render_mode not in render_modes:
@@ -405,7 +409,7 @@ class Plan:
         """Make a plan of what users say.
 
         Args:
-            source: A simulation, its class or a factory.
+            source: A simulation, its class, a factory, or a variant.
             points: The active decision points, as ``generate_env`` takes them.
             options: The options, by name.
             unanswered: Whether there is no environment's user.
@@ -413,6 +417,9 @@ class Plan:
         Raises:
             SimEnvError: Something in them cannot work; the leaf says what.
         """
+        variant = source if isinstance(source, Variant) else None
+        if variant is not None:
+            source, points, options = variant.applied(points, options)
         checked = Options().amended(options)
         model, spare = source, []
         plain_factory = not isinstance(source, type) and not hasattr(source, "run")
@@ -422,7 +429,7 @@ class Plan:
             spare.append(model)
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
         named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
-        return cls(source, named, checked, list(modes), unanswered=unanswered, spare=spare)
+        return cls(source, named, checked, list(modes), unanswered=unanswered, spare=spare, variant=variant)
 
     def make_simulation(self) -> Any:
         """Make a simulation for one environment.
@@ -440,7 +447,7 @@ class Plan:
     def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
         """The same plan, with another definition of a point."""
         named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
-        return Plan(self.source, named, self.options, self.render_modes, spare=self._spare)
+        return self._like(named, self.options)
 
     def declared(self, roster: Mapping[str, Binding]) -> Plan:
         """The same plan, with a roster of agents that has been found out."""
@@ -458,14 +465,24 @@ class Plan:
     @property
     def name(self) -> str:
         """What the simulation is called: the name of its class or factory."""
+        return str(self.maker.__name__)
+
+    @property
+    def maker(self) -> Any:
+        """The class or factory of the simulation."""
         source = self.source
-        return getattr(source, "__name__", None) or type(source).__name__
+        while isinstance(source, partial):
+            source = source.func
+        return source if hasattr(source, "__qualname__") else type(source)
 
     def amended(self, options: Mapping[str, Any]) -> Plan:
         """The same plan, but for the options that are given."""
         if not options:
             return self
-        return Plan(self.source, self._named, self.options.amended(options), self.render_modes, spare=self._spare)
+        return self._like(self._named, self.options.amended(options))
+
+    def _like(self, named: list[NamedPoint], options: Options) -> Plan:
+        return Plan(self.source, named, options, self.render_modes, spare=self._spare, variant=self.variant)
 
 
 def _names_agents(policies: Mapping[Any, Any] | None) -> bool:
@@ -540,6 +557,8 @@ def _assign(
             try:
                 point = find_point(key)
             except SimEnvError as error:
+                if policy is RULE and isinstance(error, DefinitionError):
+                    continue  # nobody decides there anyway
                 if isinstance(key, str) and isinstance(error, UnknownPointError) and None in agents:
                     by_agent[key] = policy  # an agent that a callable may name
                     continue

@@ -23,7 +23,7 @@ def simulate(
     """Run a simulation's own loop to its end, with policies answering and all else on its rule.
 
     Args:
-        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         policies: Who decides: from agent or decision point to a callable of the observation, or of the
             observation and the info, that returns an action.
         points: The decision points, as ``generate_env`` takes them. None and no policies: none.

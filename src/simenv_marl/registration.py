@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -13,8 +13,9 @@ import pettingzoo
 
 from ._plan import Plan
 from .envs import aec_env, joint_env, parallel_env, single_env
-from .errors import UnknownPointError
+from .errors import OptionValueError, UnknownPointError
 from .simulation import RULE
+from .variants import Variant
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ _RECIPES: dict[str, _Recipe] = {}
 
 
 def register_simulation(
-    simulation: Any, points: Any = None, *, name: str, version: int = 0, **options: Any
+    simulation: Any, points: Any = None, *, name: str | None = None, version: int = 0, **options: Any
 ) -> list[str]:
     """Register the environments of a simulation.
 
@@ -41,9 +42,9 @@ def register_simulation(
     that ``gymnasium.make("module:name/Joint-v0")`` finds it.
 
     Args:
-        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The decision points, as ``generate_env`` takes them.
-        name: The namespace of the ids.
+        name: The namespace of the ids; None: the name of the variant, if the simulation is one.
         version: Their version.
         **options: As ``aec_env`` takes them.
 
@@ -53,7 +54,15 @@ def register_simulation(
     Raises:
         SimEnvError: Something in it cannot work; the leaf says what.
     """
+    if name is None:
+        if not isinstance(simulation, Variant):
+            raise OptionValueError("register_simulation needs a name= for the ids")
+        name = simulation.name
     flatten = options.pop("flatten", False)
+    if isinstance(simulation, Variant) and "flatten" in simulation.options:  # an option of the joint view alone
+        others = dict(simulation.options)
+        flatten = flatten or others.pop("flatten")
+        simulation = replace(simulation, options=others)
     plan = Plan.draw_up(simulation, points, options)
     where = {"recipe": f"{name}-v{version}", "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
     _RECIPES[where["recipe"]] = _Recipe(simulation, points, options, flatten, [b.point.name for b in plan.active])

@@ -54,7 +54,7 @@ def generate_env(simulation: Any, points: Any = None, *, view: str | None = None
     """Make an environment class of a simulation (paper, section 3.3).
 
     Args:
-        simulation: A simulation (which every environment copies), its class, or a zero-argument factory.
+        simulation: A simulation (which every environment copies), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points: a dotted name, a decision function, a list of these, or a dict
             from dotted name or function to its definition, which leaves the model undecorated. None: the
             simulation's attribute ``points``, else all decorated points of the one package that has any.
@@ -91,7 +91,7 @@ def aec_env(simulation: Any, points: Any = None, **options: Any) -> SimulationAE
     """Make a PettingZoo AEC environment, in which decision points are agents.
 
     Args:
-        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
         **options: ``driver``, ``max_steps``, ``policies``, ``possible_agents``, ``undeclared``,
             ``state_space``, ``render_mode``: see the page on options.
@@ -106,7 +106,7 @@ def parallel_env(simulation: Any, points: Any = None, **options: Any) -> Simulat
     """Make a PettingZoo parallel environment, in which decision points are agents.
 
     Args:
-        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
         **options: As ``aec_env`` takes them.
 
@@ -123,7 +123,7 @@ def single_env(simulation: Any, points: Any = None, **options: Any) -> Simulatio
     ``observation``, ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
 
     Args:
-        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
         **options: As ``aec_env`` takes them.
 
@@ -139,7 +139,7 @@ def joint_env(simulation: Any, points: Any = None, **options: Any) -> Simulation
     """Make a Gymnasium environment whose one agent takes all decisions.
 
     Args:
-        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
         **options: ``flatten=True`` for one vector in place of dicts; else as ``aec_env`` takes them.
 

@@ -13,6 +13,7 @@ from gymnasium.utils import seeding
 
 from .._episode import Episode
 from .._plan import Binding, Plan
+from .._provenance import describe
 from .._session import AnyEpisode, Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast
 from ..errors import CopyError, UnknownAgentError, UnknownOptionError
@@ -71,6 +72,14 @@ class View:
         """Of each handler of the option ``plugins``: the handler, the dotted name of its target, its position."""
         plugins = self._plan.plugins
         return [] if plugins is None else plugins.entries
+
+    def provenance(self) -> dict[str, Any]:
+        """What this environment is made of, and the seed of its latest episode, ready for ``json.dump``.
+
+        Returns:
+            What ``simenv_marl.provenance`` lists.
+        """
+        return describe(self._plan, self._session.seed)
 
     @property
     def state_space(self) -> spaces.Space[Any] | None:

@@ -1,20 +1,16 @@
 """What handlers cost those who have none, those whose neighbours have some, and those who have one.
 
-Run with ``python -m benchmarks.plugins``, best pinned to one core. Everything is compared to a plain call that
-does nothing.
+Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only plugins``. Everything is compared to
+a plain call that does nothing.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
-from contextlib import ExitStack
-from pathlib import Path
-from statistics import median
 from typing import Any
 
 from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE, State
-from benchmarks.measure import Contender, Report, ratio, side_by_side, timed
+from benchmarks.measure import Contender, Section, ratio, side_by_side, timed
 from simenv_marl import ChangedResult, expose_to_plugins, handlers, make_step, single_env
 
 DEFINITION: dict[str, Any] = {
@@ -95,75 +91,58 @@ def steps(env: Any, number: int) -> Contender:
     return timed(loop, number)
 
 
-CALLS = {
-    "plain": "a plain call",
-    "none": "exposed, no handlers",
-    "none_of": "exposed, no handlers, an argument (over a plain call with one)",
-    "others": "another environment has a handler",
-    "one_before": "one handler before",
-    "one_after": "one handler after, which asks for the result and changes it",
-    "one_instead": "one handler instead",
-    "decide": "a decision function outside any environment",
-    "decide_exposed": "the same, exposed",
-}
-
-
 def nothing(model: Model) -> None: ...
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=40)
-    parser.add_argument("--number", type=int, default=20_000)
-    parser.add_argument("--output", type=Path, help="where to write the tables, in Markdown")
-    asked = parser.parse_args()
-    model, report = Model(), Report("Plugins")
-    name = f"{__name__}.Model"
+def measure(rounds: int, number: int) -> Section:
+    """Measure in so many rounds, with so many calls of a contender in each."""
+    section, model = Section("Plugins", "microseconds per call, and per step"), Model()
     other = single_env(Model, Model.decide, plugins=[(nothing, Model.others, "before")])
-    with ExitStack() as stack:
-        stack.callback(other.close)
-        stack.enter_context(
-            handlers(
-                (nothing, Model.one_before, "before"),
-                (lambda model, _result: ChangedResult(None), Model.one_after, "after"),
-                (nothing, Model.one_instead, "instead"),
-            )
-        )
-        contenders = {case: calls(getattr(model, case), asked.number) for case in CALLS if case != "none_of"}
-        contenders["plain_of"] = calls(model.plain_of, asked.number, 1.0)
-        contenders["none_of"] = calls(model.none_of, asked.number, 1.0)
-        times = side_by_side(contenders, asked.rounds)
-    report.table(
-        "Calls of functions that do nothing",
-        ["call", "us", "plain calls"],
-        [
-            [
-                text,
-                f"{median(times[case]):.3f}",
-                f"{ratio(times, case, 'plain_of' if case == 'none_of' else 'plain'):.2f}",
-            ]
-            for case, text in CALLS.items()
-        ],
+    attached = handlers(
+        (nothing, Model.one_before, "before"),
+        (lambda model, _result: ChangedResult(None), Model.one_after, "after"),
+        (nothing, Model.one_instead, "instead"),
     )
+    functions = {
+        "a plain call": model.plain,
+        "exposed, no handlers": model.none,
+        "exposed, another environment has a handler": model.others,
+        "exposed, one handler before": model.one_before,
+        "exposed, one handler after, which changes the result": model.one_after,
+        "exposed, one handler instead": model.one_instead,
+        "a decision function": model.decide,
+        "a decision function, exposed": model.decide_exposed,
+    }
+    contenders = {name: calls(function, number) for name, function in functions.items()}
+    contenders["a plain call, an argument"] = calls(model.plain_of, number, 1.0)
+    contenders["exposed, no handlers, an argument"] = calls(model.none_of, number, 1.0)
+    with attached:
+        times = side_by_side(contenders, rounds)
+    other.close()
+    bars = {
+        "exposed, no handlers": (3.0, 2.0),
+        "exposed, no handlers, an argument": (3.0, 2.0),
+        "exposed, another environment has a handler": (8.0, None),
+    }
+    for name in contenders:
+        if name.startswith("a plain call"):
+            continue
+        under = "a plain call, an argument" if name.endswith("an argument") else "a plain call"
+        section.ratio(f"{name} / {under}", ratio(times, name, under), *bars.get(name, ()))
+    section.times(times)
     envs = {
-        "no plugins": single_env(Model, Model.decide),
-        "plugins, on a function that is not called": single_env(
+        "step": single_env(Model, Model.decide),
+        "step, a plugin that is not called": single_env(
             Model, Model.decide, plugins=[(nothing, Model.others, "before")]
         ),
-        "plugins, on the decision": single_env(Model, Model.decide, plugins=[(nothing, f"{name}.decide", "before")]),
+        "step, a plugin on the decision": single_env(
+            Model, Model.decide, plugins=[(nothing, f"{__name__}.Model.decide", "before")]
+        ),
     }
-    number = max(asked.number // 10, 1)
-    times = side_by_side({text: steps(env, number) for text, env in envs.items()}, asked.rounds)
-    report.table(
-        "Steps of an environment",
-        ["environment", "us", "of that without"],
-        [[text, f"{median(times[text]):.3f}", f"{ratio(times, text, 'no plugins'):.2f}"] for text in envs],
-    )
-    for env in envs.values():
+    times = side_by_side({name: steps(env, max(number // 10, 1)) for name, env in envs.items()}, rounds)
+    for name, env in envs.items():
+        if name != "step":
+            section.ratio(f"{name} / step", ratio(times, name, "step"))
         env.close()
-    if asked.output is not None:
-        report.write(asked.output)
-
-
-if __name__ == "__main__":
-    main()
+    section.times(times)
+    return section

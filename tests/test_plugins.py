@@ -20,6 +20,7 @@ from simenv_marl import (
     PatchError,
     SimEnvError,
     UnknownTargetError,
+    aec_env,
     attach_handler,
     attached_handlers,
     decision_points,
@@ -32,7 +33,7 @@ from simenv_marl import (
 
 from .foreign import market, shop
 from .foreign.market import Broker, Cautious, Dealer, Junior, Trader
-from .models import define, notes
+from .models import calling, define, notes, play
 
 MARKET = "tests.foreign.market"
 HERE = __name__
@@ -66,8 +67,7 @@ class Greenhouse:
         return amount * (2 if twice else 1)
 
     def days(self, number):
-        for day in range(number):
-            yield day
+        yield from range(number)
         return "over"
 
     async def wire(self, amount):
@@ -537,6 +537,34 @@ def test_an_exposed_function_of_a_module_is_extended_where_others_had_imported_i
         market.price = before
 
 
+def test_an_exposed_function_outlives_its_place():
+    before = market.price
+    market.price = exposed = expose_to_plugins(market.price)
+    try:
+        with handlers((lambda good, *, rebate=0: 1, exposed, "instead")):
+            assert shop.total("tea") == 1
+    finally:
+        market.price = before
+    with handlers((lambda good, *, rebate=0: 1, exposed, "instead")):
+        assert (exposed("tea"), shop.total("tea")) == (1, 10)
+    with handlers((lambda good, *, rebate=0: 1, f"{MARKET}.price", "instead")):
+        assert (exposed("tea"), shop.total("tea")) == (10, 1)
+
+
+@pytest.mark.parametrize("parameter", ["found", "rule", "args", "self", "SLOT"])
+def test_parameters_may_have_any_name(parameter):
+    scope = {"expose_to_plugins": expose_to_plugins}
+    exec(
+        f"class Model:\n    @staticmethod\n    @expose_to_plugins\n    def function({parameter}): return {parameter}",
+        scope,
+    )
+    function, log = scope["Model"].function, []
+    for attached in ([], [(lambda *args, **kwargs: log.append(1), function, "before")]):
+        with handlers(*attached):
+            assert function(3) == function(**{parameter: 4}) - 1 == 3
+    assert log == [1, 1]
+
+
 def test_modules_that_are_imported_meanwhile_are_restored_too():
     before = market.price
     late = types.ModuleType("late_shop")
@@ -548,6 +576,12 @@ def test_modules_that_are_imported_meanwhile_are_restored_too():
         assert late.asked is before
     finally:
         del sys.modules["late_shop"]
+
+
+def test_what_was_exposed_inside_a_function_has_its_name_all_the_same():
+    first, function = local(), local()
+    with handlers((lambda value, more=0: 9, f"{HERE}.local.<locals>.function", "instead")):
+        assert (first(1), function(1)) == (1, 9)
 
 
 def test_builtins_can_be_exposed_as_themselves():
@@ -639,9 +673,14 @@ def test_whatever_can_be_called_with_the_arguments_is_accepted(handler):
 def test_removing_what_is_not_attached_is_refused(target, position, handler):
     with handlers((two, two, "after")), pytest.raises(HandlerError):
         remove_handler(target, position, handler)
-    with pytest.raises(UnknownTargetError, match="did you mean"):
-        local_function = expose_to_plugins(plus_one)
-        attach_handler(print, local_function.__module__ + ".plus_ome", "before")
+
+
+def test_a_slip_of_the_pen_gets_a_hint():
+    exposed = local()
+    name = f"{HERE}.plus_ome"
+    with pytest.raises(UnknownTargetError, match=r"did you mean .*counting"):
+        attach_handler(print, name.replace("plus_ome", "countin"), "before")
+    assert exposed(1) == 1
 
 
 def test_errors_survive_pickling():
@@ -1041,6 +1080,26 @@ def test_handlers_lie_outside_whichever_decorator_came_first(order):
     assert inspect.unwrap(decided) is choose
 
 
+def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside():
+    original = vars(Trader)["bid"]
+    log = []
+    try:
+        with handlers((lambda *args, **kwargs: log.append(1), f"{MARKET}.Trader.bid", "before")):
+            Trader.bid = define()(Trader.bid)
+            assert Trader().bid("tea") == 5
+        with handlers(
+            (lambda *args, **kwargs: log.append(2), f"{MARKET}.Trader.bid", "before"),
+            (lambda *args, **kwargs: log.append(3), Trader.bid, "before"),
+        ):
+            env = aec_env(calling(lambda: Trader().bid("tea")), Trader.bid)
+            play(env, 4)
+            assert env.unwrapped.simulation.log == [4]
+            env.close()
+        assert log == [1, 2, 3]
+    finally:
+        Trader.bid = original
+
+
 # -- copies ---------------------------------------------------------------------------------------
 
 
@@ -1071,6 +1130,7 @@ def test_exposed_classes_are_collected():
 
 
 def test_what_is_exposed_and_attached_is_listed():
+    gc.collect()  # other tests have exposed functions, too
     function = local()
     name = f"{HERE}.local.<locals>.function"
     assert name in exposed_functions()

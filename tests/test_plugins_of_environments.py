@@ -1,6 +1,9 @@
 """Section 8: plugins of one environment alone, and handlers around decisions."""
 
 import gc
+from contextlib import suppress
+from random import Random
+from threading import Thread
 
 import mesa
 import numpy as np
@@ -13,6 +16,7 @@ from simenv_marl import (
     ChangedArgs,
     ChangedResult,
     HandlerError,
+    NoDecisionError,
     OptionValueError,
     UnknownTargetError,
     aec_env,
@@ -296,6 +300,124 @@ def test_nothing_is_left_behind():
     assert simenv_marl._driver.PLUGGED == simenv_marl._driver.EVALUATING == {}
 
 
+def test_environments_in_threads_of_their_own_have_their_own_plugins():
+    choose, errors = decision(), []
+
+    def work(number):
+        try:
+            for _ in range(10):
+                plugins = [(lambda self, good, limit=5: number, BID, "instead")]
+                env = aec_env(calling(lambda: Trader().bid("tea"), choose), choose, plugins=plugins)
+                play(env, 2)
+                assert env.unwrapped.simulation.log == [number, 2]
+                env.close()
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert errors == []
+
+
+def test_environments_may_be_collected_at_any_moment():
+    choose = decision()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(1, 1, 1)
+    try:
+        for _ in range(10):
+            plugins = [(lambda *args, **kwargs: None, BID, "before")]
+            env = aec_env(calling(lambda: Trader().bid("tea"), choose), choose, plugins=plugins)
+            env.reset()
+            env.itself = env
+            del env
+            with handlers((lambda *args, **kwargs: None, BID, "before")):
+                assert Trader().bid("tea") == 5
+    finally:
+        gc.set_threshold(*thresholds)
+
+
+def test_nested_environments_have_each_their_own():
+    choose = decision()
+    inner = aec_env(
+        calling(lambda: Trader().bid("tea"), choose),
+        choose,
+        plugins=[(lambda self, good, limit=5: "inner", BID, "instead")],
+    )
+
+    def main(simulation):
+        simulation.log.append(Trader().bid("tea"))
+        play(inner, 3)
+        simulation.log += [Trader().bid("tea"), *inner.unwrapped.simulation.log]
+        choose()
+
+    outer = aec_env(script(main), choose, plugins=[(lambda self, good, limit=5: "outer", BID, "instead")])
+    play(outer, 1)
+    assert outer.unwrapped.simulation.log == ["outer", "outer", "inner", 3]
+    outer.close()
+    inner.close()
+
+
+def test_a_class_of_environments_outlives_the_exposing_of_a_target():
+    made = generate_env(House, House.water, plugins=[says("mine")])
+    before = House.word
+    House.word = expose_to_plugins(House.word)
+    try:
+        env = made()
+        env.reset()
+        assert set(env.unwrapped.simulation.log) == {"mine"}
+    finally:
+        House.word = before
+    env.step(1)
+    assert env.unwrapped.simulation.log[-2:] == ["plain", "plain"]
+    env.close()
+    assert House.word is before
+
+
+def test_the_simulations_own_methods_can_be_extended():
+    def run(self):
+        self.log += [choose(), choose()]
+        return simenv_marl.TRUNCATED
+
+    choose = decision()
+    plugins = [
+        (run, f"{HERE}.House.run", "instead"),
+        (lambda self, seed=None: ChangedArgs(self, seed=77), f"{HERE}.House.reset", "before"),
+        (lambda self, seed=None: self.log.append(seed), f"{HERE}.House.reset", "after"),
+    ]
+    env = aec_env(House, choose, plugins=plugins)
+    turns = play(env, 3)
+    assert env.unwrapped.simulation.log == ["plain", 77, 3, 3]
+    assert turns[-1].truncated
+    env.close()
+
+
+def test_iterables_of_a_copied_simulation_have_their_plugins():
+    class Shelf:
+        def __init__(self):
+            self.items = expose_to_plugins([1, 2])
+
+        def reset(self):
+            self.log = []
+
+        def run(self):
+            for item in self.items:
+                self.log.append((item, choose()))
+
+    choose, shelf = decision(), Shelf()
+    five = [(lambda items, _result: ChangedResult(_result * 5), shelf.items, "after_next")]
+    env, plain = aec_env(shelf, choose, plugins=five), aec_env(shelf, choose)
+    for each in (env, plain):
+        each.reset()
+    for action in (7, 8):
+        for each in (env, plain):
+            each.step(action)
+    assert env.unwrapped.simulation.log == [(5, 7), (10, 8)]
+    assert plain.unwrapped.simulation.log == [(1, 7), (2, 8)]
+
+
 # -- decisions in plugins -------------------------------------------------------------------------
 
 
@@ -373,7 +495,7 @@ def test_handlers_lie_outside_the_decision(how, order):
 @pytest.mark.parametrize("last", ["handlers", "points"])
 @pytest.mark.parametrize("name", [BID, f"{MARKET}.price", f"{MARKET}.Broker.bid", f"{MARKET}.Trader.rounded"])
 def test_patches_come_and_go_in_any_order(first, last, name):
-    owner, _, attribute = name.rpartition(".")
+    owner = name.rpartition(".")[0]
     place = market if owner == MARKET else getattr(market, owner.rpartition(".")[2])
     call = {
         BID: lambda: Trader().bid("tea"),
@@ -409,6 +531,49 @@ def test_patches_come_and_go_in_any_order(first, last, name):
     assert now.keys() == before.keys()
     assert all(now[key] is before[key] for key in before)
     assert call() == plain
+
+
+PLACES = [
+    BID,
+    f"{MARKET}.Broker.bid",
+    f"{MARKET}.price",
+    "tests.foreign.shop.cost",
+    f"{MARKET}.Trader.opening",
+    f"{MARKET}.Junior.opening",
+    f"{MARKET}.Trader.rounded",
+    f"{MARKET}.Trader.haggle",
+]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_whoever_comes_and_goes_nobody_is_in_anothers_way(seed):
+    random, live = Random(seed), []
+    model = calling(lambda: Broker().bid("tea"), lambda: market.Junior.opening(), lambda: shop.total_cost("tea"))
+
+    def attach(name):
+        def handler(*args, **kwargs):
+            return None
+
+        simenv_marl.attach_handler(handler, name, "before")
+        return lambda: remove_handler(name, "before", handler)
+
+    def environment(name, *others):
+        plugins = [(lambda *args, **kwargs: None, other, "after") for other in others]
+        env = aec_env(model, {name: define()}, plugins=plugins)
+        with suppress(NoDecisionError):
+            env.reset()
+        return env.close
+
+    for _ in range(100):
+        if live and random.random() < 0.5:
+            live.pop(random.randrange(len(live)))()
+        else:
+            come = random.choice([attach, environment])
+            live.append(come(random.choice(PLACES)))
+            live.append(environment(*random.sample(PLACES, 3)))
+        assert (Broker().bid("tea"), shop.total_cost("tea"), market.Junior.opening()) == (5, 9, 3)
+    while live:
+        live.pop(random.randrange(len(live)))()
 
 
 def test_points_find_functions_that_handlers_stand_in_front_of():

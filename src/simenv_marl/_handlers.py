@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import update_wrapper
+from itertools import count
 from threading import get_ident
 from types import FunctionType
 from typing import Any, Final
@@ -40,6 +41,8 @@ _MOST: Final = 12
 """Arguments beyond these a handler of a function that takes any number need not be able to take."""
 
 _NOTHING: Final = object()
+
+_NUMBERS: Final = count()
 
 _repr = reprlib.Repr()
 _repr.maxother = _repr.maxstring = 60
@@ -141,15 +144,17 @@ class Attached:
         positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
         keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY]
         least = sum(p.default is p.empty for p in positional)
-        shapes = [(count, [p for p in keywords if p.default is p.empty]) for count in range(least, len(positional) + 1)]
+        shapes = [
+            (number, [p for p in keywords if p.default is p.empty]) for number in range(least, len(positional) + 1)
+        ]
         shapes.append((len(positional), keywords))
         if any(p.kind is p.VAR_POSITIONAL for p in parameters):
             shapes.append((len(positional) + _MOST, keywords))
         extra = ["any_other_keyword"] if any(p.kind is p.VAR_KEYWORD for p in parameters) else []
         result = ["_result"] if self._wants_result else []
         try:
-            for count, named in shapes:
-                own.bind(*[None] * count, **dict.fromkeys([*(p.name for p in named), *extra, *result]))
+            for number, named in shapes:
+                own.bind(*[None] * number, **dict.fromkeys([*(p.name for p in named), *extra, *result]))
         except TypeError as error:
             raise HandlerError(
                 f"the handler {title(self.handler)}{own} cannot be attached {self.position} {self.target.name}: it"
@@ -192,10 +197,10 @@ class Attached:
             error.add_note(note)
 
 
-def _binds(signature: inspect.Signature, count: int, keywords: list[str]) -> bool:
+def _binds(signature: inspect.Signature, number: int, keywords: list[str]) -> bool:
     """Whether so many arguments and these keywords can be passed."""
     try:
-        signature.bind(*[None] * count, **dict.fromkeys(keywords))
+        signature.bind(*[None] * number, **dict.fromkeys(keywords))
     except TypeError:
         return False
     return True
@@ -374,10 +379,11 @@ def _find(slot: Slot) -> Handlers | None:
     return slot.get(PLUGGED.get(get_ident())) or slot.get(None)
 
 
-def _call(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    found = slot.get(PLUGGED.get(get_ident())) or slot.get(None)
-    if found is None:
-        return rule(*args, **kwargs)
+_NONE_HERE: Final = "(found := SLOT.get(PLUGGED.get(get_ident())) or SLOT.get(None)) is None"
+"""What ``_find`` finds out, without the call."""
+
+
+def _call(found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     if not found.recorders:
         return found.call(rule, args, kwargs)
     with found.recording(args, kwargs) as results:
@@ -385,19 +391,15 @@ def _call(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) 
     return results[0]
 
 
-def _iterate(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Generator[Any, Any, Any]:
-    found = _find(slot)
-    if found is None:
-        return (yield from rule(*args, **kwargs))
+def _iterate(
+    found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Generator[Any, Any, Any]:
     with found.recording(args, kwargs) as results:
         results.append((yield from found.iterate(slot, rule, args, kwargs)))
     return results[0]
 
 
-async def _wait(slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    found = _find(slot)
-    if found is None:
-        return await rule(*args, **kwargs)
+async def _wait(found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     with found.recording(args, kwargs) as results:
         results.append(await found.wait(rule, args, kwargs))
     return results[0]
@@ -418,6 +420,7 @@ class Target:
         nature: Why not elsewhere.
         signature: What it can be called with, and so what handlers are; None where that is not known.
         slot: Its handlers, by whose they are. Empty while it has none.
+        number: How many targets there were before it.
         place: Where it has to be set as long as it has handlers; None where it is there for good.
         attached: The handlers for everybody, in the order in which they were attached.
     """
@@ -426,12 +429,14 @@ class Target:
 
     def __init__(self, name: str, positions: tuple[str, ...], nature: str, signature: inspect.Signature | None) -> None:
         self.name, self.positions, self.nature, self.signature = name, positions, nature, signature
+        self.number = next(_NUMBERS)
         self.slot: Slot = {}
         self.place: Place | None = None
         self.patches: list[tuple[Place, int, Callable[[Any], Any]]] = []
         self.attached: list[Attached] = []
         self._of_environments: dict[Any, list[Attached]] = {}
         self._recorders: list[Record] = []
+        self._changes = 0
         Target.all.add(self)
 
     def __repr__(self) -> str:
@@ -487,14 +492,20 @@ class Target:
         self.let_go()
 
     def _make_ready(self) -> None:
-        slot: Slot = {}
-        if self.attached or self._recorders:
-            slot[None] = Handlers(self.name, self.attached, self._recorders)
-        for plugins, own in self._of_environments.items():
-            slot[plugins] = Handlers(self.name, [*self.attached, *own], self._recorders)
-        self.slot.update(slot)  # never empty in between: a call may be looking in another thread
-        for plugins in self.slot.keys() - slot.keys():
-            del self.slot[plugins]
+        self._changes += 1
+        changes = 0
+        # The collector may come in between and close an environment, whose handlers go then.
+        while changes != self._changes:
+            changes = self._changes
+            slot: Slot = {}
+            if self.attached or self._recorders:
+                slot[None] = Handlers(self.name, self.attached, self._recorders)
+            for plugins, own in list(self._of_environments.items()):
+                slot[plugins] = Handlers(self.name, [*self.attached, *own], self._recorders)
+            self.slot.update(slot)  # never empty in between: a call may be looking in another thread
+            for plugins in list(self.slot):
+                if plugins not in slot:
+                    self.slot.pop(plugins, None)
 
 
 class FunctionTarget(Target):
@@ -541,8 +552,15 @@ class FunctionTarget(Target):
             kind=self._kind,
             alone=self._alone,
             guard="SLOT",
-            ask="handled(SLOT, rule, {}, {})",
-            namespace={"SLOT": self.slot, "target": self, "handled": _HANDLED[self._kind]},
+            ask="handled(found, SLOT, rule, {}, {})",
+            unless=_NONE_HERE,
+            namespace={
+                "SLOT": self.slot,
+                "PLUGGED": PLUGGED,
+                "get_ident": get_ident,
+                "target": self,
+                "handled": _HANDLED[self._kind],
+            },
         )
 
 

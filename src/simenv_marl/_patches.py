@@ -200,7 +200,8 @@ class Place:
         self.items: Any = None
         self.rule = _next_in_line(owner, attribute, self.function, self.binding) if self.inherited else self.function
         self._purpose = purpose
-        self._levels: dict[int, tuple[int, Wrap]] = {}
+        self._levels: dict[int, int] = {}  # how many hold each level
+        self._wraps: dict[int, Wrap] = {}
         self._made: dict[tuple[int, ...], Any] = {}  # what stands there, by the levels that are held
         self._former: list[Any] = []  # what has stood there since
         self._before: dict[tuple[Any, str], Any] = {}  # what stood under a name of a module
@@ -244,9 +245,10 @@ class Place:
         """
         if self.stale:
             raise PatchError(f"{self.name} has been replaced since it was named as a {self._purpose.noun}")
-        before = self._levels.get(level, (0, wrap))
-        self._levels[level] = (before[0] + 1, wrap)
-        if before[0] == 0:
+        self._wraps[level] = wrap
+        # Counted at once: the collector may come in between and close an environment that holds it, too.
+        self._levels[level] = self._levels.get(level, 0) + 1
+        if self._levels[level] == 1:
             try:
                 self._set()
             except BaseException:
@@ -255,16 +257,11 @@ class Place:
 
     def let_go(self, level: int) -> None:
         """Undo one ``hold``; the last one puts back what stood there."""
-        users, wrap = self._levels[level]
-        if users > 1:
-            self._levels[level] = (users - 1, wrap)
+        if self._levels[level] > 1:
+            self._levels[level] -= 1
         else:
             del self._levels[level]
             self._set()
-
-    def held_levels(self) -> list[int]:
-        """The levels that somebody holds."""
-        return sorted(self._levels)
 
     @classmethod
     def where(cls, function: Any) -> Place | None:
@@ -303,7 +300,7 @@ class Place:
             made = self.rule
             for level in levels:
                 if level != HANDLED or self.exposure is None:
-                    made = self._levels[level][1](made)
+                    made = self._wraps[level](made)
             if self.exposure is not None:
                 # Its own handlers stay outside; where nothing lies beneath them, it is what stood there.
                 made = plain(self.held) if made is self.rule else self.exposure.wrap(made)
@@ -311,12 +308,14 @@ class Place:
         return self._made[levels]
 
     def _set(self) -> None:
-        new = self._compose()
+        new = None
         try:
-            if isinstance(self.owner, type):
-                self._set_in_class(new)
-            else:
-                self._set_in_modules(new)
+            while new is None or self._compose() is not new:  # which may have changed meanwhile
+                new = self._compose()
+                if isinstance(self.owner, type):
+                    self._set_in_class(new)
+                else:
+                    self._set_in_modules(new)
         except (TypeError, AttributeError) as error:
             raise PatchError(f"{self.name} cannot be a {self._purpose.noun}: {error}") from error
 

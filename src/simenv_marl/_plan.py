@@ -103,8 +103,7 @@ class Options:
 
         if isinstance(self.plugins, (str, Mapping)) or not isinstance(self.plugins, Iterable):
             raise OptionValueError(f"plugins must be a list of (handler, target, position), not {self.plugins!r}")
-        if not isinstance(self.plugins, (list, tuple)):
-            object.__setattr__(self, "plugins", tuple(self.plugins))  # an iterator is to serve more than once
+        object.__setattr__(self, "plugins", tuple(self.plugins))  # an iterator is to serve more than once
 
     def amended(self, options: Mapping[str, Any]) -> Options:
         """The same options, but for those that are given.

@@ -29,22 +29,29 @@ class Surroundings:
     @contextmanager
     def entered(self) -> Iterator[None]:
         """Keep what runs apart from whatever runs around it, and in these surroundings."""
-        if attended():
-            with unattended():
-                yield from self._enter()
-        else:
-            yield from self._enter()
+        with unattended():
+            self.enter()
+            try:
+                yield
+            finally:
+                self.leave()
 
-    def _enter(self) -> Iterator[None]:
+    def enter(self) -> None:
+        """Put them up."""
         done = []
         try:
             for surrounding in self._surroundings:
                 surrounding.enter()
                 done.append(surrounding)
-            yield
-        finally:
+        except BaseException:
             for surrounding in reversed(done):
                 surrounding.leave()
+            raise
+
+    def leave(self) -> None:
+        """Take them down."""
+        for surrounding in reversed(self._surroundings):
+            surrounding.leave()
 
     def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
         """A simulation's main loop in these surroundings, in whatever thread it runs."""
@@ -87,8 +94,16 @@ class Surrounded(Episode):
 
     def turn(self, action: Any) -> None:
         """Answer the pending decision, as ``Episode.turn`` does."""
-        with self._surroundings.entered():
+        if attended():
+            with unattended():
+                self.turn(action)
+            return
+        surroundings = self._surroundings
+        surroundings.enter()
+        try:
             super().turn(action)
+        finally:
+            surroundings.leave()
 
 
 class SurroundedRounds(Surrounded, Rounds):

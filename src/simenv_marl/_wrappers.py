@@ -20,6 +20,9 @@ EXPOSED: Final = "exposed function"
 
 _ABSENT: Final = object()
 
+_TAKEN: Final = ("ABSENT", "NOTHING", "bind", "found", "rule")
+"""Names that mean something in what is written below."""
+
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 
 # What a call costs where nobody asks and nothing is attached is decided here. A method that takes nothing but
@@ -27,7 +30,7 @@ _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await 
 # handlers are to receive them as they were passed.
 _WITHOUT_ARGUMENTS = """
 {define} stand_in({names}):
-    if not {guard}:
+    if {idle}:
         return {rule}
     return {ask}
 """
@@ -35,7 +38,7 @@ _WITH_ARGUMENTS = """
 {define} stand_in({positional}, /, **kwargs):
     if {guard} or kwargs or {last} is ABSENT:
         args = {passed}
-        if not {guard}:
+        if {idle}:
             return {rule_as_passed}
         if kwargs or len(args) < {required}:
             bind(*args, **kwargs)
@@ -44,7 +47,7 @@ _WITH_ARGUMENTS = """
 """
 _VARIADIC = """
 {define} stand_in(*args, **kwargs):
-    if not {guard}:
+    if {idle}:
         return {rule_as_passed}
     bind(*args, **kwargs)
     return {ask}
@@ -85,6 +88,7 @@ def generate(
     alone: bool,
     guard: str,
     ask: str,
+    unless: str = "",
     namespace: Mapping[str, Any],
 ) -> FunctionType:
     """Write a function that stands in front of another one.
@@ -98,17 +102,21 @@ def generate(
         alone: As ``is_alone`` has it.
         guard: The name of the container that is empty while calls are to go straight on to ``rule``.
         ask: What is called otherwise, with two gaps for the arguments: positional, and by keyword.
+        unless: What, if it is true, makes calls go straight on all the same.
         namespace: What these names mean.
     """
     parameters = list(signature.parameters.values()) if signature is not None else []
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
-    if alone and positional[0].name not in {*namespace, "rule", "bind", "ABSENT", "NOTHING"}:
-        names = [positional[0].name]  # by which a staticmethod's may be passed all the same
+    # Under its own name, by which it may be passed all the same where a staticmethod looks like a method.
+    alone = alone and positional[0].name not in {*namespace, *_TAKEN}
+    if alone:
+        names = [positional[0].name]
     call = _CALL[kind].format
     values = {
         "define": "async def" if kind == "coroutine" else "def",
         "guard": guard,
+        "idle": f"not {guard} or {unless}" if unless else f"not {guard}",
         "names": ", ".join(names),
         "rule": call(f"rule({', '.join(names)})"),
         "rule_as_passed": call("rule(*args, **kwargs)"),

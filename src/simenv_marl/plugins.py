@@ -42,7 +42,7 @@ Entry = tuple[Callable[..., Any], Any, str]
 
 def exposed_functions() -> list[str]:
     """The names of all that is exposed to plugins, or has handlers attached to it."""
-    return sorted(target.name for target in list(Target.all) if target.place is None or target.slot)
+    return sorted({target.name for target in Target.all if target.place is None or target.slot})
 
 
 def decision_points() -> list[str]:
@@ -196,7 +196,13 @@ def find_target(target: Any) -> Target:
         PatchError: It is not exposed, and cannot be patched.
     """
     if isinstance(target, str):
-        owner, attribute = resolve(target, TARGET)
+        try:
+            owner, attribute = resolve(target, TARGET)
+        except (UnknownTargetError, PatchError):
+            named = [other for other in Target.all if other.name == target and other.place is None]
+            if not named:
+                raise
+            return max(named, key=lambda other: other.number)  # exposed inside a function, under the latest's name
         return _look_at(target, owner, attribute)
     if isinstance(target, type):
         return _class_target(target)
@@ -230,6 +236,7 @@ def _at_hand(target: Target) -> Target:
 def _everywhere(target: Target) -> Target:
     """See to it that an exposed function of a module is found where others had imported it before."""
     if target.place is None and not target.slot and isinstance(target, FunctionTarget):
+        target.patches = []
         owner: Any = None
         with suppress(SimEnvError, ImportError):
             owner, attribute = resolve(target.name, TARGET)

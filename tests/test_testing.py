@@ -1,5 +1,6 @@
 """Checks of simulations: each fault is found and named, and what is right stays clean."""
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -12,10 +13,10 @@ import warnings
 
 import numpy as np
 import pytest
+from examples.greenhouse_coop.env import GreenhouseSim
 from gymnasium import spaces
 
 import simenv_marl
-from examples.greenhouse_coop.env import GreenhouseSim
 from simenv_marl import (
     TRUNCATED,
     CheckFailedError,
@@ -237,6 +238,34 @@ def test_a_fingerprint_of_ones_own_leaves_out_what_it_leaves_out():
     changes = {"observation_space_mapping": observe}
     assert finding(checked(Walk, changes), "write into the model")
     clean(checked(Walk, changes, fingerprint=lambda walk: walk.place))
+
+
+def test_mappings_that_draw_from_the_global_generators():
+    changes = {"observation_space_mapping": lambda walk: [np.random.rand(), 0.0]}
+    assert "let mappings only look" in only_error(checked(Walk, changes), "Mappings draw from").explanation
+
+
+def test_a_model_that_refuses_to_end():
+    class Stubborn(Walk):
+        def run(self):
+            for _ in range(2000):
+                with contextlib.suppress(BaseException):
+                    self.choose()
+
+    report = checked(Stubborn, episodes=1, seeds=[0])
+    assert finding(report, "refuses to end").severity == "warning"
+
+
+def test_a_model_that_fails_when_it_is_closed():
+    class Failing(Walk):
+        def run(self):
+            try:
+                super().run()
+            finally:
+                if self.number < self.steps - 1:
+                    raise OSError("disk full")
+
+    assert "closed in mid-episode: OSError: disk full" in only_error(checked(Failing), "raises OSError").evidence
 
 
 # -- seeds ----------------------------------------------------------------------------------------
@@ -471,10 +500,8 @@ def test_a_model_that_gets_stuck_by_some_actions_and_swallows_what_is_raised_in_
             while self.choose() != 1:
                 pass
             while True:
-                try:
+                with contextlib.suppress(BaseException):
                     self.place = 0.0
-                except BaseException:
-                    pass
 
         def choose(self):
             return self.random.choice([1, 2])
@@ -485,7 +512,7 @@ def test_a_model_that_gets_stuck_by_some_actions_and_swallows_what_is_raised_in_
                 super().run()
 
     report = checked(Rule, time_limit=4)
-    assert "after 1 steps" in only_error(report, "standstill").evidence
+    assert only_error(report, "standstill").evidence.startswith("episode ")
 
 
 def test_an_agent_that_is_revived():

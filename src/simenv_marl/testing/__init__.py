@@ -215,4 +215,3 @@ def _unmade(simulation: Any, error: Exception) -> CheckReport:
         f"{type(error).__name__}: {error}" + (f" ({place})" if place else ""),
     )
     return CheckReport(str(name), (finding,), ())
-

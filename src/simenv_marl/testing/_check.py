@@ -7,7 +7,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
@@ -114,15 +114,25 @@ class Checker:
         states = global_generators()
         silenced = io.StringIO()
         try:
-            with unattended(), warnings.catch_warnings(), redirect_stdout(silenced), redirect_stderr(silenced):
+            with (
+                unattended(),
+                warnings.catch_warnings(record=True) as caught,
+                redirect_stdout(silenced),
+                redirect_stderr(silenced),
+            ):
                 warnings.simplefilter("ignore")
-                if self._runs_plainly():
-                    self._compares_views()
-                    self._plays_episodes()
-                    self._conforms()
-                    self._takes_time()
+                warnings.filterwarnings("always", ".* refuses to end", ResourceWarning)
+                self._check_all()
         finally:
             set_global_generators(states)
+        if caught:
+            self._add(
+                "warning",
+                "The simulation refuses to end",
+                "When an environment is closed or reset in mid-episode, SimulationExit is raised in the model, which"
+                " has to let it pass. Look for an except that catches everything and goes on.",
+                _first_lines(str(caught[0].message)),
+            )
         if self._late():
             self._add(
                 "warning",
@@ -140,6 +150,21 @@ class Checker:
             calls=order_of(plain.decisions) if plain else "",
             timing=self._timing,
         )
+
+    def _check_all(self) -> None:
+        try:
+            if not self._runs_plainly():
+                return
+            for look in (
+                self._compares_views,
+                self._plays_episodes,
+                self._ends_early,
+                self._conforms,
+                self._takes_time,
+            ):
+                look()
+        except (Exception, SystemExit) as error:  # of the model, from where nobody expects it
+            self._tell_of_error(error, "while it was checked")
 
     def _add(self, severity: Severity, title: str, explanation: str, evidence: str = "") -> None:
         self.findings.append(Finding(severity, title, explanation, evidence))
@@ -165,7 +190,8 @@ class Checker:
         for seed in self._seeds:
             seed_global_generators(seed)
             run = self._plain[seed] = plain_run(self._plan, seed, self._max_steps, self._deadline(), self._own)
-            self._drawn |= run.drawn
+            if not self._global_rng:
+                self._drawn |= run.drawn
             if isinstance(run.error, TimeUp):
                 self._tell_of_time(run, seed)
                 return False
@@ -215,7 +241,7 @@ class Checker:
         """Run a seed a second time: what differs then has nothing to do with environments."""
         seed = self._seeds[0]
         first = self._plain[seed]
-        if self._drawn and not self._global_rng:
+        if self._drawn:
             seed_global_generators(seed + 1)
             other = self._again(seed)
             same = other is not None and alike(other.decisions, first.decisions)
@@ -334,11 +360,11 @@ class Checker:
             most = max(len(run.decisions) for run in self._plain.values())
             seeds = f"seeds {_seeds(self._seeds)}"
             self.checked.append(f"plain runs against RULE throughout ({views}; {seeds}; up to {most} decisions each)")
-            first = self._plain[self._seeds[0]].fingerprint
-            if first is not None:
-                left = f"; cannot be compared: {', '.join(sorted(first.left_out)[:6])}" if first.left_out else ""
-                more = "" if first.complete else " (and there are more)"
-                self.checked.append(f"all that the simulation holds afterwards: {len(first.parts)} parts{more}{left}")
+            held = self._plain[self._seeds[0]].fingerprint
+            if held is not None:
+                left = f"; cannot be compared: {', '.join(sorted(held.left_out)[:6])}" if held.left_out else ""
+                more = "" if held.complete else " (and there are more)"
+                self.checked.append(f"what the simulation holds afterwards: {len(held.parts)} parts{more}{left}")
 
     def _make(self, view: str, changes: Mapping[str, Any]) -> Any:
         """A new environment with a plan of its own; None where the view does not fit."""
@@ -389,9 +415,20 @@ class Checker:
                 if not (view == "joint" and isinstance(run.error, AgentError)):
                     self._tell_of_error(run.error, f"in the {view} view with RULE throughout, seed {seed}")
                 return False
+            if run.drawn - self._drawn:
+                self._tell_of_drawing_mappings(run.drawn - self._drawn)
             if not self._is_as_plain(plain, run, view, driver, seed):
                 break
         return True
+
+    def _tell_of_drawing_mappings(self, names: set[str]) -> None:
+        self._drawn |= names
+        self._add(
+            "error",
+            f"Mappings draw from generators that all of the process shares ({' and '.join(sorted(names))})",
+            "The model by itself does not, but observations, rewards, masks or agents' names do. Seeds do not make them"
+            " repeat. Draw in the model, from a generator of its own that reset() seeds, and let mappings only look.",
+        )
 
     def _close(self, env: Any) -> None:
         if env is None:
@@ -500,8 +537,7 @@ class Checker:
                 if isinstance(error, TimeUp):
                     self._tell_of_stall(f"episode {number}, seed {seed}, after {len(steps)} steps")
                     break
-                else:
-                    self._tell_of_error(error, f"in episode {number} of random legal actions, seed {seed}")
+                self._tell_of_error(error, f"in episode {number} of random legal actions, seed {seed}")
                 continue
             if number <= max(2, len(self._seeds)):
                 known.setdefault(seed, steps)
@@ -683,12 +719,28 @@ class Checker:
             if type(value) is int and value == seed and "seed" in path
         }
 
+    def _ends_early(self) -> None:
+        """Close an environment in mid-episode."""
+        if self._late() or any(finding.severity == "error" for finding in self.findings):
+            return
+        env = self._make("aec", {"max_steps": None})
+        seed_global_generators(self._seeds[0])
+        try:
+            within(self._deadline(), partial(env.reset, seed=self._seeds[0]))
+        except TimeUp:
+            pass
+        finally:
+            self._close(env)
+        self.checked.append("an environment that is closed in mid-episode")
+
     # -- PettingZoo's and Gymnasium's own tests ---------------------------------------------------
 
     def _conforms(self) -> None:
         """Run what PettingZoo and Gymnasium check; say what they warn of in plain words."""
         if self._late() or any(finding.severity == "error" for finding in self.findings):
-            return  # they could only say the same in other words
+            # They could only say the same in other words.
+            self.checked.append("not, because of the errors: what PettingZoo and Gymnasium test themselves")
+            return
         limits = {"max_steps": self._max_steps}
         passed = []
         seed_global_generators(0)
@@ -781,6 +833,10 @@ class Checker:
             return
         self._errors.add(key)
         title, explanation = f"The simulation raises {type(error).__name__}", _OF_ANY_ERROR
+        if "plain run" in where:
+            explanation = _OF_PLAIN_ERRORS
+        elif "random legal actions" in where:
+            explanation = _OF_ERRORS_OF_ACTIONS
         if isinstance(error, AgentError) and "after its end" in str(error):
             title, explanation = "An agent decides after it was removed", _OF_REVIVAL
         else:
@@ -795,10 +851,12 @@ class Checker:
 
 # -- words ----------------------------------------------------------------------------------------
 
-_OF_ANY_ERROR: Final = (
-    "The error comes from the model, or from a mapping. Where it only occurs with random actions: every action that is"
-    " in the action space and not masked is one that learning code will try, and that the model must be able to take."
-    " Narrow the space, or say by action_mask_mapping which actions are legal."
+_OF_ANY_ERROR: Final = "The error comes from the model itself, or from one of its mappings."
+_OF_PLAIN_ERRORS: Final = "The error comes from the model itself: no environment was around it."
+_OF_ERRORS_OF_ACTIONS: Final = (
+    "Every action that is in the action space and not masked is one that learning code will try, and that the model"
+    " must be able to take. If it is an action that fails: narrow the space, or say by action_mask_mapping which actions"
+    " are legal. If it is only a later episode that fails: reset() must bring back everything that run() changes."
 )
 _OF_REVIVAL: Final = (
     "removed_by says that the agent's episode has ended, and then the agent of that name decides again. Let removed_by"
@@ -848,6 +906,7 @@ _SAID_OTHERWISE: Final = (
     "different action space sizes",
     "different between two agents",
     "all zeros",
+    "single number",
     "does not have a render() method",
     "has not defined a render() method",
 )
@@ -858,11 +917,6 @@ _IN_PLAIN_WORDS: Final = (
         "more than 3 dimensions",
         "Observations have more than three dimensions",
         "Learning libraries know what to do with up to three (pictures).",
-    ),
-    (
-        "single number",
-        "Observations are single numbers",
-        "Learning libraries expect vectors; a Box of shape (1,) is one.",
     ),
     (
         "minimum and maximum values are equal",
@@ -902,9 +956,7 @@ def _enough(seeds: tuple[int, ...], number: int) -> Iterator[int]:
         yield seeds[place] if place < len(seeds) else following + place - len(seeds)
 
 
-def _first_difference(
-    one: list[list[Any]], other: list[list[Any]], here: str = "first", there: str = "then"
-) -> str:
+def _first_difference(one: list[list[Any]], other: list[list[Any]], here: str = "first", there: str = "then") -> str:
     """Where two sequences of decisions differ first, in words; empty where they do not."""
     for number, (left, right) in enumerate(zip(one, other, strict=False), 1):
         if left[0] != right[0]:
@@ -990,7 +1042,9 @@ def fitting_views(plan: Plan) -> Iterator[str]:
     """The views that a plan allows."""
     for view in VIEWS:
         try:
-            base = view_class(plan if view == "joint" or not plan.options.flatten else plan.amended({"flatten": False}), view)
+            base = view_class(
+                plan if view == "joint" or not plan.options.flatten else plan.amended({"flatten": False}), view
+            )
             if base is SimulationJointEnv:
                 base(plan).close()
         except SimEnvError:

@@ -125,7 +125,7 @@ def _inside(path: str, value: Any) -> Iterator[tuple[str, Any]] | None:
     if isinstance(value, random.Random):
         return iter([(f"{path} (state of the generator)", str(value.getstate()))])
     if isinstance(value, (np.random.Generator, np.random.RandomState)):
-        bits = value.bit_generator if isinstance(value, np.random.Generator) else value._bit_generator  # type: ignore[attr-defined]
+        bits = value.bit_generator if isinstance(value, np.random.Generator) else value._bit_generator
         return iter([(f"{path} (state of the generator)", str(bits.state))])
     if isinstance(value, weakref.ref):
         return iter([(f"{path}()", value())])
@@ -211,7 +211,7 @@ def alike(one: Any, other: Any) -> bool:
     if type(one) is not type(other):
         return False
     if isinstance(one, (np.ndarray, np.generic)):
-        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+        return bool(one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes())
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(alike(value, other[key]) for key, value in one.items())
     if isinstance(one, (list, tuple)):

@@ -68,11 +68,14 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
         watcher.start()
         return function()
     finally:
+        # It may still be raised up to when nobody is left who would raise it, and is then delivered at once. (It is not
+        # taken back: in CPython that leaves the interpreter checking for it for ever.)
         while True:
-            try:  # it may still be raised up to when nobody is left who would raise it
+            try:
                 over.set()
                 watcher.join()
-                interrupt(ctypes.c_ulong(thread), None)
+                for _ in range(10):
+                    pass
                 break
             except TimeUp:
                 continue
@@ -239,17 +242,19 @@ def plain_run(
             held.append(site)
         if profile is not None:
             sys.setprofile(profile)
-        resetter(simulation)(seed, None)
-        RUNNING[thread] = _rule
-        watcher.run.result = simulation.run()
+        try:
+            resetter(simulation)(seed, None)
+            RUNNING[thread] = _rule
+            watcher.run.result = simulation.run()
+        finally:
+            RUNNING.pop(thread, None)
+            if profile is not None:
+                sys.setprofile(before)
 
     with unattended(), watcher.watching() as run:
         try:
             within(deadline, run_it)
         finally:
-            if profile is not None:
-                sys.setprofile(before)
-            RUNNING.pop(thread, None)
             for site in held:
                 site.let_go()
     return run
@@ -361,6 +366,7 @@ def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> lis
     package = __file__.rpartition("testing")[0]
     library = random.__file__.rpartition("random.py")[0]
     shared: Any = random.random.__self__  # type: ignore[attr-defined]
+    seeding = random.Random.seed.__code__
 
     def asked(what: str, frame: Any) -> None:
         while frame is not None:
@@ -386,9 +392,8 @@ def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> lis
                 asked("the operating system is asked for random bits (as by a generator without a seed)", frame)
             elif owner is shared and name in ("random", "getrandbits"):
                 asked("Python's global generator is used", frame)
-        elif event == "call" and frame.f_code.co_name == "seed" and frame.f_code.co_filename == random.__file__:
-            if frame.f_locals.get("a", 0) is None:
-                asked("a random.Random is made without a seed", frame.f_back)
+        elif event == "call" and frame.f_code is seeding and frame.f_locals.get("a", 0) is None:
+            asked("a random.Random is made without a seed", frame.f_back)
 
     plain_run(plan, seed, limit, deadline, lambda simulation: None, profile)
     return list(found)

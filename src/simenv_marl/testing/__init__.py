@@ -6,7 +6,17 @@ plain words what is wrong; ``inspect_simulation`` tells what there is to be deci
     python -m simenv_marl check package.module:Simulation
     python -m simenv_marl inspect package.module:Simulation
 
-Nothing else of the library imports this package.
+Nothing else of the library imports this package. Its modules, each importing only from those above it::
+
+    _fingerprint   what a simulation holds, so that two runs can be compared
+    _report        findings, reports and their text
+    _runs          plain runs, runs with RULE throughout, random episodes; all of them end
+    _statistics    what observations and rewards range over
+    _words         errors and differences in plain words
+    _base          what all checks share
+    _plain, _views, _episodes, _conformance    the checks
+    _check         all of them, one after the other
+    _inspect       what there is to be decided
 """
 
 from __future__ import annotations
@@ -23,9 +33,10 @@ import numpy as np
 
 from .._driver import unattended
 from .._plan import Plan
-from ..envs import aec_env
+from ..envs import SimulationAECEnv, aec_env
 from ..errors import OptionValueError, SimEnvError
-from ._check import Checker, described, ending, fitting_views, order_of
+from ._check import Checker
+from ._inspect import described, ending, fitting_views
 from ._report import (
     CheckReport,
     ComponentStatistics,
@@ -44,6 +55,7 @@ from ._runs import (
     seed_global_generators,
     set_global_generators,
 )
+from ._words import order_of
 
 __all__ = [
     "CheckReport",
@@ -82,8 +94,8 @@ def check_simulation(
         seeds: With which seeds plain runs are compared; at least one.
         episodes: How many episodes of random legal actions are played.
         max_steps: After how many decisions a run is cut, so that models that never end can be checked as well.
-        time_limit: For how many seconds to check at most. Running Python code is interrupted; what waits outside of
-            Python (in a sleep, say) is not.
+        time_limit: For about how many seconds to check at most; a single run may take a quarter of it. Running
+            Python code is interrupted; what waits outside of Python (in a sleep, say) is not.
         fingerprint: What a simulation is compared by after a run: a callable of it that returns numbers, arrays,
             strings, or containers of these. None: its ``state()``, or else all its attributes.
         **options: Options of the environments, as ``aec_env`` takes them.
@@ -172,8 +184,6 @@ def inspect_simulation(
 
 def _agents_of(plan: Plan, seed: int, max_steps: int, deadline: float) -> dict[str, None]:
     """The agents of an episode with ``RULE`` throughout, in the order in which they joined."""
-    from ..envs.aec import SimulationAECEnv
-
     env = SimulationAECEnv(plan.amended({"flatten": False}))
     named: dict[str, None] = {}
     select = env._select

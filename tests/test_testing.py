@@ -488,10 +488,8 @@ def test_a_model_that_neither_ends_nor_decides():
             while True:
                 self.place = 0.0
 
-    start = time.monotonic()
     found = only_error(checked(Stuck, time_limit=2), "neither ends nor asks")
     assert "wait for it for ever" in found.explanation
-    assert time.monotonic() - start < 60
 
 
 def test_a_model_that_gets_stuck_by_some_actions_and_swallows_what_is_raised_in_it():
@@ -511,7 +509,7 @@ def test_a_model_that_gets_stuck_by_some_actions_and_swallows_what_is_raised_in_
             if self.choose() < 1:
                 super().run()
 
-    report = checked(Rule, time_limit=4)
+    report = checked(Rule, time_limit=8)
     assert only_error(report, "standstill").evidence.startswith("episode ")
 
 
@@ -916,6 +914,13 @@ def test_things_that_refer_to_themselves_are_written_down():
     thing = Thing(1)
     thing.other = [thing]
     assert holding(it=thing).parts["simulation.it.other[0]"] == "what is also simulation.it"
+
+
+def test_a_long_history_does_not_hide_the_rest():
+    history = [[number] * 10 for number in range(10_000)]
+    one, other = (holding(history=history, thing=random.Random(seed)) for seed in (1, 2))
+    assert not one.complete
+    assert [path for path, _, _ in one.differences(other)] == ["simulation.thing (state of the generator)"]
 
 
 def test_what_cannot_be_compared_is_told():

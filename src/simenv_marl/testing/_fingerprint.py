@@ -90,9 +90,10 @@ def _written(name: str, root: Any) -> Fingerprint:
     left_out: set[str] = set()
     met: dict[int, str] = {}
     kept = []  # what is made on the way: its id must not be given away again
-    stack = [(name, root)]
-    while stack and len(parts) < MOST_PARTS:
-        path, value = stack.pop()
+    # The nearest first: a long history that the model keeps is not to hide the rest of it.
+    left = deque([(name, root)])
+    while left and len(parts) < MOST_PARTS:
+        path, value = left.popleft()
         if isinstance(value, _ATOMS) and not isinstance(value, Enum):
             parts[path] = value
         elif isinstance(value, np.ndarray) and value.dtype != object:
@@ -114,8 +115,8 @@ def _written(name: str, root: Any) -> Fingerprint:
             if inside is None:
                 left_out.add(title(type(value)))
             else:
-                stack += reversed(list(inside))
-    return Fingerprint(parts, frozenset(left_out), not stack)
+                left += inside
+    return Fingerprint(parts, frozenset(left_out), not left)
 
 
 def _inside(path: str, value: Any) -> Iterator[tuple[str, Any]] | None:

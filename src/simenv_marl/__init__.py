@@ -26,6 +26,8 @@ The layers, each importing only from those above it::
     policies      policies back in the model's own loop
     envs          views: an episode read as a PettingZoo or Gymnasium environment
     registration  into the registries of Gymnasium and PettingZoo
+    testing       checks of a simulation; imported by its users alone
+    __main__      the same on the command line
 """
 
 from . import errors

@@ -25,7 +25,8 @@
     |   |-- EpisodeOverError                 ... because it has ended or failed
     |   `-- ClosedError                      ... because the environment was closed
     |-- ReentrancyError      (RuntimeError)  an environment stepped from inside itself
-    `-- WrongThreadError     (RuntimeError)  an environment used from another thread
+    |-- WrongThreadError     (RuntimeError)  an environment used from another thread
+    `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
 Every error is raised with its message alone, so that it survives pickling.
 """
@@ -36,6 +37,7 @@ from pathlib import Path
 
 __all__ = [
     "AgentError",
+    "CheckFailedError",
     "ClosedError",
     "CopyError",
     "DefinitionError",
@@ -166,3 +168,7 @@ class ReentrancyError(SimEnvError, RuntimeError):
 
 class WrongThreadError(SimEnvError, RuntimeError):
     """An environment was used from a thread other than the one that has reset it."""
+
+
+class CheckFailedError(SimEnvError, AssertionError):
+    """A check of a simulation has found what must not be. Its message is what was found."""

@@ -1,0 +1,181 @@
+"""The command line: ``python -m simenv_marl check module:Simulation`` and ``... inspect module:Simulation``.
+
+Exit codes: 0 where all is well, 1 where ``check`` has found errors (or the model fails in ``inspect``), 2 where nothing
+could be looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import inspect
+import json
+import os
+import pkgutil
+import sys
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Any
+
+from .errors import SimEnvError
+
+
+class _UsageError(Exception):
+    """What was asked for cannot be looked at."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: What follows the program's name; None: what it was called with.
+
+    Returns:
+        The exit code.
+    """
+    options = _parser().parse_args(arguments)
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        simulation = _found(options.simulation)
+        seen = _checked(simulation, options) if options.command == "check" else _inspected(simulation, options)
+    except (_UsageError, SimEnvError) as error:
+        print(f"simenv_marl: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps(seen.to_dict(), indent=2) if options.json else seen)
+    return 0 if getattr(seen, "ok", True) else 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m simenv_marl",
+        description="Check a simulation before its environments are trusted, or see what there is to be decided in it.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="check | inspect")
+    check = commands.add_parser(
+        "check",
+        help="run it plainly and behind environments, and say what is wrong",
+        description="Run a simulation plainly and behind environments, and say what is wrong. Exit code: 0 if nothing"
+        " is, 1 if there are errors, 2 if it cannot be run.",
+    )
+    look = commands.add_parser(
+        "inspect",
+        help="tell its decision points and the order in which they are called",
+        description="Tell the decision points of a simulation, and in what order its own rules call them.",
+    )
+    for command in (check, look):
+        command.add_argument(
+            "simulation", metavar="module:Simulation", help="its class, an instance, or a factory without arguments"
+        )
+        command.add_argument(
+            "--points", nargs="+", metavar="NAME", help="dotted names of its decision points (default: its own)"
+        )
+        command.add_argument("--seed", type=_number(0), default=0, metavar="N", help="the first seed (default: 0)")
+        command.add_argument("--json", action="store_true", help="print JSON in place of text")
+    check.add_argument("--episodes", type=_number(1), default=10, metavar="N", help="of random actions (default: 10)")
+    check.add_argument(
+        "--max-steps", type=_number(1), default=1000, metavar="N", help="decisions in a run (default: 1000)"
+    )
+    check.add_argument(
+        "--time-limit", type=_seconds, default=60.0, metavar="SECONDS", help="for all of it (default: 60)"
+    )
+    return parser
+
+
+def _number(least: int) -> Any:
+    def number(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least {least}")
+        return int(text)
+
+    return number
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no positive number of seconds")
+    return seconds
+
+
+def _checked(simulation: Any, options: argparse.Namespace) -> Any:
+    from .testing import check_simulation
+
+    return check_simulation(
+        simulation,
+        options.points,
+        seeds=range(options.seed, options.seed + 3),
+        episodes=options.episodes,
+        max_steps=options.max_steps,
+        time_limit=options.time_limit,
+    )
+
+
+def _inspected(simulation: Any, options: argparse.Namespace) -> Any:
+    from .testing import inspect_simulation
+
+    try:
+        return inspect_simulation(simulation, options.points, seed=options.seed)
+    except SimEnvError:
+        raise
+    except Exception as error:
+        raise _UsageError(f"{options.simulation} cannot be run: {type(error).__name__}: {error}") from error
+
+
+def _found(text: str) -> Any:
+    """Import what ``module:name`` says.
+
+    Raises:
+        _UsageError: It leads to nothing.
+    """
+    module_name, colon, path = text.partition(":")
+    if not (module_name and colon and path):
+        raise _UsageError(f"{text!r} is not of the form module:Simulation, such as examples.shop:Shop")
+    found: Any = _module(module_name)
+    for name in path.split("."):
+        try:
+            found = getattr(found, name)
+        except AttributeError:
+            raise _UsageError(
+                f"{getattr(found, '__name__', found)} has no {name!r}{_alternatives(name, found)}"
+            ) from None
+    return found
+
+
+def _module(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+            raise _UsageError(f"the module {name!r} needs {error.name!r}, which is not installed") from error
+        parent, _, last = error.name.rpartition(".")
+        where = importlib.import_module(parent).__path__ if parent else None
+        if where is None and parent == "":
+            where = [os.getcwd()]
+        known = [module.name for module in pkgutil.iter_modules(where)]
+        close = get_close_matches(last, known, n=3)
+        hint = f"; did you mean {' or '.join(f'{parent}.{other}'.lstrip('.') for other in close)}?" if close else ""
+        raise _UsageError(
+            f"there is no module {error.name!r}{hint} (looked for in {os.getcwd()} and on Python's path)"
+        ) from None
+    except Exception as error:
+        raise _UsageError(f"the module {name!r} cannot be imported: {type(error).__name__}: {error}") from error
+
+
+def _alternatives(name: str, owner: Any) -> str:
+    close = get_close_matches(name, dir(owner), n=3)
+    if close:
+        return f"; did you mean {' or '.join(close)}?"
+    runnable = [
+        other
+        for other, value in vars(owner).items()
+        if inspect.isclass(value) and hasattr(value, "run") and hasattr(value, "reset")
+    ]
+    return f"; it has the simulations {', '.join(runnable)}" if runnable else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())

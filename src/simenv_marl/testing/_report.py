@@ -1,0 +1,399 @@
+"""What a check has found and what an inspection has seen, as objects that read as plain text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from textwrap import fill, indent
+from typing import Any, Final, Literal
+
+from ..errors import CheckFailedError
+
+Severity = Literal["error", "warning", "note"]
+
+SEVERITIES: Final = ("error", "warning", "note")
+"""In the order of their importance."""
+
+WIDTH: Final = 100
+_MOST_COMPONENTS: Final = 12
+
+
+# -- findings -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check has found.
+
+    Attributes:
+        severity: "error": results would be wrong. "warning": learning may suffer. "note": good to know.
+        title: What it is, in one line.
+        explanation: What that means, and what to do.
+        evidence: Where and when it was seen; may be empty.
+    """
+
+    severity: Severity
+    title: str
+    explanation: str
+    evidence: str = ""
+
+    def __str__(self) -> str:
+        lines = [f"{self.severity.upper():<9}{self.title}", _wrapped(self.explanation)]
+        if self.evidence:
+            lines += [_wrapped(line, hang="  ") for line in f"Seen: {self.evidence}".splitlines()]
+        return "\n".join(lines)
+
+
+# -- statistics -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ComponentStatistics:
+    """What one component of an observation has ranged over.
+
+    Attributes:
+        name: Which one: "[2]", "position[0]"; empty where there is only one.
+        low, high: Its bounds.
+        minimum, maximum, mean: Of its values.
+        at_bounds, beyond: Which share of its values was at a bound, and outside of them (or no number).
+    """
+
+    name: str
+    low: float
+    high: float
+    minimum: float
+    maximum: float
+    mean: float
+    at_bounds: float
+    beyond: float
+
+    @property
+    def constant(self) -> bool:
+        """Whether it was always the same."""
+        return self.minimum == self.maximum
+
+
+@dataclass(frozen=True)
+class PointStatistics:
+    """What random legal actions have shown of a decision point.
+
+    Attributes:
+        point: Its dotted name.
+        agents: Who decides there: a name, or in words.
+        observation_space, action_space: Its spaces, as text.
+        observations: How many observations were made.
+        components: What they ranged over.
+        decisions: How often the point was called, in all episodes.
+        never_legal: Which actions never were legal, where it has a mask.
+        rewards: How many rewards were counted.
+        reward_minimum, reward_maximum, reward_mean: Of these.
+    """
+
+    point: str
+    agents: str
+    observation_space: str
+    action_space: str
+    observations: int
+    components: tuple[ComponentStatistics, ...]
+    decisions: int
+    never_legal: tuple[int, ...]
+    rewards: int
+    reward_minimum: float
+    reward_maximum: float
+    reward_mean: float
+
+    def __str__(self) -> str:
+        rewards = "no rewards"
+        if self.rewards:
+            rewards = (
+                f"rewards {_number(self.reward_minimum)} to {_number(self.reward_maximum)},"
+                f" mean {_number(self.reward_mean)}"
+            )
+        lines = [f"{self.agents}, at {self.point}", f"  {self.decisions} decisions, {rewards}"]
+        lines.append(f"  actions {self.action_space}, observations {self.observation_space}")
+        if self.components:
+            rows = [("observed", "least", "mean", "most", "bounds", "at a bound")]
+            for part in self.components[:_MOST_COMPONENTS]:
+                values = _number(part.minimum), _number(part.mean), _number(part.maximum)
+                bounds = f"{_number(part.low)} to {_number(part.high)}"
+                rows.append((part.name or "(value)", *values, bounds, f"{part.at_bounds:.0%}"))
+            lines += [f"  {line}" for line in _table(rows)]
+            if len(self.components) > _MOST_COMPONENTS:
+                lines.append(f"    ... and {len(self.components) - _MOST_COMPONENTS} more")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class EpisodeStatistics:
+    """What the episodes of random legal actions were like.
+
+    Attributes:
+        episodes: How many there were.
+        shortest, longest, mean: Their lengths in decisions.
+        terminated, truncated, cut: How many came to an end, to the simulation's own limit, and to ``max_steps``.
+    """
+
+    episodes: int = 0
+    shortest: int = 0
+    longest: int = 0
+    mean: float = 0.0
+    terminated: int = 0
+    truncated: int = 0
+    cut: int = 0
+
+    def __str__(self) -> str:
+        if not self.episodes:
+            return "none was played to its end"
+        ends = {"ended": self.terminated, "truncated by the simulation": self.truncated, "cut at max_steps": self.cut}
+        length = f"{self.shortest}" if self.shortest == self.longest else f"{self.shortest} to {self.longest}"
+        return (
+            f"{self.episodes} of {length} decisions (mean {_number(self.mean)});"
+            f" {', '.join(f'{number} {end}' for end, number in ends.items() if number)}"
+        )
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What a decision takes, in microseconds: plainly, and with ``RULE`` in the AEC view."""
+
+    plain: float
+    environment: float
+
+    def __str__(self) -> str:
+        return (
+            f"{_number(self.plain)} us per decision in the plain run, {_number(self.environment)} us behind the"
+            f" environment"
+        )
+
+
+# -- reports --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What ``check_simulation`` has found. Its ``str`` is a text to be read.
+
+    Attributes:
+        simulation: What was checked.
+        findings: What was found, the most important first.
+        checked: What was looked at, in words.
+        observations: By decision point, what random legal actions have shown.
+        episodes: What these episodes were like.
+        calls: In what order the decision points were called in a plain run, compressed.
+        timing: What a decision takes; None where that was not measured.
+    """
+
+    simulation: str
+    findings: tuple[Finding, ...]
+    checked: tuple[str, ...]
+    observations: tuple[PointStatistics, ...] = ()
+    episodes: EpisodeStatistics = field(default_factory=EpisodeStatistics)
+    calls: str = ""
+    timing: Timing | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no finding of severity "error"."""
+        return not self.of("error")
+
+    def of(self, severity: Severity) -> tuple[Finding, ...]:
+        """The findings of a severity."""
+        return tuple(finding for finding in self.findings if finding.severity == severity)
+
+    def raise_for_errors(self) -> None:
+        """Raise what was found to be wrong, as tests do.
+
+        Raises:
+            CheckFailedError: There are findings of severity "error"; it holds them as text.
+        """
+        errors = self.of("error")
+        if errors:
+            raise CheckFailedError("\n\n".join([f"{self.simulation}: {self._counts()}", *map(str, errors)]))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as dicts, lists, strings and numbers, for JSON; infinite numbers as strings."""
+        made: dict[str, Any] = {"ok": self.ok, **_plain(asdict(self))}
+        return made
+
+    def __str__(self) -> str:
+        parts = [f"{self.simulation}: {self._counts()}"]
+        parts += [str(finding) for finding in self.findings]
+        if self.checked:
+            parts.append("\n".join(["What was looked at", *(_wrapped(line, "  ", "  ") for line in self.checked)]))
+        lines = [f"Episodes of random legal actions: {self.episodes}"]
+        parts.append("\n".join([*lines, *(indent(str(point), "  ") for point in self.observations)]))
+        if self.calls:
+            parts.append(f"Order of the decisions in a plain run\n{_wrapped(self.calls, '  ', '  ')}")
+        if self.timing is not None:
+            parts.append(f"Time: {self.timing}")
+        return "\n\n".join(parts)
+
+    def _counts(self) -> str:
+        counts = [(len(self.of(severity)), severity) for severity in ("error", "warning", "note")]
+        named = [f"{number} {severity}{'s' * (number != 1)}" for number, severity in counts if number]
+        return ", ".join(named) if named else "nothing to complain of"
+
+
+@dataclass(frozen=True)
+class PointDescription:
+    """A decision point as an environment sees it.
+
+    Attributes:
+        name: Its dotted name.
+        agents: Who decides there: a name, or in words.
+        observation_space, action_space: Its spaces, as text.
+        details: What else there is to know: masks, choices, removals, policies.
+    """
+
+    name: str
+    agents: str
+    observation_space: str
+    action_space: str
+    details: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        lines = [self.name]
+        lines.append(f"  agent         {self.agents}")
+        lines.append(f"  observations  {self.observation_space}")
+        lines.append(f"  actions       {self.action_space}")
+        lines += [f"  {detail}" for detail in self.details]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What ``inspect_simulation`` has seen. Its ``str`` is a text to be read.
+
+    Attributes:
+        simulation: What was inspected.
+        points: Its decision points.
+        views: Which views its environments may have.
+        calls: In what order the points were called in one plain episode, compressed: ``(a b){30} c``.
+        counts: How often each was called.
+        ended: How that episode ended, in words.
+        agents: The agents of that episode, behind an environment, in the order in which they joined.
+    """
+
+    simulation: str
+    points: tuple[PointDescription, ...]
+    views: tuple[str, ...]
+    calls: str
+    counts: dict[str, int]
+    ended: str
+    agents: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same as dicts, lists, strings and numbers, for JSON."""
+        made: dict[str, Any] = _plain(asdict(self))
+        return made
+
+    def __str__(self) -> str:
+        parts = [f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}"]
+        parts += [str(point) for point in self.points]
+        parts.append(f"Views that fit: {', '.join(self.views)}")
+        counts = ", ".join(f"{point} {number} times" for point, number in self.counts.items())
+        parts.append(
+            f"One episode by the model's own rules: {self.ended}\n"
+            + _wrapped(f"calls    {counts or 'none'}", "  ", "           ")
+            + "\n"
+            + _wrapped(f"order    {self.calls or '-'}", "  ", "           ")
+            + "\n"
+            + _wrapped(f"agents   {_names(self.agents) or '-'}", "  ", "           ")
+        )
+        return "\n\n".join(parts)
+
+
+# -- the order of calls ---------------------------------------------------------------------------
+
+_LONGEST_BLOCK: Final = 24
+_MOST_CALLS: Final = 3000
+_MOST_TERMS: Final = 30
+
+
+def compressed(calls: Iterable[str]) -> str:
+    """Write a sequence down with its repetitions, as ``(a b){30} c``; long ones end in an ellipsis."""
+    all_calls = list(calls)
+    terms = all_calls[:_MOST_CALLS]
+    for length in range(1, _LONGEST_BLOCK + 1):
+        terms = _folded(terms, length)
+    rest = len(terms) - _MOST_TERMS
+    left = len(all_calls) - _MOST_CALLS
+    ending = f" ... and {rest} more such terms" if rest > 0 else f" ... and {left} more calls" if left > 0 else ""
+    return " ".join(terms[:_MOST_TERMS]) + ending
+
+
+def _folded(terms: Sequence[str], length: int) -> list[str]:
+    made: list[str] = []
+    place = 0
+    while place < len(terms):
+        block = terms[place : place + length]
+        times = 1
+        while terms[place + times * length : place + (times + 1) * length] == block:
+            times += 1
+        if times > 1:
+            made.append(f"{block[0]}{{{times}}}" if length == 1 else f"({' '.join(block)}){{{times}}}")
+            place += times * length
+        else:
+            made.append(terms[place])
+            place += 1
+    return made
+
+
+def short_names(points: Sequence[str]) -> dict[str, str]:
+    """The shortest ends of dotted names that tell them apart: of one part, else of two, and so on."""
+    short = {}
+    for point in points:
+        parts = point.split(".")
+        for length in range(1, len(parts) + 1):
+            end = ".".join(parts[-length:])
+            if sum(other == end or other.endswith(f".{end}") for other in points) == 1:
+                break
+        short[point] = end
+    return short
+
+
+# -- text -----------------------------------------------------------------------------------------
+
+
+def _wrapped(text: str, first: str = "         ", hang: str = "") -> str:
+    following = hang if hang.strip() == "" and len(hang) > len(first) else first + hang
+    if first == "  ":
+        following = hang
+    return fill(
+        text,
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=following,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _number(value: float) -> str:
+    if not math.isfinite(value):
+        return "not a number" if math.isnan(value) else "-inf" if value < 0 else "inf"
+    return f"{value:.4g}"
+
+
+def _names(names: Sequence[str], most: int = 8) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        first, *others = row
+        cells = [first.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True))]
+        yield "  ".join(cells).rstrip()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value

@@ -1,0 +1,162 @@
+"""The command line, as it is called from a shell."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from simenv_marl.__main__ import main
+
+MODELS = '''
+"""Two walks, one of which limps."""
+
+import random
+
+from gymnasium import spaces
+
+from simenv_marl import make_step
+
+
+def definition(observe):
+    return make_step(
+        observation_space=spaces.Box(-100, 100, (1,)),
+        observation_space_mapping=observe,
+        action_space=spaces.Discrete(3),
+        action_space_mapping=lambda action: action - 1,
+        reward_mapping=lambda walk: -abs(walk.place),
+        agent="walker_0",
+    )
+
+
+class Walk:
+    def reset(self, seed=None):
+        self.random, self.place = random.Random(seed), 0.0
+
+    def run(self):
+        for _ in range(10):
+            self.place += self.choose() + self.random.random()
+
+    def choose(self):
+        return 0
+
+    points = {choose: definition(lambda walk: [walk.place])}
+
+
+class Limping(Walk):
+    def choose(self):
+        return 0
+
+    points = {choose: definition(lambda walk: [walk.place + walk.random.random()])}
+
+
+number = 3
+'''
+
+
+@pytest.fixture(autouse=True)
+def beside_the_models(tmp_path, monkeypatch):
+    (tmp_path / "walking.py").write_text(MODELS)
+    (tmp_path / "broken_walk.py").write_text("import no_such_package_at_all\n")
+    (tmp_path / "failing_walk.py").write_text("1 / 0\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    for name in ("walking", "broken_walk", "failing_walk"):
+        sys.modules.pop(name, None)
+
+
+def run(*arguments):
+    root = Path(__file__).parent.parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root / "src"), str(root)])}
+    return subprocess.run(
+        [sys.executable, "-m", "simenv_marl", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        timeout=300,
+    )
+
+
+def test_a_sound_simulation_of_the_current_directory():
+    done = run("check", "walking:Walk", "--episodes", "2")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("Walk: nothing to complain of")
+
+
+def test_a_simulation_with_an_error(capsys):
+    assert main(["check", "walking:Limping", "--episodes", "2", "--seed", "4", "--max-steps", "5"]) == 1
+    text = capsys.readouterr().out
+    assert "behaves differently when it is observed" in text
+    assert "seed 4" in text
+    assert "5 decisions" in text
+
+
+def test_reports_as_json(capsys):
+    assert main(["check", "walking:Limping", "--episodes", "2", "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["ok"] is False
+    assert told["findings"][0]["severity"] == "error"
+    assert main(["inspect", "walking:Walk", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calls"] == "choose{10}"
+
+
+def test_inspection(capsys):
+    assert main(["inspect", "walking:Walk"]) == 0
+    text = capsys.readouterr().out
+    assert "walker_0" in text
+    assert "choose{10}" in text
+    assert "aec, parallel, single, joint" in text
+
+
+def test_points_by_name(capsys):
+    name = "examples.greenhouse_coop.model.Greenhouse.choose_water_amount"
+    assert main(["check", "walking:Walk", "--points", "walking.Walk.chose"]) == 2
+    assert "chose" in capsys.readouterr().err
+    assert main(["inspect", "examples.greenhouse_coop.env:GreenhouseSim", "--points", name]) == 2
+    assert "has no definition" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("target", "told"),
+    [
+        ("walking", "not of the form module:Simulation"),
+        (":Walk", "not of the form module:Simulation"),
+        ("walkin:Walk", "did you mean walking?"),
+        ("walking:Wlak", "did you mean Walk?"),
+        ("walking:Xyz", "it has the simulations Walk, Limping"),
+        ("walking:Walk.nothing", "Walk has no 'nothing'"),
+        ("simenv_marl.registraton:x", "did you mean simenv_marl.registration?"),
+        ("broken_walk:Walk", "needs 'no_such_package_at_all'"),
+        ("failing_walk:Walk", "cannot be imported: ZeroDivisionError"),
+        ("walking:number", "is no simulation"),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "inspect"])
+def test_what_cannot_be_looked_at(command, target, told, capsys):
+    assert main([command, target]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert told in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["chek", "walking:Walk"],
+        ["check"],
+        ["check", "walking:Walk", "--seed", "-1"],
+        ["check", "walking:Walk", "--episodes", "0"],
+        ["check", "walking:Walk", "--time-limit", "never"],
+    ],
+)
+def test_wrong_arguments(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage" in capsys.readouterr().err

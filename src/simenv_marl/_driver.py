@@ -58,7 +58,7 @@ class Refused:
 FINISHED: Final = Sentinel("FINISHED")
 FAILED: Final = Sentinel("FAILED")
 STUCK: Final = Sentinel("STUCK")
-"""What ``throw`` returns where nothing comes from the simulation any more."""
+"""What ``throw`` returns, with for how many seconds it has waited, where nothing comes from the simulation."""
 REFUSED: Final = Refused()
 
 Event = tuple[Any, Any, Any]

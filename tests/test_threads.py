@@ -382,6 +382,7 @@ needs_signals = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="
 
 
 def interrupt():
+    time.sleep(0.02)  # by now it is waited for the simulation
     signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
 

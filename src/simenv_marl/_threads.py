@@ -16,6 +16,9 @@ from .simulation import RULE, Sentinel
 SECONDS_TO_UNWIND: Final = 5.0
 """How long a simulation that is to be unwound may take to its next decision or to its end."""
 
+_A_WHILE: Final = 1.0
+"""For how many seconds the user waits before it looks around: a Ctrl-C just before a wait does not wake from it."""
+
 _NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
 
@@ -110,7 +113,7 @@ class ThreadDriver(Watchful):
             _wake(self._resumed)
         arrived = self._arrived
         while (event := self._event) is None:
-            arrived.acquire()
+            arrived.acquire(True, _A_WHILE)
         self._event = None
         return event
 

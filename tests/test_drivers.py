@@ -529,6 +529,27 @@ def test_a_model_in_a_thread_that_forks_cannot_decide_in_the_child():
 
 
 @needs_fork
+def test_what_a_forked_model_in_a_thread_does_not_catch_is_printed():
+    said = run("""
+        decide = decision()
+        def main(simulation):
+            decide()
+            child = os.fork()
+            if child == 0:
+                os.dup2(1, 2)
+            else:
+                os.waitpid(child, 0)
+            decide()
+        env = single_env(script(main), decide, driver="thread")
+        env.reset()
+        env.step(1)
+        env.close()
+    """)
+    assert "WrongThreadError" in said
+    assert "forked" in said
+
+
+@needs_fork
 @DRIVERS
 def test_a_fork_while_other_threads_are_moving_leaves_nothing_of_them_in_the_child(driver):
     said = run(f"""

@@ -70,6 +70,8 @@ class ThreadDriver(Watchful):
             # Nobody is going to read it, and what its frames hold must go while this thread is there: greenlets of
             # the model's own can unwind nowhere else.
             self._end[1].__traceback__ = self._end[1].__context__ = None
+        if self._end[0] is FAILED and self.lost():
+            raise self._end[1]  # the model has forked, and in this process there is nobody else to be told
         self._event = self._end
         _wake(self._arrived)
 

@@ -46,10 +46,11 @@ def simulation_threads():
 
 
 @pytest.fixture(autouse=True)
-def _no_thread_is_left_behind():
+def older_threads():
+    """Those that were there before the test. It is to leave no others."""
     gc.collect()
     before = simulation_threads()
-    yield
+    yield before
     gc.collect()
     assert simulation_threads() == before
 
@@ -418,7 +419,7 @@ def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_
 
 
 @needs_signals
-def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkeypatch):
+def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkeypatch, older_threads):
     monkeypatch.setattr(_threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, log = threading.Event(), []
 
@@ -436,7 +437,7 @@ def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkey
     decide = decision()
     env = single_env(script(main), decide, driver="thread")
     env.reset()
-    (stuck,) = simulation_threads()
+    (stuck,) = set(simulation_threads()) - set(older_threads)
     with pytest.raises(KeyboardInterrupt), pytest.warns(ResourceWarning, match=r"Script.*neither decided"):
         env.step(1)
     env.reset()
@@ -449,7 +450,7 @@ def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkey
 
 
 @pytest.mark.parametrize("how", ["close", "collect"])
-def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(monkeypatch, how):
+def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(monkeypatch, how, older_threads):
     monkeypatch.setattr(_threads, "SECONDS_TO_UNWIND", 0.05)
     go_on = threading.Event()
 
@@ -462,7 +463,7 @@ def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(mon
     decide = decision()
     env = single_env(script(main), decide, driver="thread")
     env.reset()
-    (stuck,) = simulation_threads()
+    (stuck,) = set(simulation_threads()) - set(older_threads)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if how == "close":
@@ -474,7 +475,7 @@ def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(mon
     stuck.join(10)
 
 
-def test_a_model_that_refuses_to_unwind_is_left_suspended():
+def test_a_model_that_refuses_to_unwind_is_left_suspended(older_threads):
     stop = [False]
 
     def main(simulation):
@@ -485,7 +486,7 @@ def test_a_model_that_refuses_to_unwind_is_left_suspended():
     decide = decision()
     env = single_env(script(main), decide, driver="thread")
     env.reset()
-    (left,) = simulation_threads()
+    (left,) = set(simulation_threads()) - set(older_threads)
     with pytest.warns(ResourceWarning, match="Script refuses to end"):
         env.close()
     assert left.is_alive()

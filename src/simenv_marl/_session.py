@@ -44,17 +44,16 @@ class Session:
         self._episode: Episode | None = None
         self._closed = False
         self._starting = False
-        self._held = False
-        self._plugins = plan.plugins
+        self._held: list[Any] = []
         self._surroundings = Surroundings(plan.surroundings())
         self._offspring = Offspring()
-        self._hold_sites()
+        self._hold_patches()
         try:
             with self.at_work(), preparing(self._offspring):
                 self.simulation = plan.make_simulation()
                 self._reset = resetter(self.simulation)
         except BaseException:
-            self._let_go_of_sites()
+            self._let_go_of_patches()
             raise
 
     def start(
@@ -90,10 +89,11 @@ class Session:
         generator: np.random.Generator,
         kind: type[AnyEpisode],
     ) -> AnyEpisode:
-        self._hold_sites()
+        self._hold_patches()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
             with self.at_work(), preparing(self._offspring):
+                self._surroundings.begin(self.seed)
                 self._reset(self.seed, options)
         except BaseException as error:
             error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
@@ -150,37 +150,28 @@ class Session:
         finally:
             if self._episode is None and not self._starting:
                 self._closed = True
-                self._let_go_of_sites()
+                self._let_go_of_patches()
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
         if self._episode is not None:
             self._episode.abandon()
-        self._let_go_of_sites()
+        self._let_go_of_patches()
 
-    def _hold_sites(self) -> None:
+    def _hold_patches(self) -> None:
         if self._held:
             return
-        done = []
         try:
-            for site in self.plan.sites:
-                site.hold()
-                done.append(site)
-            if self._plugins is not None:
-                self._plugins.hold()
+            for patch in self.plan.patches:
+                patch.hold()
+                self._held.append(patch)
         except BaseException:
-            for site in done:
-                site.let_go()
+            self._let_go_of_patches()
             raise
-        self._held = True
 
-    def _let_go_of_sites(self) -> None:
-        if self._held:
-            self._held = False
-            if self._plugins is not None:
-                self._plugins.let_go()
-            for site in self.plan.sites:
-                site.let_go()
+    def _let_go_of_patches(self) -> None:
+        while self._held:
+            self._held.pop().let_go()
 
 
 def checked_seed(seed: Any) -> int | None:

@@ -36,6 +36,11 @@ class Surroundings:
             finally:
                 self.leave()
 
+    def begin(self, seed: int) -> None:
+        """An episode begins."""
+        for surrounding in self._surroundings:
+            surrounding.begin(seed)
+
     def enter(self) -> None:
         """Put them up."""
         done = []

@@ -8,8 +8,8 @@ finds theirs again afterwards. Whoever's state is in place *owns* the generators
 from __future__ import annotations
 
 import random
+from _random import Random as Twister
 from collections.abc import Callable
-from contextlib import suppress
 from ctypes import memmove, string_at
 from threading import get_ident
 from typing import Any, Final, Protocol
@@ -23,6 +23,7 @@ _WORDS: Final = 4 * 625  # of both generators: 624 words of a Mersenne twister, 
 
 _python: Any = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
 _numpy: Any = np.random.mtrand._rand
+_legacy: Any = np.random  # some of whose functions its stubs leave out
 
 
 class State(Protocol):
@@ -34,20 +35,27 @@ class State(Protocol):
     def load(self) -> None:
         """Put it in place."""
 
+    def separate(self) -> None:
+        """Share it with nobody any more, who might go on drawing from it."""
+
 
 class PortableState:
     """A state that is saved and loaded by the generators' own functions; takes some 150 microseconds."""
 
     def save(self) -> None:
         """Take it from there."""
-        self._python, self._generator = random.getstate(), np.random.get_bit_generator()
+        self._python, self._generator = random.getstate(), _legacy.get_bit_generator()
         self._numpy = np.random.get_state(legacy=False)
 
     def load(self) -> None:
         """Put it in place."""
         random.setstate(self._python)
-        np.random.set_bit_generator(self._generator)
+        _legacy.set_bit_generator(self._generator)
         np.random.set_state(self._numpy)
+
+    def separate(self) -> None:
+        """Share it with nobody any more."""
+        self._generator = _copied(self._generator)
 
 
 class SwiftState:
@@ -60,15 +68,19 @@ class SwiftState:
         """Take it from there."""
         self._python = string_at(id(_python) + _HEADER, _WORDS)
         self._next = _python.gauss_next
-        self._generator = np.random.get_bit_generator()
+        self._generator = _legacy.get_bit_generator()
         self._gauss = string_at(id(_numpy) + self.gauss_at, 16)
 
     def load(self) -> None:
         """Put it in place."""
         memmove(id(_python) + _HEADER, self._python, _WORDS)
         _python.gauss_next = self._next
-        np.random.set_bit_generator(self._generator)  # which forgets the number that is kept
+        _legacy.set_bit_generator(self._generator)  # which forgets the number that is kept
         memmove(id(_numpy) + self.gauss_at, self._gauss, 16)
+
+    def separate(self) -> None:
+        """Share it with nobody any more."""
+        self._generator = _copied(self._generator)
 
 
 def _is_swift() -> bool:
@@ -78,9 +90,9 @@ def _is_swift() -> bool:
     try:
         random.seed(1)
         np.random.seed(1)
-        kept = np.random.standard_normal(1) * 0 + np.random.get_state(legacy=False)["gauss"]  # type: ignore[call-overload]
+        kept = _legacy.standard_normal(1) * 0 + _legacy.get_state(legacy=False)["gauss"]
         place = string_at(id(_numpy), type(_numpy).__basicsize__).find(kept.tobytes())
-        if place < 8 + _HEADER or type(_python).__base__.__basicsize__ not in range(_WORDS, _WORDS + 64):
+        if place < 8 + _HEADER or Twister.__basicsize__ not in range(_WORDS, _WORDS + 64):
             return False
         SwiftState.gauss_at = place - 8  # before it, whether it is there
         random.gauss(0, 1)
@@ -97,8 +109,7 @@ def _draws(saved: State | None) -> list[float]:
     """Draw from everything that there is, after a state was saved; then make everything different."""
     if saved is not None:
         saved.save()
-        if saved is not None and hasattr(saved, "_generator"):
-            saved._generator = _copied(saved._generator)
+        saved.separate()
     drawn = [random.gauss(0, 1), np.random.standard_normal(), random.random(), np.random.random()]
     drawn += [random.gauss(0, 1), np.random.standard_normal()]
     random.seed(2)
@@ -108,9 +119,11 @@ def _draws(saved: State | None) -> list[float]:
 
 
 def _copied(generator: Any) -> Any:
-    copy = type(generator)()
-    copy.state = generator.state
-    return copy
+    """A Mersenne twister, which alone can be seeded by ``numpy.random.seed``: the same, or a new one."""
+    twister = np.random.MT19937()
+    if type(generator) is np.random.MT19937:
+        twister.state = generator.state
+    return twister
 
 
 _State: Final[Callable[[], State]] = SwiftState if _is_swift() else PortableState
@@ -140,8 +153,7 @@ class GlobalRandom:
         """Make a state that is the present one, until ``begin`` says otherwise."""
         self._owner = _Owner()
         self._owner.state.save()
-        with suppress(AttributeError):  # shared it would be drawn from by both
-            self._owner.state._generator = _copied(self._owner.state._generator)  # type: ignore[attr-defined]
+        self._owner.state.separate()
 
     def begin(self, seed: int) -> None:
         """Seed the generators, which are in place, for an episode: both with its seed."""

@@ -26,6 +26,7 @@ The layers, each importing only from those above it::
     _session      a simulation over all episodes of one environment
     policies      policies back in the model's own loop
     envs          views: an episode read as a PettingZoo or Gymnasium environment
+    branching     exact continuations of an episode that is going on
     registration  into the registries of Gymnasium and PettingZoo
     testing       checks of a simulation; imported by its users alone
     __main__      the same on the command line
@@ -34,6 +35,7 @@ The layers, each importing only from those above it::
 from . import errors
 from ._handlers import Call, ChangedArgs, ChangedResult
 from ._provenance import provenance
+from .branching import branch
 from .decision import Definition, difference, make_step
 from .envs import (
     SimulationAECEnv,
@@ -80,6 +82,7 @@ __all__ = [
     "aec_env",
     "attach_handler",
     "attached_handlers",
+    "branch",
     "decision_points",
     "difference",
     "errors",

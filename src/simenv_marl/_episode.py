@@ -24,6 +24,7 @@ Views read the records of agents; none of them computes an observation or a rewa
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from threading import get_ident
@@ -47,6 +48,7 @@ from ._driver import (
 from ._greenlets import GreenletDriver
 from ._plan import Binding, Plan, Removal
 from ._record import Record, not_finite, number
+from ._spaces import duplicate, same
 from ._threads import ThreadDriver
 from .decision import DIFFERENCES
 from .errors import (
@@ -65,6 +67,19 @@ its processes at each try."""
 UNNAMED: Final = Sentinel("UNNAMED")
 NAMED_AT_CALL: Final = Sentinel("NAMED_AT_CALL")
 
+MOST_TAKEN: Final = 200_000
+"""How many actions are kept for a replay. A simulation that never ends is not to fill the memory."""
+
+
+class _Lost(list[Any]):
+    """Stands in for actions that became too many."""
+
+    def append(self, action: Any) -> None:
+        """Keep nothing."""
+
+
+LOST: Final = _Lost()
+
 DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {"greenlet": GreenletDriver, "thread": ThreadDriver}
 
 
@@ -80,10 +95,19 @@ class Episode:
         over: Whether the episode is over.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
         turns: How many actions the environment's user has given.
+        taken: These actions, copied where they could change.
+        consulted: What policies have answered. Either is ``LOST`` once it would have become too long.
         clock: Returns the simulation's time; None where it has none.
     """
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None, offspring: Offspring | None = None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        simulation: Any,
+        seed: int | None,
+        offspring: Offspring | None = None,
+        foretold: deque[Any] | None = None,
+    ) -> None:
         """Begin an episode of a simulation that has been reset: run it to its first decision.
 
         Args:
@@ -91,6 +115,7 @@ class Episode:
             simulation: The simulation.
             seed: What it was reset with, for those who read an error's notes.
             offspring: The threads that the simulation has started so far; None: it was never used before.
+            foretold: What policies are to answer before they are asked themselves, where an episode is replayed.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
@@ -102,12 +127,17 @@ class Episode:
         self.parting: list[Record] = []
         self.over = self.terminated = self.truncated = False
         self.turns = 0
+        self.taken: list[Any] = []
+        self.consulted: list[Any] = []
+        self._foretold = foretold
         # By binding: whose decision it is, where nothing but the mappings is to be seen to.
         self._swift: dict[Any, Any] = {}
         self._answered: dict[str, Record] = {}  # those for whom policies answer
         self._latest: Record | None = None
         self._plan, self._simulation, self._seed = plan, simulation, seed
-        self._max_turns = plan.options.max_steps or -1  # never reached
+        self._most_turns = plan.options.max_steps or -1  # never reached
+        # When either an episode is truncated or its actions are no longer kept.
+        self._max_turns = MOST_TAKEN if self._most_turns < 0 else min(self._most_turns, MOST_TAKEN)
         self._failed_in_model = False
         self.clock = getattr(simulation, "time", None)
         for agent, binding in () if plan.unanswered else plan.roster.items():
@@ -178,11 +208,14 @@ class Episode:
                 reply = action
             else:
                 reply = binding.reply(action, record.agent, record.mask, record.choices)
+                action = duplicate(action)
         except Exception as error:
             self._annotate(error)
             raise
         self.pending = None
         self.turns = turns = self.turns + 1
+        taken = self.taken
+        taken.append(action)
         if record.followed_up:
             record.follow_up()
         try:
@@ -266,9 +299,11 @@ class Episode:
 
     def _arise(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """A decision of the environment's user has arisen."""
-        if self.turns == self._max_turns:
+        if self.turns == self._most_turns:
             self._finish(truncated=True)
             return
+        if self.turns == self._max_turns:
+            self._max_turns, self.taken = self._most_turns, LOST
         record.settle(args, kwargs)
         binding = record.binding
         if self.clock is None and binding.legal is None and binding.point.alone:
@@ -313,13 +348,38 @@ class Episode:
         if record.policy is RULE:
             return RULE
         record.observe(args, kwargs)
-        action, choices = record.policy(record.observation, record.info), record.choices
+        foretold, choices, consulted = self._foretold, record.choices, self.consulted
+        action = foretold.popleft() if foretold else record.policy(record.observation, record.info)
+        if len(consulted) == MOST_TAKEN:
+            self.consulted = LOST
+        self.consulted.append(duplicate(action))
         record.follow_up()
         return RULE if action is RULE else record.binding.reply(action, record.agent, record.mask, choices)
 
     def record(self, agent: str) -> Record | None:
         """What is known of an agent of the environment, whether it lives or is gone."""
         return self.agents.get(agent) or self.gone.get(agent)
+
+    def replay(self, taken: list[Any]) -> None:
+        """Give the actions of another episode once more.
+
+        Raises:
+            BaseException: Whatever the model or a mapping raises.
+        """
+        for action in taken:
+            self.turn(action)
+
+    def stands_as(self, other: Episode) -> bool:
+        """Whether the pending decision looks just like that of another episode."""
+        mine, theirs = self.pending, other.pending
+        if mine is None or theirs is None:
+            return mine is theirs
+        return (
+            mine.agent == theirs.agent
+            and list(self.agents) == list(other.agents)
+            and same(mine.observation, theirs.observation)
+            and same(mine.mask, theirs.mask)
+        )
 
     # -- agents announced beforehand --------------------------------------------------------------
 

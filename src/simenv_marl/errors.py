@@ -12,7 +12,8 @@
     |-- AgentError           (ValueError)    names of agents that clash or are none
     |-- UnknownAgentError    (LookupError)   an agent that the environment does not know
     |-- ViewError            (ValueError)    a view that these decision points do not allow
-    |-- CopyError            (TypeError)     an environment that was to be copied or pickled
+    |-- CopyError            (TypeError)     an environment that was to be copied in mid-episode
+    |-- BranchError          (RuntimeError)  a branch of an episode that could not be made, or died
     |-- UnknownOptionError   (TypeError)     an option that does not exist
     |-- OptionValueError     (ValueError)    an option that cannot have this value
     |-- InvalidActionError   (ValueError)    an action that is not legal; nothing has moved
@@ -37,6 +38,7 @@ from pathlib import Path
 
 __all__ = [
     "AgentError",
+    "BranchError",
     "CheckFailedError",
     "ClosedError",
     "CopyError",
@@ -115,7 +117,11 @@ class ViewError(SimEnvError, ValueError):
 
 
 class CopyError(SimEnvError, TypeError):
-    """An environment was to be copied or pickled, which it cannot be."""
+    """An environment was to be copied or pickled in mid-episode."""
+
+
+class BranchError(SimEnvError, RuntimeError):
+    """A branch of an episode could not be made, or has died without an answer."""
 
 
 class UnknownOptionError(SimEnvError, TypeError):

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from .._plan import Plan
 from ..errors import OptionValueError
+from ._view import View
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
 from .parallel import SimulationParallelEnv
@@ -18,6 +19,7 @@ __all__ = [
     "SimulationEnv",
     "SimulationJointEnv",
     "SimulationParallelEnv",
+    "View",
     "aec_env",
     "generate_env",
     "joint_env",

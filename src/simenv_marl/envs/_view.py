@@ -7,6 +7,7 @@ import os
 import weakref
 from collections.abc import Callable
 from functools import wraps
+from sys import modules
 from threading import RLock
 from typing import Any
 
@@ -42,10 +43,12 @@ class View:
         """
         self.check(plan)
         super().__init__()
+        self._claimed_by: type[View] | None = None
         if plan.options.driver == "thread":
+            self._claimed_by = type(self)
             self.__class__ = _one_at_a_time(type(self))
             self._claim = _Claim()
-        self._plan = plan
+        self._plan = self._made_of = plan
         self._session = Session(plan)
         self._finalizer = weakref.finalize(self, self._session.abandon)
         self._episode: Episode | None = None
@@ -139,9 +142,81 @@ class View:
             if self._episode is None or self._episode.over:
                 self._clear()
 
+    def __deepcopy__(self, memory: dict[int, Any]) -> Any:
+        """Copy it, between episodes: an environment like this one, with a simulation of its own."""
+        made = memory[id(self)] = _made_again(self._claimed_by or type(self), self._made_of)
+        made.__setstate__(copy.deepcopy(self._kept(), memory))
+        return made
+
+    def __copy__(self) -> Any:
+        return copy.deepcopy(self)
+
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Refuse to be copied or pickled: the stack of a simulation cannot be."""
-        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
+        """Be pickled, between episodes: to an environment like this one, with a simulation of its own."""
+        made = self._claimed_by or type(self)
+        found: Any = modules.get(made.__module__)
+        for name in made.__qualname__.split("."):
+            found = getattr(found, name, None)
+        if found is not made:  # a class that generate_env has made, and which nobody would find by its name
+            made = next(base for base in made.__mro__ if base.__module__.startswith(__package__))
+        return _made_again, (made, self._made_of), self._kept()
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self._session.seed = kept.pop("seed")
+        vars(self).update(kept)
+
+    def _kept(self) -> dict[str, Any]:
+        """What a copy takes over.
+
+        Raises:
+            CopyError: An episode is going on, and the stack of a simulation cannot be copied.
+        """
+        if self._in_mid_episode():
+            raise CopyError(
+                f"{type(self).__name__} can be copied and pickled between episodes, and not in mid-episode: close() or"
+                " reset it afterwards, or see branch() for copies of a running simulation"
+            )
+        return self._state()
+
+    def _state(self) -> dict[str, Any]:
+        kept = {name: value for name, value in vars(self).items() if name not in _OWN}
+        return kept | {"seed": self._session.seed}
+
+    @property
+    def driver(self) -> str:
+        """What switches between the simulation and its user."""
+        return self._plan.options.driver
+
+    def check_pending(self) -> None:
+        """Make sure that a decision is pending.
+
+        Raises:
+            ResetNeededError: None is.
+            ReentrancyError: The simulation is moving.
+        """
+        if self._episode is None:
+            raise self._session.not_running()
+        if self._episode.pending is None:
+            raise self._episode.nothing_pending()
+
+    def replayed(self) -> Any:
+        """Make an environment that stands just where this one stands in mid-episode: a copy for ``branch``.
+
+        Raises:
+            BranchError: It cannot be brought there.
+            ResetNeededError: There is no episode that could be brought anywhere.
+        """
+        made = _made_again(self._claimed_by or type(self), self._made_of)
+        made.__setstate__(copy.deepcopy(self._state()))
+        made._go_on(made._session.replay(self._session))
+        return made
+
+    def _go_on(self, episode: Any) -> None:
+        """Take over an episode in the midst of it."""
+        self._episode = episode
+
+    def _in_mid_episode(self) -> bool:
+        return self._episode is not None and not self._episode.over
 
     def _clear(self) -> None:
         """Forget the episode."""
@@ -229,6 +304,20 @@ class AgentsView(View):
         if record is None or record.observation is None:
             return blank(self._binding(agent).definition.observation_space)
         return duplicate(record.observation)
+
+
+def _made_again(view: type[View], plan: Plan) -> View:
+    """An environment of a class, of which a plan is all that is known."""
+    made = view.__new__(view)
+    base: Any = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
+    base.__init__(made, plan)
+    return made
+
+
+_OWN = frozenset(
+    ("_claim", "_claimed_by", "_episode", "_finalizer", "_made_of", "_plan", "_record", "_session", "metadata")
+)
+"""What each environment has of its own, and no copy takes over."""
 
 
 # -- many threads ---------------------------------------------------------------------------------

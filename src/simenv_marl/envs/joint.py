@@ -46,7 +46,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             with_seed = self._session.start(0, None, np.random.default_rng(0), Rounds)
             roster = {agent: record.binding for agent, record in with_seed.agents.items()}
             self._session.close()
-            self._plan = self._session.plan = plan.declared(roster)
+            self._plan = self._made_of = self._session.plan = plan.declared(roster)
         self._agents = list(roster)
         observations = {agent: deepcopy(binding.definition.observation_space) for agent, binding in roster.items()}
         actions = {agent: deepcopy(binding.definition.action_space) for agent, binding in roster.items()}

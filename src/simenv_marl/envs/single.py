@@ -112,6 +112,10 @@ class SimulationEnv(View, gym.Env[Any, Any]):
             record.info,
         )
 
+    def _go_on(self, episode: Any) -> None:
+        super()._go_on(episode)
+        self._record = episode.agents[self._agent]
+
     def _clear(self) -> None:
         super()._clear()
         self._record = None
@@ -133,6 +137,7 @@ class SimulationGoalEnv(SimulationEnv):
         self.check(plan)
         self._definition = plan.active[0].definition
         super().__init__(plan.redefined(plan.active[0].point, _with_goals(self._definition)))
+        self._made_of = plan
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:
         """What the rewards had been, had these been the goals.

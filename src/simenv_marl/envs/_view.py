@@ -10,6 +10,7 @@ from functools import wraps
 from threading import RLock
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
@@ -43,8 +44,7 @@ class View:
         self.check(plan)
         super().__init__()
         if plan.options.driver == "thread":
-            self.__class__ = _one_at_a_time(type(self))
-            self._claim = _Claim()
+            one_at_a_time(self)
         self._plan = plan
         self._session = Session(plan)
         self._finalizer = weakref.finalize(self, self._session.abandon)
@@ -146,6 +146,23 @@ class View:
     def _clear(self) -> None:
         """Forget the episode."""
         self._episode = None
+
+
+class OneAgentView(View, gym.Env[Any, Any]):
+    """A view with one agent, and so a Gymnasium environment."""
+
+    _agent: str
+
+    def _begin(self, seed: int | None, options: dict[str, Any] | None, kind: type[AnyEpisode]) -> AnyEpisode:
+        """End the episode that runs, begin another, and seed the generator and the spaces."""
+        seed = checked_seed(seed)
+        self._make_way()
+        gym.Env.reset(self, seed=seed)
+        episode = self._session.start(seed, options, self.np_random, kind)
+        if seed is not None:
+            seed_space(self.observation_space, seed, self._agent)
+            seed_space(self.action_space, seed, self._agent)
+        return episode
 
 
 class AgentsView(View):
@@ -253,12 +270,17 @@ class _Claim:
         self._lock.release()
 
 
-def _one_at_a_time(view: type[View]) -> type[View]:
-    """The same class of environments, but for changing threads: what moves the simulation claims it before.
+def one_at_a_time(env: Any) -> None:
+    """Have an environment be used from changing threads: what moves its simulation claims it before.
 
-    A class of its own, so that environments which stay in their thread have nothing to pay for it.
+    It gets a class of its own, so that environments which stay in their thread have nothing to pay for it.
     """
-    made: type[View] | None = vars(view).get("_claiming")
+    env.__class__ = _one_at_a_time(type(env))
+    env._claim = _Claim()
+
+
+def _one_at_a_time(view: type[Any]) -> type[Any]:
+    made: type[Any] | None = vars(view).get("_claiming")
     if made is None:
         claiming = {name: _claiming(getattr(view, name)) for name in ("reset", "step", "close")}
         same = {name: getattr(view, name) for name in ("__module__", "__qualname__", "__doc__")}

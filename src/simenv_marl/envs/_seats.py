@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, concatenate, iterate
 from numpy.typing import NDArray
 
+from .._episode import turn_together
 from .._plan import Plan
 from .._session import AnyEpisode, Session, checked_seed, seed_space
 from ..errors import InvalidActionError, OptionValueError
@@ -27,6 +28,9 @@ from .single import SimulationEnv, SimulationGoalEnv, single_view, with_goals
 
 Told = list[tuple[int, dict[str, Any]]]
 """Infos, each with the number of its seat, in the order in which they are to be merged."""
+
+End = tuple[int, bool, bool]
+"""The number of a seat whose episode has ended; whether it has terminated; whether it was truncated."""
 
 IGNORED: Final = Sentinel("IGNORED")
 """Stands for an action that is not used."""
@@ -378,9 +382,9 @@ class Row:
         Raises:
             BaseException: What making a simulation raises.
         """
-        self._batch, self._mode, self._offset, self._single = batch, mode, offset, seating.single
+        self._batch, self._mode, self._offset = batch, mode, offset
         self._write = writer(seating.single_observation_space, batch.observations)
-        self._shows = seating.plan.options.render_mode == "human"
+        self._swift = seating.single and seating.plan.options.render_mode != "human"
         self._rows: list[Any] = [None] * number
         self.ended: set[int] = set()
         self.failed = False
@@ -414,7 +418,7 @@ class Row:
                 self._rows[number], info = self.seats[number].reset(seed=seeds[number], options=options)
                 told.append((number, info))
         except BaseException as error:
-            self._fail(number, error, moved=number != chosen[0])
+            self._fail(number, error, chosen[0])
             raise
         for number in chosen:
             self._batch.terminations[number] = self._batch.truncations[number] = False
@@ -448,55 +452,89 @@ class Row:
         Raises:
             BaseException: Whatever a simulation or a mapping raises. Unless nothing has moved, the row has ``failed``.
         """
-        rows, shows, single = self._rows, self._shows, self._single
-        at_once = self._mode == AutoresetMode.SAME_STEP
-        waiting = self.ended if self._mode == AutoresetMode.NEXT_STEP else ()
         told: Told = []
-        rewards: list[float] = []
-        ends: list[tuple[int, bool, bool]] = []
-        number = 0
-        try:
-            for number, (seat, action) in enumerate(zip(self.seats, actions, strict=True)):
-                if number in waiting:
-                    rows[number], info = seat.reset()
-                    rewards.append(0.0)
-                elif single:
-                    # What ``SimulationEnv.step`` does, without the call.
-                    episode = seat._episode
-                    episode.turn(action)
-                    if shows:
-                        seat.render()
-                    record = seat._record
-                    rows[number], info = record.observation, record.info
-                    rewards.append(record.reward)
-                    if episode.over:
-                        ends.append((number, episode.terminated or record.ended, episode.truncated and not record.ended))
-                else:
-                    rows[number], reward, terminated, truncated, info = seat.step(action)
-                    rewards.append(reward)
-                    if terminated or truncated:
-                        ends.append((number, terminated, truncated))
-                if at_once and ends and ends[-1][0] == number:
-                    told.append((number, {"final_obs": rows[number], "final_info": info}))
-                    rows[number], info = seat.reset()
-                if info:
-                    told.append((number, info))
-        except BaseException as error:
-            self._fail(number, error, moved=number > 0)
-            raise
+        rewards, ends = (self._turns if self._swift else self._steps)(actions, told)
         batch = self._batch
         batch.rewards[:] = rewards
         batch.terminations.fill(False)
         batch.truncations.fill(False)
-        for number, batch.terminations[number], batch.truncations[number] in ends:
-            pass
-        self.ended = set() if at_once else {number for number, *_ in ends}
-        batch.observations = self._write(rows)
+        for number, terminated, truncated in ends:
+            batch.terminations[number], batch.truncations[number] = terminated, truncated
+        self.ended = {number for number, *_ in ends} if self._mode != AutoresetMode.SAME_STEP else set()
+        batch.observations = self._write(self._rows)
         return told
 
-    def _fail(self, number: int, error: BaseException, *, moved: bool) -> None:
+    def _turns(self, actions: Sequence[Any], told: Told) -> tuple[list[float], list[End]]:
+        """What ``_steps`` does, for seats of the single view, without a call of ``SimulationEnv.step`` for each."""
+        seats, mode = self.seats, self._mode
+        waiting = self.ended
+        if waiting:
+            for number in waiting:
+                self._again(number)
+            moving = [number for number in range(len(seats)) if number not in waiting]
+            others = moving and turn_together(
+                [seats[number]._episode for number in moving],
+                [actions[number] for number in moving],
+                lambda number, error: self._fail(moving[number], error),
+            )
+            others = sorted((*waiting, *(moving[number] for number in others)))
+        else:
+            others = turn_together([seat._episode for seat in seats], actions, self._fail)
+        records = [seat._record for seat in seats]
+        self._rows = rows = [record.observation for record in records]
+        rewards = [record.reward for record in records]
+        for number in waiting:
+            rewards[number] = 0.0
+        ends: list[End] = []
+        for number in others:
+            info, episode = records[number].info, seats[number]._episode
+            if episode.over:
+                removed = records[number].ended
+                ends.append((number, episode.terminated or removed, episode.truncated and not removed))
+                if mode == AutoresetMode.SAME_STEP:
+                    told.append((number, {"final_obs": rows[number], "final_info": info}))
+                    rows[number], info = self._again(number)
+            if info:
+                told.append((number, info))
+        return rewards, ends
+
+    def _steps(self, actions: Sequence[Any], told: Told) -> tuple[list[float], list[End]]:
+        """Step each seat, or reset it. Returns the rewards, and whose episode has ended and how."""
+        rewards: list[float] = []
+        ends: list[End] = []
+        number = 0
+        for number, (seat, action) in enumerate(zip(self.seats, actions, strict=True)):
+            if action is IGNORED:
+                self._rows[number], info = self._again(number)
+                rewards.append(0.0)
+            else:
+                try:
+                    self._rows[number], reward, terminated, truncated, info = seat.step(action)
+                except BaseException as error:
+                    self._fail(number, error)
+                    raise
+                rewards.append(reward)
+                if terminated or truncated:
+                    ends.append((number, terminated, truncated))
+                    if self._mode == AutoresetMode.SAME_STEP:
+                        told.append((number, {"final_obs": self._rows[number], "final_info": info}))
+                        self._rows[number], info = self._again(number)
+            if info:
+                told.append((number, info))
+        return rewards, ends
+
+    def _again(self, number: int) -> tuple[Any, dict[str, Any]]:
+        """Begin the next episode of a seat whose episode has ended."""
+        try:
+            observation, info = self.seats[number].reset()
+        except BaseException as error:
+            self._fail(number, error)
+            raise
+        return observation, info
+
+    def _fail(self, number: int, error: BaseException, first: int = 0) -> None:
         error.add_note(f"simenv_marl: in sub-environment {self._offset + number}")
-        if moved or not self.seats[number].pending:
+        if number != first or not self.seats[number].pending:  # else nothing has moved
             self.failed = True
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:

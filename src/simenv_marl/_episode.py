@@ -525,6 +525,10 @@ def turn_together(
     Raises:
         BaseException: As ``Episode.turn``.
     """
+    episode: Any
+    record: Any
+    binding: Any
+    reward: Any
     if RUNNING or EVALUATING or type(episodes[0]) is not Episode:
         for index, (episode, action) in enumerate(zip(episodes, actions, strict=True)):
             try:
@@ -537,9 +541,6 @@ def turn_together(
     others: list[int] = []
     left = iter(events)
     del events
-    episode: Any
-    binding: Any
-    reward: Any
     try:
         for episode, (binding, args, kwargs) in zip(episodes, left):  # noqa: B905 - it would look for one more
             record, turns = episode._latest, episode.turns

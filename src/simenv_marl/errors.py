@@ -26,6 +26,7 @@
     |   `-- ClosedError                      ... because the environment was closed
     |-- ReentrancyError      (RuntimeError)  an environment stepped from inside itself
     |-- WrongThreadError     (RuntimeError)  an environment used from another thread
+    |-- WorkerError          (RuntimeError)  a process with simulations that died, or has raised what cannot be told
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
 Every error is raised with its message alone, so that it survives pickling.
@@ -60,6 +61,7 @@ __all__ = [
     "UnknownPointError",
     "UnknownTargetError",
     "ViewError",
+    "WorkerError",
     "WrongThreadError",
 ]
 
@@ -168,6 +170,10 @@ class ReentrancyError(SimEnvError, RuntimeError):
 
 class WrongThreadError(SimEnvError, RuntimeError):
     """An environment was used from a thread other than the one that has reset it."""
+
+
+class WorkerError(SimEnvError, RuntimeError):
+    """A process with simulations in it died, or something was raised there that cannot be told here as it was."""
 
 
 class CheckFailedError(SimEnvError, AssertionError):

@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 from .._plan import Plan
 from ..errors import OptionValueError
+from ._workers import Recipe
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
 from .parallel import SimulationParallelEnv
@@ -189,10 +190,9 @@ def vector_env(
         SimEnvError: Something in it cannot work; the leaf says what.
     """
     return SimulationVectorEnv(
-        Plan.draw_up(simulation, points, options),
+        Recipe(simulation, points, options, view),
         num_envs=num_envs,
         workers=workers,
-        view=view,
         copy=copy,
         autoreset_mode=autoreset_mode,
         context=context,

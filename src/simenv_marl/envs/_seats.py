@@ -21,7 +21,7 @@ from .._episode import turn_together
 from .._plan import Plan
 from .._session import AnyEpisode, Session, checked_seed, seed_space
 from ..errors import InvalidActionError, OptionValueError
-from ..simulation import RULE, Sentinel
+from ..simulation import RULE
 from ._view import OneAgentView
 from .joint import SimulationJointEnv
 from .single import SimulationEnv, SimulationGoalEnv, single_view, with_goals
@@ -32,8 +32,8 @@ Told = list[tuple[int, dict[str, Any]]]
 End = tuple[int, bool, bool]
 """The number of a seat whose episode has ended; whether it has terminated; whether it was truncated."""
 
-IGNORED: Final = Sentinel("IGNORED")
-"""Stands for an action that is not used."""
+IGNORED: Final = None
+"""Stands for an action that is not used; no space has it."""
 
 
 # -- seats ----------------------------------------------------------------------------------------
@@ -66,7 +66,7 @@ class Seat(OneAgentView):
         return self._own_spaces
 
     @property
-    def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+    def observation_space(self) -> spaces.Space[Any]:
         """The observation space, of this environment alone."""
         return self._spaces[0]
 
@@ -75,7 +75,7 @@ class Seat(OneAgentView):
         self._own_spaces = space, self._spaces[1]
 
     @property
-    def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+    def action_space(self) -> spaces.Space[Any]:
         """The action space, of this environment alone."""
         return self._spaces[1]
 
@@ -333,9 +333,13 @@ class Actions:
         if swift and isinstance(space, spaces.Discrete) and actions.dtype.kind in "iu":
             if actions.min() >= space.start and actions.max() < space.start + space.n:
                 return actions.tolist()  # type: ignore[no-any-return]
-        elif swift and isinstance(space, spaces.Box) and actions.dtype is space.dtype:
-            if ((actions >= space.low) & (actions <= space.high)).all():
-                return list(actions)
+        elif (
+            swift
+            and isinstance(space, spaces.Box)
+            and actions.dtype is space.dtype
+            and ((actions >= space.low) & (actions <= space.high)).all()
+        ):
+            return list(actions)
         apart = self._apart(actions)
         for number in range(self._number):
             if number in unused:
@@ -365,6 +369,7 @@ class Row:
 
     Attributes:
         seats: They.
+        batch: What they write into.
         ended: The numbers of those whose episode has ended and has not begun anew.
         failed: Whether an error has left some of them where the others are not, and all are to be reset.
     """
@@ -382,7 +387,7 @@ class Row:
         Raises:
             BaseException: What making a simulation raises.
         """
-        self._batch, self._mode, self._offset = batch, mode, offset
+        self.batch, self._mode, self._offset = batch, mode, offset
         self._write = writer(seating.single_observation_space, batch.observations)
         self._swift = seating.single and seating.plan.options.render_mode != "human"
         self._rows: list[Any] = [None] * number
@@ -421,9 +426,9 @@ class Row:
             self._fail(number, error, chosen[0])
             raise
         for number in chosen:
-            self._batch.terminations[number] = self._batch.truncations[number] = False
+            self.batch.terminations[number] = self.batch.truncations[number] = False
         self.ended.difference_update(chosen)
-        self._batch.observations = self._write(self._rows)
+        self.batch.observations = self._write(self._rows)
         self.failed = False
         return told
 
@@ -454,7 +459,7 @@ class Row:
         """
         told: Told = []
         rewards, ends = (self._turns if self._swift else self._steps)(actions, told)
-        batch = self._batch
+        batch = self.batch
         batch.rewards[:] = rewards
         batch.terminations.fill(False)
         batch.truncations.fill(False)
@@ -573,6 +578,11 @@ class Row:
                     raised.add_note(f"simenv_marl: and in sub-environment {self._offset + number}: {error!r}")
         if raised is not None:
             raise raised
+
+    @property
+    def observed(self) -> list[Any]:
+        """The latest observation of each seat."""
+        return self._rows
 
     @property
     def suspended(self) -> bool:

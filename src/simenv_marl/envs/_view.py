@@ -285,7 +285,7 @@ def _one_at_a_time(view: type[Any]) -> type[Any]:
         claiming = {name: _claiming(getattr(view, name)) for name in ("reset", "step", "close")}
         same = {name: getattr(view, name) for name in ("__module__", "__qualname__", "__doc__")}
         made = type(view.__name__, (view,), claiming | same)
-        view._claiming = made  # type: ignore[attr-defined]
+        view._claiming = made
     return made
 
 

@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from .._plan import Plan
 from .._session import checked_seed
 from .._spaces import duplicate
 from ..errors import (
@@ -24,6 +23,7 @@ from ..errors import (
 )
 from ._seats import Actions, Batch, Row, Seat, Seating
 from ._view import one_at_a_time
+from ._workers import Recipe, Workers
 
 
 class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
@@ -42,16 +42,15 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     def __init__(
         self,
-        plan: Plan,
+        recipe: Recipe,
         *,
         num_envs: int,
-        view: str | None = None,
         workers: int = 0,
         copy: bool = True,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         context: Any = None,
     ) -> None:
-        """Make the environment of a plan; the arguments are those of ``vector_env``.
+        """Make the environment of a recipe; the other arguments are those of ``vector_env``.
 
         Raises:
             SimEnvError: Something in it cannot work; the leaf says what.
@@ -61,8 +60,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         workers = _count(workers, "workers", 0)
         self._mode = _mode(autoreset_mode)
         self._copy = bool(copy)
-        seating = Seating(plan, view)
-        self._plan = seating.plan
+        plan = recipe.plan()
+        seating = Seating(plan, recipe.view)
         self.render_mode = plan.options.render_mode
         self.metadata = {**seating.metadata, "autoreset_mode": self._mode}
         self.single_observation_space = seating.single_observation_space
@@ -70,11 +69,16 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._actions = Actions(seating, self.num_envs)
-        self._batch = Batch(create_empty_array(self.single_observation_space, self.num_envs), self.num_envs)
         self._begun = self._moving = False
-        self._crew = Row(seating, self._batch, self._mode, self.num_envs)
+        self._crew: Row | Workers
+        if workers:
+            self._crew = Workers(recipe, seating, self._mode, self.num_envs, workers, context)
+        else:
+            batch = Batch(create_empty_array(self.single_observation_space, self.num_envs), self.num_envs)
+            self._crew = Row(seating, batch, self._mode, self.num_envs)
+        self._batch = self._crew.batch
         self._finalizer = weakref.finalize(self, self._crew.abandon)
-        if plan.options.driver == "thread":
+        if workers or plan.options.driver == "thread":
             one_at_a_time(self)
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -248,7 +252,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         finally:
             self._moving = False
 
-    @property
+    @property  # type: ignore[misc]  # one generator for each cannot be set as one
     def np_random(self) -> Any:
         """The generators of the sub-environments, as a tuple."""
         return self.get_attr("np_random")

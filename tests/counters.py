@@ -14,6 +14,7 @@ from .worlds import FuseError, World, advised, agent_of, points_of
 
 MODES = list(AutoresetMode)
 
+
 class Counter:
     """Counts to a number that its seed gives; every decision says by how much."""
 

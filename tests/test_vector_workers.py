@@ -41,6 +41,7 @@ ROOT = Path(__file__).parent.parent
 FORK = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
 """The quickest way to start a worker; which one it is makes no difference once it runs."""
 
+
 def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
     """A vector environment of four counters in two workers."""
     options = {"num_envs": 4, "workers": 2, "context": FORK, **options}
@@ -161,6 +162,7 @@ def test_models_and_mappings_that_no_module_holds_are_sent_along():
             observation_space=spaces.Box(0, 1000, (1,), np.int64),
             observation_space_mapping=lambda self: [self.count],
             action_space=spaces.Discrete(5),
+            action_space_mapping=int,
             reward_mapping=lambda self: float(self.count),
         )
         def decide(self) -> int:
@@ -263,7 +265,7 @@ def test_errors_of_the_tree_stay_themselves():
 def test_errors_in_a_factory_surface_where_the_environment_is_made():
     with pytest.raises(ZeroDivisionError) as caught:
         workers(Breaking(os.getpid()), num_envs=3)
-    assert "sub-environment" in notes(caught.value)
+    assert "worker 0" in notes(caught.value)
 
 
 class Breaking:
@@ -295,15 +297,14 @@ def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, c
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
 def test_workers_that_are_killed_between_steps_are_noticed():
-    for use in (lambda envs: envs.step(ONES), lambda envs: envs.call("simulation"), lambda envs: envs.close()):
+    for use in (lambda envs: envs.step(ONES), lambda envs: envs.call("simulation"), None):
         envs = workers(Failing)
         envs.reset(seed=0)
         for process in set(processes_of(envs)):
             os.kill(process, signal.SIGKILL)
-        try:
-            use(envs)
-        except WorkerError as error:
-            assert "exit code -9" in str(error)
+        if use is not None:
+            with pytest.raises(WorkerError, match="exit code -9"):
+                use(envs)
         envs.close()
         assert envs.closed
 
@@ -430,6 +431,7 @@ class Slow(Counter):
 
 
 SCRIPT = """
+import os
 import numpy as np
 from gymnasium import spaces
 from simenv_marl import make_step, vector_env
@@ -444,7 +446,7 @@ class Model:
 
     @make_step(
         observation_space=spaces.Box(0, 9, (1,), np.int64), observation_space_mapping=lambda self: [self.count],
-        action_space=spaces.Discrete(2), reward_mapping=lambda self: 1.0,
+        action_space=spaces.Discrete(2), action_space_mapping=int, reward_mapping=lambda self: 1.0,
     )
     def decide(self): return 0
 
@@ -457,7 +459,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("context", ["spawn", FORK])
-@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"])
+@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "os.kill(os.getpid(), 9)"])
 def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
     path = tmp_path / "script.py"
     path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
@@ -472,7 +474,7 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
     )
     lines = done.stdout.splitlines()
     assert lines[0] == "[[1], [0]]"
-    assert lines[1:] == ["unwound", "unwound"]
+    assert done.stdout.count("unwound") == 2
     if not end:
         assert done.stderr == ""
         assert done.returncode == 0

@@ -539,7 +539,7 @@ def turn_together(
         return range(len(episodes))
     events = _resume_together(episodes, actions, blame)
     others: list[int] = []
-    left = iter(events)
+    left: Any = iter(events)
     del events
     try:
         for episode, (binding, args, kwargs) in zip(episodes, left):  # noqa: B905 - it would look for one more
@@ -575,15 +575,16 @@ def turn_together(
             record.info = {}
             episode.pending = record
     except BaseException as error:
-        blame(len(episodes) - length_hint(left) - 1, error)
+        index, left = len(episodes) - length_hint(left) - 1, None
+        blame(index, error)
         raise
     return others
 
 
-def _resume_together(episodes: Any, actions: Any, blame: Callable[[int, BaseException], None]) -> list[Any]:
+def _resume_together(episodes: Any, actions: Any, blame: Callable[[int, BaseException], None]) -> Any:
     """Answer the decisions of many episodes. Returns the events that come next; none for those that went on alone."""
     here: Any = getcurrent()
-    events: list[Any] = []
+    events: Any = []
     add = events.append
     try:
         for episode, action in zip(episodes, actions, strict=True):
@@ -612,7 +613,9 @@ def _resume_together(episodes: Any, actions: Any, blame: Callable[[int, BaseExce
                 episode._fail(error)
                 raise
     except BaseException as error:
-        blame(len(events), error)
+        index = len(events)
+        events = add = resume = reply = None  # else the error would keep alive what they hold
+        blame(index, error)
         raise
     return events
 

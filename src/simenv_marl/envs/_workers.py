@@ -465,21 +465,36 @@ class Workers:
             asked.append(worker)
         return self._gather(asked, self._identity)
 
-    def _gather(self, asked: list[Worker], identity: int, seconds: float | None = None) -> list[tuple[Worker, Any]]:
+    def _gather(self, asked: list[Worker], identity: int) -> list[tuple[Worker, Any]]:
+        """Wait for answers.
+
+        Raises:
+            BaseException: What the first worker raises that raises anything.
+        """
+        results, errors = self._collect(asked, identity)
+        for worker in asked:
+            if worker in errors:
+                raise errors[worker]
+        return list(results.items())
+
+    def _collect(
+        self, asked: list[Worker], identity: int, seconds: float | None = None
+    ) -> tuple[dict[Worker, Any], dict[Worker, BaseException]]:
+        """Wait until all have answered, have died or have let some seconds go by. Returns results, and errors."""
         until = None if seconds is None else monotonic() + seconds
         results: dict[Worker, Any] = {}
         errors: dict[Worker, BaseException] = {}
         while left := [worker for worker in asked if worker not in results and worker not in errors]:
             remaining = None if until is None else max(until - monotonic(), 0.0)
-            pipes: list[Any] = [worker.pipe for worker in left]
-            if not wait([*pipes, *(worker.sentinel for worker in left)], remaining):
+            ready = wait([part for worker in left for part in (worker.pipe, worker.sentinel)], remaining)
+            if not ready:
                 break
             for worker in left:
+                if worker.pipe not in ready and worker.sentinel not in ready:
+                    continue
                 try:
-                    if not worker.pipe.poll():
-                        if wait([worker.sentinel], 0) and not worker.pipe.poll():
-                            errors[worker] = worker.died()
-                        continue
+                    if worker.pipe not in ready and not worker.pipe.poll():  # it has died, and has not answered before
+                        raise worker.died()
                     answered, fine, answer = worker.receive()
                 except WorkerError as error:
                     errors[worker] = error
@@ -490,10 +505,8 @@ class Workers:
                     results[worker] = answer
                 else:
                     errors[worker] = _unpacked(*answer)
-        for worker in asked:
-            if worker in errors:
-                raise errors[worker]
-        return [(worker, results[worker]) for worker in asked if worker in results]
+                    errors[worker].add_note(f"simenv_marl: in {worker.name}")
+        return {worker: results[worker] for worker in asked if worker in results}, errors
 
     # -- what a row does --------------------------------------------------------------------------
 
@@ -565,9 +578,12 @@ class Workers:
                 with suppress(WorkerError):
                     worker.send(dumps((self._identity, "close", ())))
             there = [worker for worker in there if worker.there]
-            answered = self._gather(there, self._identity, SECONDS_TO_CLOSE)
-            if len(answered) < len(there):
+            results, errors = self._collect(there, self._identity, SECONDS_TO_CLOSE)
+            if len(results) + len(errors) < len(there):
                 warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are ended by force", ResourceWarning)
+            for worker, error in errors.items():
+                if worker.there:  # else it has died, and there is nothing left to be closed
+                    raise error
         finally:
             self.abandon()
 

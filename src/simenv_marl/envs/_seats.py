@@ -339,7 +339,7 @@ class Actions:
             and actions.dtype is space.dtype
             and ((actions >= space.low) & (actions <= space.high)).all()
         ):
-            return list(actions)
+            return list(actions.copy())  # which nobody else can change
         apart = self._apart(actions)
         for number in range(self._number):
             if number in unused:
@@ -389,6 +389,7 @@ class Row:
         """
         self.batch, self._mode, self._offset = batch, mode, offset
         self._write = writer(seating.single_observation_space, batch.observations)
+        self._binding = seating.plan.active[0]
         self._swift = seating.single and seating.plan.options.render_mode != "human"
         self._rows: list[Any] = [None] * number
         self.ended: set[int] = set()
@@ -478,13 +479,14 @@ class Row:
                 self._again(number)
             moving = [number for number in range(len(seats)) if number not in waiting]
             others = moving and turn_together(
+                self._binding,
                 [seats[number]._episode for number in moving],
                 [actions[number] for number in moving],
                 lambda number, error: self._fail(moving[number], error),
             )
             others = sorted((*waiting, *(moving[number] for number in others)))
         else:
-            others = turn_together([seat._episode for seat in seats], actions, self._fail)
+            others = turn_together(self._binding, [seat._episode for seat in seats], actions, self._fail)
         records = [seat._record for seat in seats]
         self._rows = rows = [record.observation for record in records]
         rewards = [record.reward for record in records]

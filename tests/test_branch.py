@@ -274,9 +274,9 @@ def test_an_error_in_a_branch_surfaces_as_itself(method):
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (lambda twin, number: os.kill(os.getpid(), signal.SIGKILL), r"branch 0 has died.*signal 9"),
-        (lambda twin, number: os._exit(3), r"branch 0 has died.*exit code 3"),
-        (lambda twin, number: sys.exit(4), r"branch 0 has raised[\s\S]*SystemExit: 4"),
+        (lambda twin, number: os.kill(os.getpid(), signal.SIGKILL), r"branch [01] has died.*signal 9"),
+        (lambda twin, number: os._exit(3), r"branch [01] has died.*exit code 3"),
+        (lambda twin, number: sys.exit(4), r"branch [01] has raised[\s\S]*SystemExit: 4"),
         (lambda twin, number: (yield), "cannot be pickled"),
         (lambda twin, number: Unpicklable(1, 2), "cannot be pickled"),
     ],

@@ -42,11 +42,13 @@ from .envs import (
     SimulationEnv,
     SimulationJointEnv,
     SimulationParallelEnv,
+    SimulationVectorEnv,
     aec_env,
     generate_env,
     joint_env,
     parallel_env,
     single_env,
+    vector_env,
 )
 from .errors import *  # noqa: F403 - the whole tree is public
 from .plugins import (
@@ -78,6 +80,7 @@ __all__ = [
     "SimulationInterface",
     "SimulationJointEnv",
     "SimulationParallelEnv",
+    "SimulationVectorEnv",
     "Variant",
     "aec_env",
     "attach_handler",
@@ -99,5 +102,6 @@ __all__ = [
     "simulate",
     "single_env",
     "trace",
+    "vector_env",
 ]
 __all__ += errors.__all__

@@ -106,6 +106,16 @@ class Rounds(Episode):
         for actions in taken:
             self.play(actions)
 
+    def check(self, actions: Mapping[str, Any]) -> None:
+        """Check the actions of a round as ``play`` does, and do nothing else.
+
+        Raises:
+            UnknownAgentError, InvalidActionError, EpisodeOverError: As ``play`` raises them.
+        """
+        if self.pending is None:
+            raise self.nothing_pending()
+        self._checked(actions, self.pending)
+
     def _checked(self, actions: Mapping[str, Any], pending: Record) -> dict[str, Any]:
         """The actions, checked as far as they can be before anything moves."""
         checked, agents = {}, self.agents

@@ -27,6 +27,7 @@
     |   `-- ClosedError                      ... because the environment was closed
     |-- ReentrancyError      (RuntimeError)  an environment used while it is moving
     |-- WrongThreadError     (RuntimeError)  a thread or process that cannot go on from here
+    |-- WorkerError          (RuntimeError)  a process with simulations that died, or has raised what cannot be told
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
 Every error is raised with its message alone, so that it survives pickling.
@@ -62,6 +63,7 @@ __all__ = [
     "UnknownPointError",
     "UnknownTargetError",
     "ViewError",
+    "WorkerError",
     "WrongThreadError",
 ]
 
@@ -174,6 +176,10 @@ class ReentrancyError(SimEnvError, RuntimeError):
 
 class WrongThreadError(SimEnvError, RuntimeError):
     """A simulation is in another thread or process, or a thread that it has started was to decide something."""
+
+
+class WorkerError(SimEnvError, RuntimeError):
+    """A process with simulations in it died, or something was raised there that cannot be told here as it was."""
 
 
 class CheckFailedError(SimEnvError, AssertionError):

@@ -11,6 +11,7 @@ from sys import modules
 from threading import RLock
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
@@ -46,8 +47,7 @@ class View:
         self._claimed_by: type[View] | None = None
         if plan.options.driver == "thread":
             self._claimed_by = type(self)
-            self.__class__ = _one_at_a_time(type(self))
-            self._claim = _Claim()
+            one_at_a_time(self)
         self._plan = self._made_of = plan
         self._session = Session(plan)
         self._finalizer = weakref.finalize(self, self._session.abandon)
@@ -223,6 +223,23 @@ class View:
         self._episode = None
 
 
+class OneAgentView(View, gym.Env[Any, Any]):
+    """A view with one agent, and so a Gymnasium environment."""
+
+    _agent: str
+
+    def _begin(self, seed: int | None, options: dict[str, Any] | None, kind: type[AnyEpisode]) -> AnyEpisode:
+        """End the episode that runs, begin another, and seed the generator and the spaces."""
+        seed = checked_seed(seed)
+        self._make_way()
+        gym.Env.reset(self, seed=seed)
+        episode = self._session.start(seed, options, self.np_random, kind)
+        if seed is not None:
+            seed_space(self.observation_space, seed, self._agent)
+            seed_space(self.action_space, seed, self._agent)
+        return episode
+
+
 class AgentsView(View):
     """A view in which agents are told apart. ``possible_agents`` exists only where all are known beforehand.
 
@@ -342,17 +359,22 @@ class _Claim:
         self._lock.release()
 
 
-def _one_at_a_time(view: type[View]) -> type[View]:
-    """The same class of environments, but for changing threads: what moves the simulation claims it before.
+def one_at_a_time(env: Any) -> None:
+    """Have an environment be used from changing threads: what moves its simulation claims it before.
 
-    A class of its own, so that environments which stay in their thread have nothing to pay for it.
+    It gets a class of its own, so that environments which stay in their thread have nothing to pay for it.
     """
-    made: type[View] | None = vars(view).get("_claiming")
+    env.__class__ = _one_at_a_time(type(env))
+    env._claim = _Claim()
+
+
+def _one_at_a_time(view: type[Any]) -> type[Any]:
+    made: type[Any] | None = vars(view).get("_claiming")
     if made is None:
         claiming = {name: _claiming(getattr(view, name)) for name in ("reset", "step", "close")}
         same = {name: getattr(view, name) for name in ("__module__", "__qualname__", "__doc__")}
         made = type(view.__name__, (view,), claiming | same)
-        view._claiming = made  # type: ignore[attr-defined]
+        view._claiming = made
     return made
 
 

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from greenlet import getcurrent, greenlet
 from gymnasium import spaces
+from mesa.examples.advanced.wolf_sheep import model as wolf_sheep
 from mesa.examples.advanced.wolf_sheep.agents import Sheep, Wolf
-from mesa.examples.advanced.wolf_sheep.model import WolfSheep
-from mesa.experimental.devs import ABMSimulator
 from numpy.typing import NDArray
 
 from benchmarks.measure import Contender, Section, ratio, side_by_side
@@ -34,13 +33,12 @@ class Meadow(SimulationInterface):
     """
 
     def reset(self, seed: int | None = None) -> None:
-        self.simulator = ABMSimulator()
-        self.model = WolfSheep(simulator=self.simulator, seed=seed)
+        self.model, self.clock = wolves_and_sheep(seed)
         self.counts: list[tuple[int, int]] = []
 
     def run(self) -> Any:
         for _ in range(TICKS):
-            self.simulator.run_for(1)
+            self.clock.run_for(1)
             living = self.model.agents_by_type
             self.counts.append((len(living[Wolf]), len(living[Sheep])))
         return TRUNCATED
@@ -57,6 +55,17 @@ class Meadow(SimulationInterface):
             for animal in self.model.agents_by_type.get(kind, ())
         ]
         return self.counts, animals, self.model.random.getstate()
+
+
+def wolves_and_sheep(seed: int | None) -> tuple[Any, Any]:
+    """The model, and what runs it for so many ticks: itself since Mesa 3.5, a simulator before."""
+    if hasattr(wolf_sheep, "WolfSheepScenario"):
+        model = wolf_sheep.WolfSheep(wolf_sheep.WolfSheepScenario(rng=seed))
+        return model, model
+    from mesa.experimental.devs import ABMSimulator
+
+    simulator = ABMSimulator()
+    return wolf_sheep.WolfSheep(simulator=simulator, seed=seed), simulator
 
 
 def name_of(kind: type) -> str:

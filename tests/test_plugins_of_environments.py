@@ -738,7 +738,7 @@ class Sheep(mesa.Agent):
 
 class Meadow(mesa.Model):
     def __init__(self, seed=None):
-        super().__init__(seed=seed)
+        super().__init__(rng=seed)
         Sheep.create_agents(self, 2)
 
 

@@ -382,12 +382,21 @@ def test_errors_surface_with_a_traceback_into_the_culprit_and_notes(error):
 needs_signals = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="the platform has no pthread_kill")
 
 
+@pytest.fixture
+def interruptible():
+    """Whoever is started in the background of a shell ignores Ctrl-C, and Python leaves it at that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def interrupt():
     time.sleep(0.02)  # by now it is waited for the simulation
     signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
 
 @needs_signals
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_next_decision():
     log, interrupted = [], threading.Event()
 
@@ -419,6 +428,7 @@ def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_
 
 
 @needs_signals
+@pytest.mark.usefixtures("interruptible")
 def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkeypatch, older_threads):
     monkeypatch.setattr(_threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, log = threading.Event(), []

@@ -24,7 +24,7 @@ Views read the records of agents; none of them computes an observation or a rewa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from threading import get_ident
 from typing import Any, Final
@@ -42,6 +42,7 @@ from ._driver import (
     Offspring,
     SimulationExit,
     attended,
+    interrupted,
     unattended,
 )
 from ._greenlets import GreenletDriver
@@ -54,6 +55,7 @@ from .errors import (
     EpisodeOverError,
     NoDecisionError,
     ReentrancyError,
+    annotate,
     warn_user,
 )
 from .simulation import RULE, TRUNCATED, Sentinel
@@ -124,6 +126,7 @@ class Episode:
                     self._foresee(pending)
                     self.pending = pending
             except BaseException as error:
+                self.pending, self.over = None, True
                 self._fail(error)
                 raise
         if self.pending is None and not plan.unanswered:
@@ -181,11 +184,11 @@ class Episode:
         except Exception as error:
             self._annotate(error)
             raise
-        self.pending = None
-        self.turns = turns = self.turns + 1
-        if record.followed_up:
-            record.follow_up()
         try:
+            self.pending = None
+            self.turns = turns = self.turns + 1
+            if record.followed_up:
+                record.follow_up()
             while True:
                 # Functions are fetched from attributes before they are called: calling them there is slower.
                 resume = driver.resume
@@ -229,6 +232,7 @@ class Episode:
                 # Else they would keep alive what the model lets go meanwhile.
                 binding = args = kwargs = first = agent = record = None
         except BaseException as error:
+            self.pending, self.over = None, True  # whatever comes in between: an interrupt, the end of the stack
             binding = args = kwargs = first = None  # else the error would keep them alive
             self._fail(error)
             raise
@@ -331,11 +335,12 @@ class Episode:
                 record.observe(args, {})
                 record.choices = None  # which are asked for again when it decides
 
-    def _announced(self) -> Iterator[tuple[Record, tuple[Any, ...]]]:
+    def _announced(self) -> Iterable[tuple[Record, tuple[Any, ...]]]:
         """The live agents that the simulation says are going to decide, with the arguments of their calls."""
         expected = getattr(self._simulation, "expected_calls", None)
         if expected is None:
-            return
+            return ()
+        announced = []  # a generator could not pass on a StopIteration
         agents = self.agents
         for binding in self._plan.active:
             name_agent = binding.name_agent
@@ -349,7 +354,8 @@ class Episode:
                     record = self._meet(agent, binding)
                     if record.policy is not None:
                         continue
-                yield record, args
+                announced.append((record, args))
+        return announced
 
     def _names(self) -> str:
         names = list(self.agents)
@@ -404,11 +410,15 @@ class Episode:
 
     def _fail(self, error: BaseException) -> None:
         """End the episode for an error, which says where it came from."""
-        self._annotate(error)
-        EVALUATING.pop(get_ident(), None)  # an error in a mapping has left it there
         self.pending, self.over = None, True
-        for problem in self._unwind():
-            error.add_note(f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
+        interrupted()
+        self._annotate(error)
+        try:
+            problems = self._unwind()
+        except Warning as warning:  # where these are errors; another one must not take its place
+            problems = [warning]
+        for problem in problems:
+            annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
 
     def _annotate(self, error: BaseException) -> None:
         record = self._latest
@@ -418,7 +428,7 @@ class Episode:
             number = self.turns if self._failed_in_model else self.turns + 1
             where = "in the model, after" if self._failed_in_model else "at"
             where += f" decision {number}, of {record.agent!r} at {record.binding.point.name}"
-        error.add_note(f"simenv_marl: {where}; seed {self._seed}")
+        annotate(error, f"simenv_marl: {where}; seed {self._seed}")
 
     def close(self) -> None:
         """Unwind the simulation, if it is suspended; answer none of its decisions.
@@ -485,13 +495,17 @@ class Episode:
         return problems
 
     def _let_go_of_driver(self) -> None:
-        if self._driver is not None:
-            self._driver.forget()
-            self._driver = None
+        driver, self._driver = self._driver, None
+        if driver is not None:
+            driver.forget()
 
 
 def _is_exit(error: BaseException | None) -> bool:
     """Whether an error is the exit that was raised in a simulation, passed on in whatever guise."""
-    while error is not None and not isinstance(error, SimulationExit):
+    seen = set()  # causes may go in circles
+    while error is not None and not isinstance(error, SimulationExit) and id(error) not in seen:
+        if isinstance(error, BaseExceptionGroup) and all(_is_exit(member) for member in error.exceptions):
+            return True
+        seen.add(id(error))
         error = error.__cause__
-    return error is not None
+    return isinstance(error, SimulationExit)

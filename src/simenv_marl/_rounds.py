@@ -64,16 +64,16 @@ class Rounds(Episode):
         if getcurrent() is not self._driver.caller:
             self._driver.enter()
         left = self._checked(actions, pending)
-        if actions:
-            self.turns += 1
-        for record in self.agents.values():
-            record.acted = False
-        for record in self.parting:
-            record.acted = False
-        self.parting = []
         try:
             # Whoever steps an environment from inside a mapping is told so: until the end nothing is pending.
             self.pending = None
+            if actions:
+                self.turns += 1
+            for record in self.agents.values():
+                record.acted = False
+            for record in self.parting:
+                record.acted = False
+            self.parting = []
             following = self._answer(pending, left)
             if following is None:
                 return
@@ -84,6 +84,7 @@ class Rounds(Episode):
                 self._foresee(following)
                 self.pending = following
         except BaseException as error:
+            self.pending, self.over = None, True
             self._fail(error)
             raise
 

@@ -17,7 +17,7 @@ from ._driver import Offspring, preparing, unattended
 from ._episode import Episode
 from ._plan import Plan
 from ._surroundings import Surroundings, surrounded
-from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
+from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, annotate, warn_user
 from .simulation import resetter
 
 AnyEpisode = TypeVar("AnyEpisode", bound=Episode)
@@ -44,7 +44,7 @@ class Session:
         self._episode: Episode | None = None
         self._closed = False
         self._starting = False
-        self._held = False
+        self._held: list[Any] = []  # what is set, and is to be put back
         self._plugins = plan.plugins
         self._surroundings = Surroundings(plan.surroundings())
         self._offspring = Offspring()
@@ -77,8 +77,8 @@ class Session:
             BaseException: What the model raises.
         """
         self.end()
-        self._closed, self._starting = False, True
         try:
+            self._closed, self._starting = False, True
             return self._begin(seed, options, generator, kind)
         finally:
             self._starting = False
@@ -96,7 +96,7 @@ class Session:
             with self.at_work(), preparing(self._offspring):
                 self._reset(self.seed, options)
         except BaseException as error:
-            error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
+            annotate(error, f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
         begin: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
         episode: AnyEpisode = begin(self.plan, self.simulation, self.seed, self._offspring)
@@ -154,33 +154,32 @@ class Session:
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
-        if self._episode is not None:
-            self._episode.abandon()
-        self._let_go_of_sites()
+        try:
+            if self._episode is not None:
+                self._episode.abandon()
+        finally:
+            self._let_go_of_sites()
 
     def _hold_sites(self) -> None:
         if self._held:
             return
-        done = []
         try:
             for site in self.plan.sites:
                 site.hold()
-                done.append(site)
+                self._held.append(site)
             if self._plugins is not None:
                 self._plugins.hold()
+                self._held.append(self._plugins)
         except BaseException:
-            for site in done:
-                site.let_go()
+            self._let_go_of_sites()
             raise
-        self._held = True
 
     def _let_go_of_sites(self) -> None:
-        if self._held:
-            self._held = False
-            if self._plugins is not None:
-                self._plugins.let_go()
-            for site in self.plan.sites:
-                site.let_go()
+        while self._held:
+            try:
+                self._held[-1].let_go()
+            finally:
+                self._held.pop()
 
 
 def checked_seed(seed: Any) -> int | None:

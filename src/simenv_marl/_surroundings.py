@@ -6,8 +6,8 @@ afterwards: for each turn, and not for each switch to the simulation. All others
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
@@ -26,15 +26,9 @@ class Surroundings:
     def __bool__(self) -> bool:
         return bool(self._surroundings)
 
-    @contextmanager
-    def entered(self) -> Iterator[None]:
+    def entered(self) -> AbstractContextManager[None]:
         """Keep what runs apart from whatever runs around it, and in these surroundings."""
-        with unattended():
-            self.enter()
-            try:
-                yield
-            finally:
-                self.leave()
+        return _Entered(self)
 
     def enter(self) -> None:
         """Put them up."""
@@ -58,6 +52,27 @@ class Surroundings:
         for surrounding in reversed(self._surroundings):
             run = surrounding.around(run)
         return run
+
+
+class _Entered(unattended):
+    __slots__ = ("_surroundings",)
+
+    def __init__(self, surroundings: Surroundings) -> None:
+        self._surroundings = surroundings
+
+    def __enter__(self) -> None:
+        super().__enter__()
+        try:
+            self._surroundings.enter()
+        except BaseException:
+            super().__exit__()
+            raise
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            self._surroundings.leave()
+        finally:
+            super().__exit__()
 
 
 class Surrounded(Episode):

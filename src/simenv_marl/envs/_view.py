@@ -121,9 +121,12 @@ class View:
         Raises:
             BaseException: What the simulation raises while it unwinds.
         """
-        self._end(self._session.close)
-        # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
-        self._finalizer.detach()
+        try:
+            self._end(self._session.close)
+        finally:
+            if self._episode is None:  # else it was refused
+                # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
+                self._finalizer.detach()
 
     def _make_way(self) -> None:
         """End the episode that runs, and see to it that the next one ends should the environment be abandoned."""

@@ -19,6 +19,7 @@ from gymnasium import spaces
 import simenv_marl
 from simenv_marl import (
     TRUNCATED,
+    ChangedResult,
     CheckFailedError,
     OptionValueError,
     SimEnvError,
@@ -935,3 +936,27 @@ def test_a_simulation_that_truncates_by_itself_is_told_from_one_that_is_cut():
 
     report = clean(checked(Limited))
     assert (report.episodes.truncated, report.episodes.cut) == (4, 0)
+
+
+def test_global_generators_of_its_own_are_a_cure():
+    """With them, the model that draws from everybody's is compared with its plain run like any other."""
+
+    class Lottery(Walk):
+        def run(self):
+            for _ in range(4):
+                self.place += self.choose() + random.uniform(-0.5, 0.5)
+                self.log.append(self.place)
+
+    assert not checked(Lottery).ok
+    report = clean(checked(Lottery, global_rng=True))
+    assert "plain runs against RULE" in report.checked[0]
+
+
+def test_plugins_are_part_of_the_plain_run_too():
+    """What an environment's plugins change, they change on purpose."""
+
+    def doubled(walk, _result):
+        return ChangedResult(_result * 2)
+
+    report = clean(checked(Walk, plugins=[(doubled, Walk.choose, "after")]))
+    assert "plain runs against RULE" in report.checked[0]

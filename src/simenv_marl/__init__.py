@@ -6,6 +6,7 @@ The layers, each importing only from those above it::
     simulation    what a simulation is; RULE and TRUNCATED
     _spaces       casting observations to spaces, checking actions against them
     _driver       what runs around us: simulations, mappings, plugins, threads that simulations have started
+    _generators   a state of the global generators for each environment that asks for one
     _wrappers     functions that stand in front of others: decision functions, exposed functions
     decision      make_step: definitions, decision points, decision functions
     _greenlets    switching between a simulation's stack and its user's, in one thread

@@ -43,6 +43,9 @@ class Surrounding(Protocol):
     be nested, and ``unattended`` may lie in between.
     """
 
+    def begin(self, seed: int) -> None:
+        """An episode begins, with that seed. Called between ``enter`` and ``leave``."""
+
     def enter(self) -> None:
         """Put it up."""
 
@@ -81,7 +84,7 @@ class Refused:
 FINISHED: Final = Sentinel("FINISHED")
 FAILED: Final = Sentinel("FAILED")
 STUCK: Final = Sentinel("STUCK")
-"""What ``throw`` returns where nothing comes from the simulation any more."""
+"""What ``throw`` returns, with for how many seconds it has waited, where nothing comes from the simulation."""
 REFUSED: Final = Refused()
 
 Event = tuple[Any, Any, Any]

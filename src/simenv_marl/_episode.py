@@ -48,7 +48,7 @@ from ._driver import (
 from ._greenlets import GreenletDriver
 from ._plan import Binding, Plan, Removal
 from ._record import Record, not_finite, number
-from ._threads import SECONDS_TO_UNWIND, ThreadDriver
+from ._threads import ThreadDriver
 from .decision import DIFFERENCES
 from .errors import (
     AgentError,
@@ -485,8 +485,8 @@ class Episode:
         driver.give_up()
         self._driver = None
         refusal = (
-            f"has neither decided anything nor ended in {SECONDS_TO_UNWIND} s; it is left running in its thread, and at"
-            " its next decision SimulationExit is raised in it"
+            f"has neither decided anything nor ended for {value} s; it is left running in its thread until it decides"
+            " again, and until then an episode that is begun shares the simulation with it"
             if kind is STUCK
             else f"refuses to end: it went on after {UNWINDING_TRIES} times SimulationExit was raised in it; it is left"
             " suspended. Let it re-raise what it does not know"

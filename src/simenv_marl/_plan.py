@@ -18,6 +18,7 @@ from gymnasium import spaces
 
 from . import _spaces
 from ._driver import Surrounding, unattended
+from ._generators import GlobalRandom
 from ._points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, stand_ins
 from ._spaces import ILLEGAL
 from .decision import DecisionPoint, Definition, unwrapped
@@ -63,6 +64,8 @@ class Options:
             model's own rule.
         plugins: Handlers for this environment's simulation alone: of each the handler, the target and the position,
             as ``attach_handler`` takes them.
+        global_rng: Whether the simulation gets a state of its own of the global generators of ``random`` and
+            ``numpy.random``, which each reset seeds with the seed of the episode.
         flatten: Whether the joint view has one vector in place of dicts.
         state_space: The space to whose shape and dtype the environment's ``state()`` is cast; None: what the
             simulation's own ``state()`` returns is taken as it is.
@@ -75,6 +78,7 @@ class Options:
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
     plugins: Iterable[Any] = ()
+    global_rng: bool = False
     flatten: bool = False
     state_space: spaces.Space[Any] | None = None
     render_mode: str | None = None
@@ -88,6 +92,8 @@ class Options:
             )
         if self.undeclared not in ("error", "rule"):
             raise OptionValueError(f'undeclared must be "error" or "rule", not {self.undeclared!r}')
+        if not isinstance(self.global_rng, bool):
+            raise OptionValueError(f"global_rng must be True or False, not {self.global_rng!r}")
         if self.state_space is not None and not isinstance(self.state_space, spaces.Space):
             raise OptionValueError(f"state_space must be a gymnasium space, not {self.state_space!r}")
         steps = self.max_steps
@@ -384,9 +390,15 @@ class Plan:
         """The names of all agents that there may be; None where they are only known when they decide."""
         return list(self.roster) if self.complete else None
 
+    @property
+    def patches(self) -> list[Site | Plugins]:
+        """What must be set in the model while an environment is in use."""
+        return [*self.sites] if self.plugins is None else [*self.sites, self.plugins]
+
     def surroundings(self) -> list[Surrounding]:
         """What the simulation of one environment is to find around it, from the outermost to the innermost."""
-        return [] if self.plugins is None else [Plugged(self.plugins)]
+        found: list[Surrounding] = [GlobalRandom()] if self.options.global_rng else []
+        return found if self.plugins is None else [*found, Plugged(self.plugins)]
 
     def _find_removals(self) -> None:
         for binding in dict.fromkeys(self.bindings.values()):
@@ -440,7 +452,7 @@ class Plan:
         Raises:
             SimulationError: The source makes none.
         """
-        if self._spare and not self.surroundings():  # which it was made without
+        if self._spare and not (self.plugins or self.options.global_rng):  # which it was made without
             try:
                 return self._spare.pop()
             except IndexError:  # another thread was faster

@@ -45,16 +45,15 @@ class Session:
         self._closed = False
         self._starting = False
         self._held: list[Any] = []  # what is set, and is to be put back
-        self._plugins = plan.plugins
         self._surroundings = Surroundings(plan.surroundings())
         self._offspring = Offspring()
-        self._hold_sites()
+        self._hold_patches()
         try:
             with self.at_work(), preparing(self._offspring):
                 self.simulation = plan.make_simulation()
                 self._reset = resetter(self.simulation)
         except BaseException:
-            self._let_go_of_sites()
+            self._let_go_of_patches()
             raise
 
     def start(
@@ -90,10 +89,11 @@ class Session:
         generator: np.random.Generator,
         kind: type[AnyEpisode],
     ) -> AnyEpisode:
-        self._hold_sites()
+        self._hold_patches()
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
             with self.at_work(), preparing(self._offspring):
+                self._surroundings.begin(self.seed)
                 self._reset(self.seed, options)
         except BaseException as error:
             annotate(error, f"simenv_marl: while the simulation was reset; seed {self.seed}")
@@ -150,7 +150,7 @@ class Session:
         finally:
             if self._episode is None and not self._starting:
                 self._closed = True
-                self._let_go_of_sites()
+                self._let_go_of_patches()
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
@@ -158,23 +158,20 @@ class Session:
             if self._episode is not None:
                 self._episode.abandon()
         finally:
-            self._let_go_of_sites()
+            self._let_go_of_patches()
 
-    def _hold_sites(self) -> None:
+    def _hold_patches(self) -> None:
         if self._held:
             return
         try:
-            for site in self.plan.sites:
-                site.hold()
-                self._held.append(site)
-            if self._plugins is not None:
-                self._plugins.hold()
-                self._held.append(self._plugins)
+            for patch in self.plan.patches:
+                patch.hold()
+                self._held.append(patch)
         except BaseException:
-            self._let_go_of_sites()
+            self._let_go_of_patches()
             raise
 
-    def _let_go_of_sites(self) -> None:
+    def _let_go_of_patches(self) -> None:
         while self._held:
             try:
                 self._held[-1].let_go()

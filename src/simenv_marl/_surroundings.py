@@ -30,6 +30,11 @@ class Surroundings:
         """Keep what runs apart from whatever runs around it, and in these surroundings."""
         return _Entered(self)
 
+    def begin(self, seed: int) -> None:
+        """An episode begins."""
+        for surrounding in self._surroundings:
+            surrounding.begin(seed)
+
     def enter(self) -> None:
         """Put them up."""
         done = []

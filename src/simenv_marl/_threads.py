@@ -9,12 +9,15 @@ from threading import Lock, Thread, current_thread, get_ident
 from time import monotonic
 from typing import Any, Final
 
-from ._driver import FINISHED, RUNNING, STUCK, Bound, Event, Offspring, SimulationExit, Watchful
+from ._driver import FAILED, FINISHED, RUNNING, STUCK, Bound, Event, Offspring, SimulationExit, Watchful
 from .errors import WrongThreadError, warn_user
 from .simulation import RULE, Sentinel
 
 SECONDS_TO_UNWIND: Final = 5.0
 """How long a simulation that is to be unwound may take to its next decision or to its end."""
+
+_A_WHILE: Final = 1.0
+"""For how many seconds the user waits before it looks around: a Ctrl-C just before a wait does not wake from it."""
 
 _NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
@@ -60,8 +63,15 @@ class ThreadDriver(Watchful):
         RUNNING[thread] = self.ask
         try:
             self._end = context.run(self._live, run)  # not in this frame too, to which the frames of an error lead back
-        finally:
-            RUNNING.pop(thread, None)
+        except BaseException as error:  # thrown into this thread from elsewhere; without an end its user would wait on
+            self._end = FAILED, error, None
+        RUNNING.pop(thread, None)
+        if isinstance(self._end[1], SimulationExit):
+            # Nobody is going to read it, and what its frames hold must go while this thread is there: greenlets of
+            # the model's own can unwind nowhere else.
+            self._end[1].__traceback__ = self._end[1].__context__ = None
+        if self._end[0] is FAILED and self.lost():
+            raise self._end[1]  # the model has forked, and in this process there is nobody else to be told
         self._event = self._end
         _wake(self._arrived)
 
@@ -105,7 +115,7 @@ class ThreadDriver(Watchful):
             _wake(self._resumed)
         arrived = self._arrived
         while (event := self._event) is None:
-            arrived.acquire()
+            arrived.acquire(True, _A_WHILE)
         self._event = None
         return event
 
@@ -136,7 +146,7 @@ class ThreadDriver(Watchful):
         while (event := self._end or self._event) is None:
             left = patience - monotonic()
             if left <= 0:
-                return STUCK, None, None
+                return STUCK, SECONDS_TO_UNWIND, None
             self._arrived.acquire(timeout=left)
         self._event = None
         return event

@@ -24,8 +24,8 @@
     |   |-- NotResetError                    ... because there was none yet
     |   |-- EpisodeOverError                 ... because it has ended or failed
     |   `-- ClosedError                      ... because the environment was closed
-    |-- ReentrancyError      (RuntimeError)  an environment stepped from inside itself
-    |-- WrongThreadError     (RuntimeError)  an environment used from another thread
+    |-- ReentrancyError      (RuntimeError)  an environment used while it is moving
+    |-- WrongThreadError     (RuntimeError)  a thread or process that cannot go on from here
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
 Every error is raised with its message alone, so that it survives pickling.
@@ -173,11 +173,11 @@ class ClosedError(ResetNeededError):
 
 
 class ReentrancyError(SimEnvError, RuntimeError):
-    """An environment was stepped or reset while its own simulation was moving."""
+    """An environment was stepped, reset or closed while its own simulation was moving."""
 
 
 class WrongThreadError(SimEnvError, RuntimeError):
-    """An environment was used from a thread other than the one that has reset it."""
+    """A simulation is in another thread or process, or a thread that it has started was to decide something."""
 
 
 class CheckFailedError(SimEnvError, AssertionError):

@@ -478,6 +478,9 @@ class Plugged:
         self._plugins = plugins
         self._before: list[tuple[Any, bool]] = []
 
+    def begin(self, seed: int) -> None:
+        """They are the same in every episode."""
+
     def enter(self) -> None:
         """Let them take part in what runs in this thread."""
         thread = get_ident()

@@ -68,7 +68,7 @@ class Checks:
         self._slow = False  # whether a view has taken too long
         self._latest_step = 0.0  # when it was
         self._place_of_difference = 0  # of the finding that says so
-        self._global_rng = bool(getattr(plan.options, "global_rng", False))
+        self._global_rng = plan.options.global_rng
 
     def _add(self, severity: Severity, title: str, explanation: str, evidence: str = "") -> None:
         self.findings.append(Finding(severity, title, explanation, evidence))

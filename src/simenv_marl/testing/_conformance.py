@@ -137,7 +137,7 @@ class ConformanceChecks(Checks):
         """Measure what a decision takes, where runs come to their end."""
         seed = self._seeds[0]
         run = self._plain[seed]
-        if run.cut or not run.decisions or self._late() or self._global_rng:
+        if run.cut or not run.decisions or self._late():
             return
         env = None
         try:

@@ -20,9 +20,10 @@ from zlib import crc32
 
 import numpy as np
 
-from .._driver import RUNNING, SimulationExit, unattended
+from .._driver import RUNNING, SimulationExit
 from .._plan import Binding, Plan
 from .._spaces import MASK
+from .._surroundings import Surroundings
 from ..decision import DecisionPoint
 from ..simulation import RULE, make_simulation, resetter
 from ._fingerprint import Fingerprint, alike, brief, fingerprint
@@ -233,16 +234,13 @@ def plain_run(
     watcher = Watcher(points_of(plan), limit, own)
     thread = threading.get_ident()
     before = sys.getprofile()
-    held = []
 
     def run_it() -> None:
         watcher.simulation = simulation = make_simulation(plan.source)
-        for site in plan.sites:
-            site.hold()
-            held.append(site)
         if profile is not None:
             sys.setprofile(profile)
         try:
+            surroundings.begin(seed)
             resetter(simulation)(seed, None)
             RUNNING[thread] = _rule
             watcher.run.result = simulation.run()
@@ -251,13 +249,24 @@ def plain_run(
             if profile is not None:
                 sys.setprofile(before)
 
-    with unattended(), watcher.watching() as run:
-        try:
-            within(deadline, run_it)
-        finally:
-            for site in held:
-                site.let_go()
+    with held(plan) as surroundings, watcher.watching() as run:
+        within(deadline, run_it)
     return run
+
+
+@contextmanager
+def held(plan: Plan) -> Iterator[Surroundings]:
+    """Set in the model what environments of a plan set there, and be where their simulations are."""
+    surroundings, done = Surroundings(plan.surroundings()), []
+    try:
+        for site in plan.patches:
+            site.hold()
+            done.append(site)
+        with surroundings.entered():
+            yield surroundings
+    finally:
+        for site in reversed(done):
+            site.let_go()
 
 
 def _rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
@@ -269,12 +278,14 @@ def untouched_run(plan: Plan, seed: int, deadline: float) -> float:
 
     def run_it() -> float:
         simulation = make_simulation(plan.source)
+        surroundings.begin(seed)
         resetter(simulation)(seed, None)
         start = time.perf_counter()
         simulation.run()
         return time.perf_counter() - start
 
-    with unattended():
+    surroundings = Surroundings(plan.surroundings())
+    with surroundings.entered():
         return within(deadline, run_it)
 
 

@@ -37,13 +37,6 @@ class ViewChecks(Checks):
         """Compare the plain run with every view and driver, with ``RULE`` throughout."""
         if not self._repeats:
             return
-        if self._global_rng:
-            self._add(
-                "note",
-                "The plain run was not compared with environments",
-                "With global_rng=True an environment's random numbers begin elsewhere than those of a plain run.",
-            )
-            return
         drivers = (self._plan.options.driver,) if self._plan.options.driver != DRIVERS[0] else DRIVERS
         compared: dict[str, list[str]] = {}
         for driver in drivers:

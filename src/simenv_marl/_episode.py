@@ -86,17 +86,13 @@ class Episode:
     """
 
     def __init__(self, plan: Plan, simulation: Any, seed: int | None, offspring: Offspring | None = None) -> None:
-        """Begin an episode of a simulation that has been reset: run it to its first decision.
+        """Prepare an episode of a simulation that has been reset.
 
         Args:
             plan: What the environment is made of.
             simulation: The simulation.
             seed: What it was reset with, for those who read an error's notes.
             offspring: The threads that the simulation has started so far; None: it was never used before.
-
-        Raises:
-            NoDecisionError: There is no decision for the environment's user.
-            BaseException: Whatever the model, a mapping or a policy raises.
         """
         self.pending: Record | None = None
         self.agents: dict[str, Record] = {}
@@ -116,11 +112,21 @@ class Episode:
             self.agents[agent] = Record(agent, binding, None, self.clock)
         make_driver = DRIVERS[plan.options.driver]
         self._driver: Driver | None = make_driver(self._main_loop(), plan.bindings, offspring or Offspring())
+
+    def begin(self) -> None:
+        """Run the simulation to its first decision.
+
+        Raises:
+            NoDecisionError: There is no decision for the environment's user.
+            BaseException: Whatever the model, a mapping or a policy raises.
+        """
+        driver = self._driver
+        assert driver is not None
         with self._kept_apart():
             try:
                 reply = None
                 while self.pending is None and not self.over:
-                    reply = self._take(*self._driver.resume(reply))
+                    reply = self._take(*driver.resume(reply))
                 if not self.over:
                     pending, self.pending = self.pending, None
                     self._foresee(pending)
@@ -129,10 +135,10 @@ class Episode:
                 self.pending, self.over = None, True
                 self._fail(error)
                 raise
-        if self.pending is None and not plan.unanswered:
+        if self.pending is None and not self._plan.unanswered:
             raise NoDecisionError(
-                f"{type(simulation).__name__}.run() came to its end without a decision of"
-                f" {', '.join(binding.point.name for binding in plan.active)}; does the simulation call the"
+                f"{type(self._simulation).__name__}.run() came to its end without a decision of"
+                f" {', '.join(binding.point.name for binding in self._plan.active)}; does the simulation call the"
                 " decision functions as attributes of their class or module?"
             )
 
@@ -449,6 +455,11 @@ class Episode:
         for problem in self._unwind():
             self._annotate(problem)
             raise problem
+
+    @property
+    def unwound(self) -> bool:
+        """Whether the episode is over, and nothing is left of it in the simulation."""
+        return self.over and self._driver is None
 
     def abandon(self) -> None:
         """Unwind the simulation when its environment is gone, from wherever that is noticed."""

@@ -28,7 +28,7 @@ class Rounds(Episode):
     """An episode that is played round by round, and not turn by turn."""
 
     def __init__(self, plan: Plan, simulation: Any, seed: int | None, offspring: Offspring | None = None) -> None:
-        """Begin an episode, as ``Episode`` does; then reward and observe all agents for the first time."""
+        """Prepare an episode, as ``Episode`` does."""
         # By binding, how its agents are named, where nothing but the mappings is to be seen to.
         self._quick: dict[Any, Any] = {}
         if getattr(simulation, "time", None) is None:

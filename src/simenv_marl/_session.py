@@ -98,9 +98,16 @@ class Session:
         except BaseException as error:
             annotate(error, f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
-        begin: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
-        episode: AnyEpisode = begin(self.plan, self.simulation, self.seed, self._offspring)
-        self._episode = episode
+        prepare: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
+        episode: AnyEpisode = prepare(self.plan, self.simulation, self.seed, self._offspring)
+        try:
+            self._episode = episode  # whenever an interrupt comes from now on, its end is seen to
+            episode.begin()
+        except BaseException:
+            episode.over = True  # it may have been interrupted before it could say so
+            if episode.unwound:
+                self._episode = None
+            raise
         return episode
 
     def at_work(self) -> AbstractContextManager[None]:
@@ -120,8 +127,13 @@ class Session:
             try:
                 self._episode.close()
             finally:
-                if self._episode.over:
+                if self._episode.unwound:
                     self._episode = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to end."""
+        return self._episode is None
 
     def not_running(self) -> Exception:
         """The error that says why there is no episode."""

@@ -92,7 +92,7 @@ class Surrounded(Episode):
         *,
         surroundings: Surroundings,
     ) -> None:
-        """Begin an episode, as ``Episode`` does."""
+        """Prepare an episode, as ``Episode`` does."""
         self._surroundings = surroundings
         super().__init__(plan, simulation, seed, offspring)
         clock = self.clock
@@ -136,5 +136,5 @@ class SurroundedRounds(Surrounded, Rounds):
 
 
 def surrounded(kind: type[Episode], surroundings: Surroundings) -> Callable[..., Episode]:
-    """What begins an episode that is played like those of a kind, in surroundings."""
+    """What prepares an episode that is played like those of a kind, in surroundings."""
     return partial(SurroundedRounds if issubclass(kind, Rounds) else Surrounded, surroundings=surroundings)

@@ -124,7 +124,7 @@ class View:
         try:
             self._end(self._session.close)
         finally:
-            if self._episode is None:  # else it was refused
+            if self._session.idle:  # else it was refused, or something came in between
                 # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
                 self._finalizer.detach()
 

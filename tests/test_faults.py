@@ -15,7 +15,7 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import RULE, _driver, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, ResetNeededError, _driver, aec_env, joint_env, parallel_env, single_env
 
 from .models import Script, culprits, decision, define, notes, play
 
@@ -393,3 +393,114 @@ def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view, mo
             assert env.unwrapped.simulation.log == [3], (where, log)
             env.close()
     assert number > 100
+
+
+# -- the end of the stack -------------------------------------------------------------------------
+
+
+def deep_down(function, room):
+    """Call a function where there is room for so many more calls only."""
+
+    def down(left):
+        return function() if left <= 0 else down(left - 1)
+
+    here, frame = 0, sys._getframe()
+    while frame is not None:
+        here, frame = here + 1, frame.f_back
+    return down(sys.getrecursionlimit() - here - room)
+
+
+@VIEWS
+def test_an_environment_survives_the_end_of_its_users_stack(view):
+    decide = decision()
+
+    class Model(Script):
+        def expected_calls(self, point):
+            return [()]
+
+    def main(simulation):
+        try:
+            for _ in range(3):
+                simulation.log.append(decide())
+        finally:
+            simulation.log.append("unwound")
+
+    def step():
+        env.step({"choose_0": 3} if view in (parallel_env, joint_env) else 3)
+
+    env = view(lambda: Model(main), decide)
+    ends = set()
+    for room in range(1, 60):
+        env.reset()
+        log = env.unwrapped.simulation.log
+        for what in (step, env.reset, env.close):
+            try:
+                deep_down(what, room)
+                ends.add("went well")
+            except RecursionError:
+                ends.add("came to the end")
+            except ResetNeededError:
+                ends.add("was over")
+        env.reset()
+        assert log[-1] == "unwound"
+        for _ in range(3):
+            step()
+        assert env.unwrapped.simulation.log == [3, 3, 3, "unwound"]
+        assert get_ident() not in _driver.RUNNING
+    assert ends >= {"went well", "came to the end"}
+
+
+@VIEWS
+@pytest.mark.parametrize("where", ["observation", "reward", "action", "rule", "model", "finally"])
+def test_a_runaway_recursion_surfaces_as_itself(view, where):
+    armed = []
+
+    def run_away():
+        return run_away() + 1
+
+    def at_place(place, value):
+        def mapping(*args):
+            if place in armed:
+                armed.remove(place)
+                run_away()
+            return value
+
+        return mapping
+
+    decide = decision(
+        lambda: at_place("rule", 0)(),
+        agent="choose_0",
+        observation_space_mapping=at_place("observation", [0, 0]),
+        reward_mapping=at_place("reward", 0.0),
+        action_space_mapping=at_place("action", 0),
+    )
+
+    class Model(Script):
+        def expected_calls(self, point):
+            return [()]
+
+    def main(simulation):
+        try:
+            for _ in range(3):
+                decide()
+                at_place("model", 0)()
+        finally:
+            at_place("finally", 0)()
+
+    def step(action=3):
+        action = RULE if where == "rule" else action
+        env.step({"choose_0": action} if view in (parallel_env, joint_env) and action is not RULE else action)
+
+    env = view(lambda: Model(main), decide)
+    for _ in range(2):
+        env.reset(seed=5)
+        step()
+        armed.append(where)
+        with pytest.raises(RecursionError) as caught:
+            env.close() if where == "finally" else step()
+        assert culprits(caught.value)[-1] == "run_away"
+        assert "seed 5" in notes(caught.value)
+        env.reset()
+        for _ in range(3):
+            step()
+    env.close()

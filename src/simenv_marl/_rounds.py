@@ -18,7 +18,7 @@ from ._episode import UNNAMED, Episode
 from ._plan import Plan
 from ._record import Record, not_finite, number
 from .decision import DIFFERENCES
-from .errors import UnknownAgentError
+from .errors import InvalidActionError, UnknownAgentError
 from .simulation import RULE, Sentinel
 
 MISSING: Final = Sentinel("MISSING")
@@ -91,6 +91,8 @@ class Rounds(Episode):
     def _checked(self, actions: Mapping[str, Any], pending: Record) -> dict[str, Any]:
         """The actions, checked as far as they can be before anything moves."""
         checked, agents = {}, self.agents
+        if type(actions) is not dict and not isinstance(actions, Mapping):
+            raise InvalidActionError(f"a round takes a dict of actions by agent, not {actions!r}")
         for agent, action in actions.items():
             record = agents.get(agent)
             if record is None:

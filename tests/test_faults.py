@@ -18,6 +18,7 @@ import simenv_marl
 from simenv_marl import RULE, ResetNeededError, _driver, aec_env, joint_env, parallel_env, single_env
 
 from .models import Script, culprits, decision, define, notes, play
+from .test_threads import in_a_thread
 
 # -- a model that may fail anywhere ---------------------------------------------------------------
 
@@ -392,6 +393,7 @@ def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view, mo
             env.step({"choose_0": 3} if view in (parallel_env, joint_env) else 3)
             assert env.unwrapped.simulation.log == [3], (where, log)
             env.close()
+        assert in_a_thread(env.close) is None, where  # nothing of it is left to this one
     assert number > 100
 
 

@@ -6,6 +6,7 @@ import copy
 import os
 import weakref
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from threading import RLock
 from typing import Any
@@ -246,7 +247,13 @@ class _Claim:
     def __enter__(self) -> None:
         if self._process != os.getpid():  # a fork: whoever may have held the lock is not in this process
             self.__init__()  # type: ignore[misc]
-        if not self._lock.acquire(blocking=False):
+        try:
+            claimed = self._lock.acquire(blocking=False)
+        except BaseException:  # an interrupt; whoever has it already keeps it
+            with suppress(RuntimeError):
+                self._lock.release()
+            raise
+        if not claimed:
             raise ReentrancyError(
                 "the environment was used while another thread was stepping, resetting or closing it; any thread may"
                 " use it, but one at a time"

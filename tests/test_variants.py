@@ -158,7 +158,7 @@ def test_variants_can_be_pickled():
     variant = Variant("small", Farm, parameters={"fields": 1}, plugins=[(dearer, HARVEST, "after")], points=[SOW])
     again = pickle.loads(pickle.dumps(variant))
     assert (again.name, again.simulation, dict(again.parameters), again.plugins, again.points) == (
-        ("small", Farm, {"fields": 1}, variant.plugins, [SOW])
+        ("small", Farm, {"fields": 1}, ((dearer, HARVEST, "after"),), [SOW])
     )
     assert simulate(again, points=POINTS).log == [("wheat", 10)]
 

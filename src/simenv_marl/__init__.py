@@ -26,6 +26,7 @@ The layers, each importing only from those above it::
     _session      a simulation over all episodes of one environment
     policies      policies back in the model's own loop
     envs          views: an episode read as a PettingZoo or Gymnasium environment
+    branching     exact continuations of an episode that is going on
     registration  into the registries of Gymnasium and PettingZoo
     testing       checks of a simulation; imported by its users alone
     __main__      the same on the command line
@@ -34,17 +35,20 @@ The layers, each importing only from those above it::
 from . import errors
 from ._handlers import Call, ChangedArgs, ChangedResult
 from ._provenance import provenance
+from .branching import branch
 from .decision import Definition, difference, make_step
 from .envs import (
     SimulationAECEnv,
     SimulationEnv,
     SimulationJointEnv,
     SimulationParallelEnv,
+    SimulationVectorEnv,
     aec_env,
     generate_env,
     joint_env,
     parallel_env,
     single_env,
+    vector_env,
 )
 from .errors import *  # noqa: F403 - the whole tree is public
 from .plugins import (
@@ -76,10 +80,12 @@ __all__ = [
     "SimulationInterface",
     "SimulationJointEnv",
     "SimulationParallelEnv",
+    "SimulationVectorEnv",
     "Variant",
     "aec_env",
     "attach_handler",
     "attached_handlers",
+    "branch",
     "decision_points",
     "difference",
     "errors",
@@ -96,5 +102,6 @@ __all__ = [
     "simulate",
     "single_env",
     "trace",
+    "vector_env",
 ]
 __all__ += errors.__all__

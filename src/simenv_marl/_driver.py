@@ -25,7 +25,15 @@ from .simulation import Sentinel
 Ask = Callable[[Any, tuple[Any, ...], dict[str, Any]], Any]
 """Decides a call of a decision point: of the point, and of the call's arguments."""
 
-RUNNING: dict[int, Ask] = {}
+
+class _Running(dict[int, Ask]):
+    """There is one in a process: decision functions that are pickled by value find that of their new process."""
+
+    def __reduce__(self) -> str:
+        return "RUNNING"
+
+
+RUNNING: Final = _Running()
 """By thread: whom decision functions ask there. Touched by drivers and by this module alone."""
 
 EVALUATING: dict[int, dict[Any, Any]] = {}

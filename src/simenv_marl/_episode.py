@@ -24,8 +24,10 @@ Views read the records of agents; none of them computes an observation or a rewa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from operator import length_hint
 from threading import get_ident
 from typing import Any, Final
 
@@ -48,6 +50,7 @@ from ._driver import (
 from ._greenlets import GreenletDriver
 from ._plan import Binding, Plan, Removal
 from ._record import Record, not_finite, number
+from ._spaces import duplicate, same
 from ._threads import ThreadDriver
 from .decision import DIFFERENCES
 from .errors import (
@@ -67,6 +70,19 @@ its processes at each try."""
 UNNAMED: Final = Sentinel("UNNAMED")
 NAMED_AT_CALL: Final = Sentinel("NAMED_AT_CALL")
 
+MOST_TAKEN: Final = 200_000
+"""How many actions are kept for a replay. A simulation that never ends is not to fill the memory."""
+
+
+class _Lost(list[Any]):
+    """Stands in for actions that became too many."""
+
+    def append(self, action: Any) -> None:
+        """Keep nothing."""
+
+
+LOST: Final = _Lost()
+
 DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {"greenlet": GreenletDriver, "thread": ThreadDriver}
 
 
@@ -82,10 +98,19 @@ class Episode:
         over: Whether the episode is over.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
         turns: How many actions the environment's user has given.
+        taken: These actions, copied where they could change.
+        consulted: What policies have answered. Either is ``LOST`` once it would have become too long.
         clock: Returns the simulation's time; None where it has none.
     """
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None, offspring: Offspring | None = None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        simulation: Any,
+        seed: int | None,
+        offspring: Offspring | None = None,
+        foretold: deque[Any] | None = None,
+    ) -> None:
         """Prepare an episode of a simulation that has been reset.
 
         Args:
@@ -93,6 +118,7 @@ class Episode:
             simulation: The simulation.
             seed: What it was reset with, for those who read an error's notes.
             offspring: The threads that the simulation has started so far; None: it was never used before.
+            foretold: What policies are to answer before they are asked themselves, where an episode is replayed.
         """
         self.pending: Record | None = None
         self.agents: dict[str, Record] = {}
@@ -100,12 +126,17 @@ class Episode:
         self.parting: list[Record] = []
         self.over = self.terminated = self.truncated = False
         self.turns = 0
+        self.taken: list[Any] = []
+        self.consulted: list[Any] = []
+        self._foretold = foretold
         # By binding: whose decision it is, where nothing but the mappings is to be seen to.
         self._swift: dict[Any, Any] = {}
         self._answered: dict[str, Record] = {}  # those for whom policies answer
         self._latest: Record | None = None
         self._plan, self._simulation, self._seed = plan, simulation, seed
-        self._max_turns = plan.options.max_steps or -1  # never reached
+        self._most_turns = plan.options.max_steps or -1  # never reached
+        # When either an episode is truncated or its actions are no longer kept.
+        self._max_turns = MOST_TAKEN if self._most_turns < 0 else min(self._most_turns, MOST_TAKEN)
         self._failed_in_model = False
         self.clock = getattr(simulation, "time", None)
         for agent, binding in () if plan.unanswered else plan.roster.items():
@@ -187,12 +218,15 @@ class Episode:
                 reply = action
             else:
                 reply = binding.reply(action, record.agent, record.mask, record.choices)
+                action = duplicate(action)
         except Exception as error:
             self._annotate(error)
             raise
         try:
             self.pending = None
             self.turns = turns = self.turns + 1
+            taken = self.taken
+            taken.append(action)
             if record.followed_up:
                 record.follow_up()
             while True:
@@ -243,6 +277,21 @@ class Episode:
             self._fail(error)
             raise
 
+    def _go_on(self, binding: Any, args: Any, kwargs: Any) -> None:
+        """Go on with an event, as ``turn`` does, to the next decision that the user is to answer or to the end."""
+        try:
+            while True:
+                reply = self._take(binding, args, kwargs)
+                if self.pending is not None or self.over or self._driver is None:
+                    return
+                binding = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
+                resume = self._driver.resume
+                binding, args, kwargs = resume(reply)
+        except BaseException as error:
+            binding = args = kwargs = None
+            self._fail(error)
+            raise
+
     def nothing_pending(self) -> Exception:
         """The error that says why no action can be taken now."""
         if self.over:
@@ -276,9 +325,11 @@ class Episode:
 
     def _arise(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """A decision of the environment's user has arisen."""
-        if self.turns == self._max_turns:
+        if self.turns == self._most_turns:
             self._finish(truncated=True)
             return
+        if self.turns == self._max_turns:
+            self._max_turns, self.taken = self._most_turns, LOST
         record.settle(args, kwargs)
         binding = record.binding
         if self.clock is None and binding.legal is None and binding.point.alone:
@@ -323,13 +374,38 @@ class Episode:
         if record.policy is RULE:
             return RULE
         record.observe(args, kwargs)
-        action, choices = record.policy(record.observation, record.info), record.choices
+        foretold, choices, consulted = self._foretold, record.choices, self.consulted
+        action = foretold.popleft() if foretold else record.policy(record.observation, record.info)
+        if len(consulted) == MOST_TAKEN:
+            self.consulted = LOST
+        self.consulted.append(duplicate(action))
         record.follow_up()
         return RULE if action is RULE else record.binding.reply(action, record.agent, record.mask, choices)
 
     def record(self, agent: str) -> Record | None:
         """What is known of an agent of the environment, whether it lives or is gone."""
         return self.agents.get(agent) or self.gone.get(agent)
+
+    def replay(self, taken: list[Any]) -> None:
+        """Give the actions of another episode once more.
+
+        Raises:
+            BaseException: Whatever the model or a mapping raises.
+        """
+        for action in taken:
+            self.turn(action)
+
+    def stands_as(self, other: Episode) -> bool:
+        """Whether the pending decision looks just like that of another episode."""
+        mine, theirs = self.pending, other.pending
+        if mine is None or theirs is None:
+            return mine is theirs
+        return (
+            mine.agent == theirs.agent
+            and list(self.agents) == list(other.agents)
+            and same(mine.observation, theirs.observation)
+            and same(mine.mask, theirs.mask)
+        )
 
     # -- agents announced beforehand --------------------------------------------------------------
 
@@ -509,6 +585,127 @@ class Episode:
         driver, self._driver = self._driver, None
         if driver is not None:
             driver.forget()
+
+
+Blame = Callable[[int, BaseException], None]
+"""Called where one of many episodes raises something: with its number, and the error."""
+
+
+def turn_together(binding: Binding, episodes: Sequence[Episode], actions: Sequence[Any], blame: Blame) -> Sequence[int]:
+    """Answer the pending decisions of many episodes, each as ``Episode.turn`` does.
+
+    All of them move before any is rewarded and observed, which takes less time than one after the other.
+
+    Args:
+        binding: Where all of them decide, for one agent each.
+        episodes: Episodes of one plan.
+        actions: An action for each, checked against its space.
+        blame: Called where something raises. The other episodes have moved or not, and can be closed.
+
+    Returns:
+        The numbers of the episodes that may be over, or have infos with something in them.
+
+    Raises:
+        BaseException: As ``Episode.turn``.
+    """
+    if (
+        RUNNING
+        or EVALUATING
+        or binding.agent is None
+        or binding.legal is not None
+        or not binding.point.alone
+        or type(episodes[0]) is not Episode
+    ):
+        for index, (each, action) in enumerate(zip(episodes, actions, strict=True)):
+            try:
+                each.turn(action)
+            except BaseException as error:
+                blame(index, error)
+                raise
+        return range(len(episodes))
+    events = _resume_together(binding, episodes, actions, blame)
+    others: list[int] = []
+    left: Any = iter(events)
+    del events
+    episode: Any
+    record: Any
+    reward: Any
+    memories = EVALUATING if DIFFERENCES else None
+    thread = get_ident()
+    reward_mapping, observe, cast = binding.reward, binding.observe, binding.cast
+    try:
+        for episode, (bound, args, kwargs) in zip(episodes, left):  # noqa: B905 - it would look for one more
+            record = episode.pending
+            if bound is not binding or record.ended:
+                others.append(len(episodes) - length_hint(left) - 1)
+                if bound is not None:  # else its turn is over already
+                    episode.pending = None
+                    episode._go_on(bound, args, kwargs)
+                bound = args = kwargs = None
+                continue
+            # As in ``turn``.
+            episode._latest, episode.pending = record, None
+            (first,) = args
+            record._args, record._kwargs = args, kwargs
+            if memories is not None:
+                memories[thread] = record.memory
+            try:
+                reward = reward_mapping(first)
+                if type(reward) is not float:
+                    reward = number(reward)
+                if reward - reward != 0.0:
+                    raise not_finite(record, reward)
+                record.reward = reward
+                record.observation = cast(observe(first))
+            except BaseException as error:
+                args = kwargs = first = None
+                episode._fail(error)
+                raise
+            if record.info:
+                record.info = {}
+            episode.pending = record
+    except BaseException as error:
+        index, left = len(episodes) - length_hint(left) - 1, None
+        blame(index, error)
+        raise
+    finally:
+        EVALUATING.pop(thread, None)
+    return others
+
+
+def _resume_together(binding: Binding, episodes: Any, actions: Any, blame: Blame) -> Any:
+    """Answer the decisions of many episodes. Returns the events that come next; none for those that went on alone."""
+    here: Any = getcurrent()
+    convert = binding.convert
+    events: Any = []
+    add = events.append
+    try:
+        for episode, action in zip(episodes, actions, strict=True):
+            record, driver, turns = episode.pending, episode._driver, episode.turns + 1
+            if record is None or driver.caller is not here or record.followed_up or turns == episode._max_turns:
+                episode.turn(action)
+                add((None, None, None))
+                continue
+            try:
+                reply = convert(action)
+            except Exception as error:
+                episode._annotate(error)
+                raise
+            # Still pending, so that it can be closed should another one fail.
+            episode.turns = turns
+            try:
+                resume = driver.resume
+                add(resume(reply))
+            except BaseException as error:
+                episode.pending = None
+                episode._fail(error)
+                raise
+    except BaseException as error:
+        index = len(events)
+        events = add = resume = reply = None  # else the error would keep alive what they hold
+        blame(index, error)
+        raise
+    return events
 
 
 def _is_exit(error: BaseException | None) -> bool:

@@ -115,7 +115,8 @@ def owner_at_hand(function: FunctionType) -> type:
         PatchError: There is none.
     """
     for owner in all_classes():
-        if beneath(plain(vars(owner).get(function.__name__))) is function:
+        held = beneath(plain(vars(owner).get(function.__name__)))
+        if held is function or unwrapped(held) is function:
             return owner
     raise PatchError(
         f"{function.__module__}.{function.__qualname__} is not what is found under that name, nor in any class;"

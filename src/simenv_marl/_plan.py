@@ -19,7 +19,7 @@ from gymnasium import spaces
 from . import _spaces
 from ._driver import Surrounding, unattended
 from ._generators import GlobalRandom
-from ._points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, stand_ins
+from ._points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, portable, stand_ins
 from ._spaces import ILLEGAL
 from .decision import DecisionPoint, Definition, unwrapped
 from .errors import (
@@ -446,6 +446,18 @@ class Plan:
         named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
         return cls(source, named, checked, list(modes), unanswered=unanswered, spare=spare, variant=variant)
 
+    def __deepcopy__(self, memory: Any) -> Plan:
+        return self  # it holds nothing of any environment
+
+    def __reduce__(self) -> Any:
+        points = {point.key: point.own_definition for point in self._named}
+        options = {option.name: getattr(self.options, option.name) for option in fields(Options)}
+        for name in ("policies", "possible_agents"):
+            if isinstance(options[name], Mapping):
+                options[name] = {portable(key): value for key, value in options[name].items()}
+        options["plugins"] = [] if self.plugins is None else self.plugins.portable
+        return _remade, (self.source, points, options, self.variant, self.unanswered)
+
     def make_simulation(self) -> Any:
         """Make a simulation for one environment.
 
@@ -498,6 +510,12 @@ class Plan:
 
     def _like(self, named: list[NamedPoint], options: Options) -> Plan:
         return Plan(self.source, named, options, self.render_modes, spare=self._spare, variant=self.variant)
+
+
+def _remade(source: Any, points: Any, options: dict[str, Any], variant: Variant | None, unanswered: bool) -> Plan:
+    plan = Plan.draw_up(source, points, options, unanswered=unanswered)
+    plan.variant = variant
+    return plan
 
 
 def _names_agents(policies: Mapping[Any, Any] | None) -> bool:

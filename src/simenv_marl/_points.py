@@ -35,6 +35,30 @@ class NamedPoint:
     definition: Definition
     site: Site | None
 
+    @property
+    def key(self) -> Any:
+        """What names it in another process."""
+        return portable(self.point.rule, self.point.name)
+
+    @property
+    def own_definition(self) -> Definition | None:
+        """Its definition; None where that is the one which it was decorated with, and which comes along with it."""
+        return None if self.site is None and self.definition is self.point.definition else self.definition
+
+
+def portable(key: Any, name: str | None = None) -> Any:
+    """What names a function in another process: its dotted name, if that is sure to lead to it there.
+
+    Args:
+        key: A function, or whatever somebody has named.
+        name: Its dotted name, if that is known.
+    """
+    function = unwrapped(key)
+    if not isinstance(function, FunctionType):
+        return key
+    name = name or f"{function.__module__}.{function.__qualname__}"
+    return function if "<" in name or name.startswith("__main__.") else name
+
 
 def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[NamedPoint]:
     """Find all that ``points=`` names.

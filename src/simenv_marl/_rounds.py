@@ -7,6 +7,7 @@ with actions for everybody, and a round with one action.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from threading import get_ident
 from typing import Any, Final
@@ -14,9 +15,10 @@ from typing import Any, Final
 from greenlet import getcurrent
 
 from ._driver import EVALUATING, RUNNING, Offspring, unattended
-from ._episode import UNNAMED, Episode
+from ._episode import LOST, MOST_TAKEN, UNNAMED, Episode
 from ._plan import Plan
 from ._record import Record, not_finite, number
+from ._spaces import duplicate
 from .decision import DIFFERENCES
 from .errors import InvalidActionError, UnknownAgentError
 from .simulation import RULE, Sentinel
@@ -27,7 +29,14 @@ MISSING: Final = Sentinel("MISSING")
 class Rounds(Episode):
     """An episode that is played round by round, and not turn by turn."""
 
-    def __init__(self, plan: Plan, simulation: Any, seed: int | None, offspring: Offspring | None = None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        simulation: Any,
+        seed: int | None,
+        offspring: Offspring | None = None,
+        foretold: deque[Any] | None = None,
+    ) -> None:
         """Prepare an episode, as ``Episode`` does."""
         # By binding, how its agents are named, where nothing but the mappings is to be seen to.
         self._quick: dict[Any, Any] = {}
@@ -37,7 +46,7 @@ class Rounds(Episode):
                 for binding in plan.active
                 if binding.name_agent is not None and binding.legal is None and binding.point.alone
             }
-        super().__init__(plan, simulation, seed, offspring)
+        super().__init__(plan, simulation, seed, offspring, foretold)
 
     def play(self, actions: Mapping[str, Any]) -> None:
         """Answer decisions with actions, each once, up to the first whose action is missing; or to the end.
@@ -64,9 +73,13 @@ class Rounds(Episode):
         if getcurrent() is not self._driver.caller:
             self._driver.enter()
         left = self._checked(actions, pending)
+        taken = {agent: action if type(action) is int else duplicate(action) for agent, action in left.items()}
         try:
             # Whoever steps an environment from inside a mapping is told so: until the end nothing is pending.
             self.pending = None
+            self.taken.append(taken)
+            if len(self.taken) == MOST_TAKEN:
+                self.taken = LOST
             if actions:
                 self.turns += 1
             for record in self.agents.values():
@@ -77,7 +90,7 @@ class Rounds(Episode):
             following = self._answer(pending, left)
             if following is None:
                 return
-            if self.turns == self._max_turns and actions:
+            if self.turns == self._most_turns and actions:
                 self._foresee(following, settle=False)
                 self._finish(truncated=True)
             else:
@@ -87,6 +100,21 @@ class Rounds(Episode):
             self.pending, self.over = None, True
             self._fail(error)
             raise
+
+    def replay(self, taken: list[Any]) -> None:
+        """Play the rounds of another episode once more, as ``Episode.replay`` does."""
+        for actions in taken:
+            self.play(actions)
+
+    def check(self, actions: Mapping[str, Any]) -> None:
+        """Check the actions of a round as ``play`` does, and do nothing else.
+
+        Raises:
+            UnknownAgentError, InvalidActionError, EpisodeOverError: As ``play`` raises them.
+        """
+        if self.pending is None:
+            raise self.nothing_pending()
+        self._checked(actions, self.pending)
 
     def _checked(self, actions: Mapping[str, Any], pending: Record) -> dict[str, Any]:
         """The actions, checked as far as they can be before anything moves."""

@@ -6,6 +6,7 @@ is abandoned in mid-episode goes at once and takes its session along.
 
 from __future__ import annotations
 
+from collections import deque
 from contextlib import AbstractContextManager
 from typing import Any, TypeVar
 from zlib import crc32
@@ -14,10 +15,18 @@ import numpy as np
 from gymnasium import spaces
 
 from ._driver import Offspring, preparing, unattended
-from ._episode import Episode
+from ._episode import LOST, MOST_TAKEN, Episode
 from ._plan import Plan
 from ._surroundings import Surroundings, surrounded
-from .errors import ClosedError, NotResetError, OptionValueError, ReentrancyError, annotate, warn_user
+from .errors import (
+    BranchError,
+    ClosedError,
+    NotResetError,
+    OptionValueError,
+    ReentrancyError,
+    annotate,
+    warn_user,
+)
 from .simulation import resetter
 
 AnyEpisode = TypeVar("AnyEpisode", bound=Episode)
@@ -30,6 +39,8 @@ class Session:
         plan: What the environment is made of.
         simulation: The simulation.
         seed: The seed of the latest episode.
+        options: What the latest ``reset`` of the environment was given.
+        kind: How the latest episode was played.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -41,6 +52,8 @@ class Session:
         """
         self.plan = plan
         self.seed: int | None = None
+        self.options: dict[str, Any] | None = None
+        self.kind: type[Episode] = Episode
         self._episode: Episode | None = None
         self._closed = False
         self._starting = False
@@ -88,8 +101,10 @@ class Session:
         options: dict[str, Any] | None,
         generator: np.random.Generator,
         kind: type[AnyEpisode],
+        foretold: deque[Any] | None = None,
     ) -> AnyEpisode:
         self._hold_patches()
+        self.options, self.kind = options, kind
         self.seed = int(generator.integers(2**31)) if seed is None else seed
         try:
             with self.at_work(), preparing(self._offspring):
@@ -99,7 +114,7 @@ class Session:
             annotate(error, f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
         prepare: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
-        episode: AnyEpisode = prepare(self.plan, self.simulation, self.seed, self._offspring)
+        episode: AnyEpisode = prepare(self.plan, self.simulation, self.seed, self._offspring, foretold)
         try:
             self._episode = episode  # whenever an interrupt comes from now on, its end is seen to
             episode.begin()
@@ -109,6 +124,37 @@ class Session:
                 self._episode = None
             raise
         return episode
+
+    def replay(self, other: Session) -> Any:
+        """Bring the simulation to where another session's, of the same plan, stands in mid-episode.
+
+        Returns:
+            The episode.
+
+        Raises:
+            BranchError: It cannot be brought there.
+            BaseException: What the model raises.
+        """
+        episode = other._episode
+        if episode is None or episode.pending is None:
+            raise other.not_running() if episode is None else episode.nothing_pending()
+        if episode.taken is LOST or episode.consulted is LOST:
+            raise BranchError(
+                f"the episode has had more than {MOST_TAKEN:,} decisions, and its actions were not kept; use"
+                ' method="fork"'
+            )
+        self.end()
+        self._closed = False
+        again = self._begin(other.seed, other.options, np.random.default_rng(), other.kind, deque(episode.consulted))
+        again.replay(episode.taken)
+        if again.pending is None or not again.stands_as(episode):
+            again.close()
+            raise BranchError(
+                f"{type(self.simulation).__name__} does not come to the same decision again when it is reset with the"
+                ' same seed and given the same actions: something in it is random for itself. Use method="fork", or'
+                " global_rng=True if it draws from Python's or NumPy's global generators"
+            )
+        return again
 
     def at_work(self) -> AbstractContextManager[None]:
         """Keep what the simulation does apart from whatever runs around it, and in its surroundings."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from sys import getrefcount
 from typing import Any, Final
 
@@ -142,17 +142,31 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
     return cast
 
 
+_UNCHANGING: Final = (np.generic, int, float, str, Sentinel)
+
+
 def duplicate(observation: Any) -> Any:
     """Copy an observation, so that whoever gets it may change it."""
     if type(observation) is np.ndarray:
         return observation.copy()
-    if isinstance(observation, np.generic):
+    if isinstance(observation, _UNCHANGING):
         return observation
     if type(observation) is dict:
         return {key: duplicate(value) for key, value in observation.items()}
     if type(observation) is tuple:
         return tuple(duplicate(value) for value in observation)
     return copy.deepcopy(observation)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two observations are equal, number for number."""
+    if isinstance(one, Mapping):
+        return isinstance(other, Mapping) and one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, (tuple, list)):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    return bool(one == other)
 
 
 def blank(space: spaces.Space[Any]) -> Any:

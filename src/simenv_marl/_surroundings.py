@@ -6,6 +6,7 @@ afterwards: for each turn, and not for each switch to the simulation. All others
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
@@ -89,12 +90,13 @@ class Surrounded(Episode):
         simulation: Any,
         seed: int | None,
         offspring: Offspring | None = None,
+        foretold: deque[Any] | None = None,
         *,
         surroundings: Surroundings,
     ) -> None:
         """Prepare an episode, as ``Episode`` does."""
         self._surroundings = surroundings
-        super().__init__(plan, simulation, seed, offspring)
+        super().__init__(plan, simulation, seed, offspring, foretold)
         clock = self.clock
         if clock is not None:
             self.clock = lambda: self._tell(clock)

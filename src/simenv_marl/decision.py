@@ -274,6 +274,10 @@ class DecisionPoint:
     def __repr__(self) -> str:
         return f"<DecisionPoint {self.name}>"
 
+    def __reduce__(self) -> Any:
+        made_of = (self.rule, self.name, self.bound, self.kind)
+        return _restored, made_of, self.definition, None, None, _redefined
+
     @property
     def letters(self) -> str:
         """The function's letters in lower case, of which its agent's default name is made."""
@@ -299,8 +303,7 @@ class DecisionPoint:
                 "RUNNING": RUNNING,
                 "get_ident": get_ident,
                 "point": self,
-                "unattended": _run_rule,
-                "definition": definition,
+                "unattended": _Unattended(definition),
             },
         )
         self.wrappers.add(wrapper)
@@ -315,7 +318,7 @@ def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
     """The point of a decision function and the definition that it was made with; None for anything else."""
     function = beneath(function)
     if stands_in(function, DECISION):
-        return function.__globals__["point"], function.__globals__["definition"]
+        return function.__globals__["point"], function.__globals__["unattended"].definition
     return None
 
 
@@ -372,8 +375,38 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
     raise PatchError(f"{function!r} cannot be a decision point: it is no function written in Python")
 
 
-def _run_rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    return point.rule(*args, **kwargs)
+class _Unattended:
+    """Whom decision functions ask where no simulation runs, while one runs elsewhere: the rule.
+
+    Attributes:
+        definition: What the decision function was made with. It is kept here so that it stays with the function when
+            that is pickled by value, which takes along what its code names, and nothing else.
+    """
+
+    __slots__ = ("definition",)
+
+    def __init__(self, definition: Definition | None) -> None:
+        self.definition = definition
+
+    def __call__(self, point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        return point.rule(*args, **kwargs)
+
+
+def _restored(rule: FunctionType, name: str, bound: bool, kind: str) -> DecisionPoint:
+    """The point of a rule, in whichever process: the one that is there, or a new one."""
+    for point in _FAMILIES.get(rule, ()):
+        if point.name == name:
+            return point
+    point = DecisionPoint(rule, name, bound=bound)
+    point.bound, point.kind = bound, kind
+    return point
+
+
+def _redefined(point: DecisionPoint, definition: Definition | None) -> None:
+    """Give a point that was restored its definition, which may lead back to it, unless it has one of this process."""
+    if point.definition is None and definition is not None:
+        point.definition = definition
+        _REGISTRY.setdefault(point.name, point)
 
 
 # -- differences ----------------------------------------------------------------------------------
@@ -391,6 +424,9 @@ class Difference:
             DIFFERENCES.append(getattr(function, "__qualname__", repr(function)))
         self._function = function
         update_wrapper(self, function)
+
+    def __reduce__(self) -> Any:
+        return Difference, (self._function,)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The change of the function's value at these arguments."""

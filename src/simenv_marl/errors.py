@@ -12,7 +12,8 @@
     |-- AgentError           (ValueError)    names of agents that clash or are none
     |-- UnknownAgentError    (LookupError)   an agent that the environment does not know
     |-- ViewError            (ValueError)    a view that these decision points do not allow
-    |-- CopyError            (TypeError)     an environment that was to be copied or pickled
+    |-- CopyError            (TypeError)     an environment that was to be copied in mid-episode
+    |-- BranchError          (RuntimeError)  a branch of an episode that could not be made, or died
     |-- UnknownOptionError   (TypeError)     an option that does not exist
     |-- OptionValueError     (ValueError)    an option that cannot have this value
     |-- InvalidActionError   (ValueError)    an action that is not legal; nothing has moved
@@ -26,6 +27,7 @@
     |   `-- ClosedError                      ... because the environment was closed
     |-- ReentrancyError      (RuntimeError)  an environment used while it is moving
     |-- WrongThreadError     (RuntimeError)  a thread or process that cannot go on from here
+    |-- WorkerError          (RuntimeError)  a process with simulations that died, or has raised what cannot be told
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
 Every error is raised with its message alone, so that it survives pickling.
@@ -37,6 +39,7 @@ from pathlib import Path
 
 __all__ = [
     "AgentError",
+    "BranchError",
     "CheckFailedError",
     "ClosedError",
     "CopyError",
@@ -60,6 +63,7 @@ __all__ = [
     "UnknownPointError",
     "UnknownTargetError",
     "ViewError",
+    "WorkerError",
     "WrongThreadError",
 ]
 
@@ -125,7 +129,11 @@ class ViewError(SimEnvError, ValueError):
 
 
 class CopyError(SimEnvError, TypeError):
-    """An environment was to be copied or pickled, which it cannot be."""
+    """An environment was to be copied or pickled in mid-episode."""
+
+
+class BranchError(SimEnvError, RuntimeError):
+    """A branch of an episode could not be made, or has died without an answer."""
 
 
 class UnknownOptionError(SimEnvError, TypeError):
@@ -178,6 +186,10 @@ class ReentrancyError(SimEnvError, RuntimeError):
 
 class WrongThreadError(SimEnvError, RuntimeError):
     """A simulation is in another thread or process, or a thread that it has started was to decide something."""
+
+
+class WorkerError(SimEnvError, RuntimeError):
+    """A process with simulations in it died, or something was raised there that cannot be told here as it was."""
 
 
 class CheckFailedError(SimEnvError, AssertionError):

@@ -425,16 +425,26 @@ class Plugins:
             SimEnvError: As ``attach_handler``.
         """
         self._attached: list[Attached] = []
+        self._given: list[Any] = []
         self._users = 0
         with _LOCK:
             for entry in entries:
                 handler, target, position = checked_entry(entry)
+                self._given.append(target)
                 self._attached.append(Attached(handler, find_target(target), position))
 
     @property
     def entries(self) -> list[Entry]:
         """For each the handler, the dotted name of its target, and its position."""
         return [(a.handler, a.target.name, a.position) for a in self._attached]
+
+    @property
+    def portable(self) -> list[Entry]:
+        """The same as ``entries``, but for targets that are not named the same in another process."""
+        return [
+            (handler, target if "<" not in target and not target.startswith("__main__.") else given, position)
+            for (handler, target, position), given in zip(self.entries, self._given, strict=True)
+        ]
 
     @property
     def stale(self) -> bool:

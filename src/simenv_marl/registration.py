@@ -12,7 +12,7 @@ import gymnasium
 import pettingzoo
 
 from ._plan import Plan
-from .envs import aec_env, joint_env, parallel_env, single_env
+from .envs import aec_env, joint_env, parallel_env, single_env, vector_env
 from .errors import OptionValueError, UnknownPointError
 from .simulation import RULE
 from .variants import Variant
@@ -100,7 +100,7 @@ def _camel(point: str, parts: int) -> str:
 
 def _register_gymnasium(identity: str, maker: str, **kwargs: Any) -> None:
     gymnasium.registry.pop(identity, None)  # registered again, as when a notebook's cell runs again
-    gymnasium.register(identity, f"{__name__}:{maker}", kwargs=kwargs)
+    gymnasium.register(identity, f"{__name__}:{maker}", vector_entry_point=f"{__name__}:{maker}_vector", kwargs=kwargs)
 
 
 def _recipe(recipe: str, module: str) -> _Recipe:
@@ -118,17 +118,35 @@ def _recipe(recipe: str, module: str) -> _Recipe:
 def make_single(recipe: str, module: str, point: str, **options: Any) -> Any:
     """The entry point of the single views: all points but one run their rule, or the policy they have."""
     known = _recipe(recipe, module)
+    return single_env(known.simulation, known.points, **_single_options(known, point, options))
+
+
+def make_single_vector(recipe: str, module: str, point: str, num_envs: int = 1, **options: Any) -> Any:
+    """The entry point of the vector view over such single views."""
+    known = _recipe(recipe, module)
+    merged = _single_options(known, point, options)
+    return vector_env(known.simulation, known.points, num_envs=num_envs, view="single", **merged)
+
+
+def _single_options(known: _Recipe, point: str, options: dict[str, Any]) -> dict[str, Any]:
     merged = {**known.options, **options}
     merged["policies"] = {other: RULE for other in known.active if other != point} | dict(merged.get("policies") or {})
     for name in ("possible_agents", "undeclared"):
         merged.pop(name, None)
-    return single_env(known.simulation, known.points, **merged)
+    return merged
 
 
 def make_joint(recipe: str, module: str, **options: Any) -> Any:
     """The entry point of the joint view."""
     known = _recipe(recipe, module)
     return joint_env(known.simulation, known.points, **{**known.options, "flatten": known.flatten, **options})
+
+
+def make_joint_vector(recipe: str, module: str, num_envs: int = 1, **options: Any) -> Any:
+    """The entry point of the vector view over joint views."""
+    known = _recipe(recipe, module)
+    merged = {**known.options, "flatten": known.flatten, **options}
+    return vector_env(known.simulation, known.points, num_envs=num_envs, view="joint", **merged)
 
 
 def make_aec(recipe: str, module: str, **options: Any) -> Any:

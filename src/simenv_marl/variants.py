@@ -14,6 +14,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
+from ._points import portable
 from .errors import OptionValueError, SimulationError
 
 
@@ -83,8 +84,22 @@ class Variant:
             pass
 
     def __reduce__(self) -> Any:
-        plain = (dict(self.parameters), self.points, self.plugins, dict(self.policies), dict(self.options))
-        return _remake, (self.name, self.simulation, *plain)
+        # Functions go by their names: while environments are in use, others may stand in their places.
+        points, plugins = self.points, [(handler, portable(target), *rest) for handler, target, *rest in self.plugins]
+        if isinstance(points, Mapping):
+            points = {portable(key): definition for key, definition in points.items()}
+        elif points is not None and not isinstance(points, str):
+            points = [portable(key) for key in (points if isinstance(points, Iterable) else [points])]
+        policies = {portable(key): policy for key, policy in self.policies.items()}
+        return _remake, (
+            self.name,
+            self.simulation,
+            dict(self.parameters),
+            points,
+            plugins,
+            policies,
+            dict(self.options),
+        )
 
     def applied(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
         """What an environment is made of that is made of this variant.

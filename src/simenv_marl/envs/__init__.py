@@ -5,12 +5,17 @@ from __future__ import annotations
 import sys
 from typing import Any, Final
 
+from gymnasium.vector import AutoresetMode
+
 from .._plan import Plan
 from ..errors import OptionValueError
+from ._view import View
+from ._workers import Recipe
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
 from .parallel import SimulationParallelEnv
 from .single import SimulationEnv, single_view
+from .vector import SimulationVectorEnv
 
 __all__ = [
     "VIEWS",
@@ -18,11 +23,14 @@ __all__ = [
     "SimulationEnv",
     "SimulationJointEnv",
     "SimulationParallelEnv",
+    "SimulationVectorEnv",
+    "View",
     "aec_env",
     "generate_env",
     "joint_env",
     "parallel_env",
     "single_env",
+    "vector_env",
 ]
 
 VIEWS: Final = ("aec", "parallel", "single", "joint")
@@ -148,3 +156,46 @@ def joint_env(simulation: Any, points: Any = None, **options: Any) -> Simulation
         SimEnvError: Something else in it cannot work; the leaf says what.
     """
     return SimulationJointEnv(Plan.draw_up(simulation, points, options))
+
+
+def vector_env(
+    simulation: Any,
+    points: Any = None,
+    *,
+    num_envs: int,
+    workers: int = 0,
+    view: str | None = None,
+    copy: bool = True,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    context: Any = None,
+    **options: Any,
+) -> SimulationVectorEnv:
+    """Make a Gymnasium vector environment: many simulations of a kind, stepped together.
+
+    It tells, step by step, what ``gymnasium.vector.SyncVectorEnv`` tells of as many single (or joint) views.
+
+    Args:
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
+        points: The active decision points, as ``generate_env`` takes them.
+        num_envs: How many simulations.
+        workers: Over how many processes they are spread; 0: all of them are suspended in this one.
+        view: "single" or "joint". None: single where one point with one agent is active, joint otherwise.
+        copy: Whether ``reset`` and ``step`` return observations of the caller's own; else they return the same
+            arrays again, which the next call changes.
+        autoreset_mode: When a simulation whose episode has ended begins the next one, as Gymnasium has it:
+            ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
+        context: How workers are started: "spawn" (what None means), "forkserver", "fork", or a context of
+            ``multiprocessing``.
+        **options: ``flatten=True`` for one vector in place of dicts in the joint view; else as ``aec_env`` takes them.
+
+    Raises:
+        SimEnvError: Something in it cannot work; the leaf says what.
+    """
+    return SimulationVectorEnv(
+        Recipe(simulation, points, options, view),
+        num_envs=num_envs,
+        workers=workers,
+        copy=copy,
+        autoreset_mode=autoreset_mode,
+        context=context,
+    )

@@ -8,9 +8,11 @@ import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
+from sys import modules
 from threading import RLock
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
@@ -43,10 +45,11 @@ class View:
         """
         self.check(plan)
         super().__init__()
+        self._claimed_by: type[View] | None = None
         if plan.options.driver == "thread":
-            self.__class__ = _one_at_a_time(type(self))
-            self._claim = _Claim()
-        self._plan = plan
+            self._claimed_by = type(self)
+            one_at_a_time(self)
+        self._plan = self._made_of = plan
         self._session = Session(plan)
         self._finalizer = weakref.finalize(self, self._session.abandon)
         self._episode: Episode | None = None
@@ -143,13 +146,102 @@ class View:
             if self._episode is None or self._episode.over:
                 self._clear()
 
+    def __deepcopy__(self, memory: dict[int, Any]) -> Any:
+        """Copy it, between episodes: an environment like this one, with a simulation of its own."""
+        made = memory[id(self)] = _made_again(self._claimed_by or type(self), self._made_of)
+        made.__setstate__(copy.deepcopy(self._kept(), memory))
+        return made
+
+    def __copy__(self) -> Any:
+        return copy.deepcopy(self)
+
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Refuse to be copied or pickled: the stack of a simulation cannot be."""
-        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
+        """Be pickled, between episodes: to an environment like this one, with a simulation of its own."""
+        made = self._claimed_by or type(self)
+        found: Any = modules.get(made.__module__)
+        for name in made.__qualname__.split("."):
+            found = getattr(found, name, None)
+        if found is not made:  # a class that generate_env has made, and which nobody would find by its name
+            made = next(base for base in made.__mro__ if base.__module__.startswith(__package__))
+        return _made_again, (made, self._made_of), self._kept()
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        self._session.seed = kept.pop("seed")
+        vars(self).update(kept)
+
+    def _kept(self) -> dict[str, Any]:
+        """What a copy takes over.
+
+        Raises:
+            CopyError: An episode is going on, and the stack of a simulation cannot be copied.
+        """
+        if self._in_mid_episode():
+            raise CopyError(
+                f"{type(self).__name__} can be copied and pickled between episodes, and not in mid-episode: close() or"
+                " reset it afterwards, or see branch() for copies of a running simulation"
+            )
+        return self._state()
+
+    def _state(self) -> dict[str, Any]:
+        kept = {name: value for name, value in vars(self).items() if name not in _OWN}
+        return kept | {"seed": self._session.seed}
+
+    @property
+    def driver(self) -> str:
+        """What switches between the simulation and its user."""
+        return self._plan.options.driver
+
+    def check_pending(self) -> None:
+        """Make sure that a decision is pending.
+
+        Raises:
+            ResetNeededError: None is.
+            ReentrancyError: The simulation is moving.
+        """
+        if self._episode is None:
+            raise self._session.not_running()
+        if self._episode.pending is None:
+            raise self._episode.nothing_pending()
+
+    def replayed(self) -> Any:
+        """Make an environment that stands just where this one stands in mid-episode: a copy for ``branch``.
+
+        Raises:
+            BranchError: It cannot be brought there.
+            ResetNeededError: There is no episode that could be brought anywhere.
+        """
+        made = _made_again(self._claimed_by or type(self), self._made_of)
+        made.__setstate__(copy.deepcopy(self._state()))
+        made._go_on(made._session.replay(self._session))
+        return made
+
+    def _go_on(self, episode: Any) -> None:
+        """Take over an episode in the midst of it."""
+        self._episode = episode
+
+    def _in_mid_episode(self) -> bool:
+        return self._episode is not None and not self._episode.over
 
     def _clear(self) -> None:
         """Forget the episode."""
         self._episode = None
+
+
+class OneAgentView(View, gym.Env[Any, Any]):
+    """A view with one agent, and so a Gymnasium environment."""
+
+    _agent: str
+
+    def _begin(self, seed: int | None, options: dict[str, Any] | None, kind: type[AnyEpisode]) -> AnyEpisode:
+        """End the episode that runs, begin another, and seed the generator and the spaces."""
+        seed = checked_seed(seed)
+        self._make_way()
+        gym.Env.reset(self, seed=seed)
+        episode = self._session.start(seed, options, self.np_random, kind)
+        if seed is not None:
+            seed_space(self.observation_space, seed, self._agent)
+            seed_space(self.action_space, seed, self._agent)
+        return episode
 
 
 class AgentsView(View):
@@ -235,6 +327,20 @@ class AgentsView(View):
         return duplicate(record.observation)
 
 
+def _made_again(view: type[View], plan: Plan) -> View:
+    """An environment of a class, of which a plan is all that is known."""
+    made = view.__new__(view)
+    base: Any = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
+    base.__init__(made, plan)
+    return made
+
+
+_OWN = frozenset(
+    ("_claim", "_claimed_by", "_episode", "_finalizer", "_made_of", "_plan", "_record", "_session", "metadata")
+)
+"""What each environment has of its own, and no copy takes over."""
+
+
 # -- many threads ---------------------------------------------------------------------------------
 
 
@@ -263,17 +369,22 @@ class _Claim:
         self._lock.release()
 
 
-def _one_at_a_time(view: type[View]) -> type[View]:
-    """The same class of environments, but for changing threads: what moves the simulation claims it before.
+def one_at_a_time(env: Any) -> None:
+    """Have an environment be used from changing threads: what moves its simulation claims it before.
 
-    A class of its own, so that environments which stay in their thread have nothing to pay for it.
+    It gets a class of its own, so that environments which stay in their thread have nothing to pay for it.
     """
-    made: type[View] | None = vars(view).get("_claiming")
+    env.__class__ = _one_at_a_time(type(env))
+    env._claim = _Claim()
+
+
+def _one_at_a_time(view: type[Any]) -> type[Any]:
+    made: type[Any] | None = vars(view).get("_claiming")
     if made is None:
         claiming = {name: _claiming(getattr(view, name)) for name in ("reset", "step", "close")}
         same = {name: getattr(view, name) for name in ("__module__", "__qualname__", "__doc__")}
         made = type(view.__name__, (view,), claiming | same)
-        view._claiming = made  # type: ignore[attr-defined]
+        view._claiming = made
     return made
 
 

@@ -143,6 +143,13 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     # -- PettingZoo's books -----------------------------------------------------------------------
 
+    def _go_on(self, episode: Any) -> None:
+        super()._go_on(episode)
+        episode.parting = []  # who has ended is in the books already
+
+    def _in_mid_episode(self) -> bool:
+        return super()._in_mid_episode() or bool(self._leaving)  # who has ended is yet to take leave
+
     def _clear(self) -> None:
         super()._clear()
         self.agents = []

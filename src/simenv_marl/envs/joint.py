@@ -6,20 +6,18 @@ from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from .._plan import Plan
 from .._rounds import Rounds
-from .._session import checked_seed, seed_space
 from .._spaces import blank, duplicate
 from ..errors import InvalidActionError, ViewError
 from ..simulation import RULE
-from ._view import View
+from ._view import OneAgentView
 
 
-class SimulationJointEnv(View, gym.Env[Any, Any]):
+class SimulationJointEnv(OneAgentView):
     """A simulation as a Gymnasium environment whose one agent takes all decisions. Made by ``joint_env``.
 
     A step is a round of the parallel view with an action for everybody; the reward is the sum. The agents are
@@ -32,6 +30,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
     """
 
     _episode: Rounds | None
+    _agent = "joint"
 
     def __init__(self, plan: Plan) -> None:
         """Make the environment of a plan.
@@ -46,7 +45,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             with_seed = self._session.start(0, None, np.random.default_rng(0), Rounds)
             roster = {agent: record.binding for agent, record in with_seed.agents.items()}
             self._session.close()
-            self._plan = self._session.plan = plan.declared(roster)
+            self._plan = self._made_of = self._session.plan = plan.declared(roster)
         self._agents = list(roster)
         observations = {agent: deepcopy(binding.definition.observation_space) for agent, binding in roster.items()}
         actions = {agent: deepcopy(binding.definition.action_space) for agent, binding in roster.items()}
@@ -78,13 +77,7 @@ class SimulationJointEnv(View, gym.Env[Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        seed = checked_seed(seed)
-        self._make_way()
-        gym.Env.reset(self, seed=seed)
-        self._episode = self._session.start(seed, options, self.np_random, Rounds)
-        if seed is not None:
-            seed_space(self.observation_space, seed, "joint")
-            seed_space(self.action_space, seed, "joint")
+        self._episode = self._begin(seed, options, Rounds)
         self._time = None
         if self._shows:
             self.render()

@@ -6,7 +6,6 @@ import copy
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -14,13 +13,12 @@ from numpy.typing import NDArray
 from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
-from .._session import checked_seed, seed_space
 from ..decision import Definition
 from ..errors import ViewError
-from ._view import View
+from ._view import OneAgentView, View
 
 
-class SimulationEnv(View, gym.Env[Any, Any]):
+class SimulationEnv(OneAgentView):
     """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``.
 
     Attributes:
@@ -71,13 +69,7 @@ class SimulationEnv(View, gym.Env[Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        seed = checked_seed(seed)
-        self._make_way()
-        gym.Env.reset(self, seed=seed)
-        self._episode = episode = self._session.start(seed, options, self.np_random, Episode)
-        if seed is not None:
-            seed_space(self.observation_space, seed, self._agent)
-            seed_space(self.action_space, seed, self._agent)
+        self._episode = episode = self._begin(seed, options, Episode)
         self._record = record = episode.agents[self._agent]
         if self._shows:
             self.render()
@@ -112,6 +104,10 @@ class SimulationEnv(View, gym.Env[Any, Any]):
             record.info,
         )
 
+    def _go_on(self, episode: Any) -> None:
+        super()._go_on(episode)
+        self._record = episode.agents[self._agent]
+
     def _clear(self) -> None:
         super()._clear()
         self._record = None
@@ -132,7 +128,8 @@ class SimulationGoalEnv(SimulationEnv):
         """
         self.check(plan)
         self._definition = plan.active[0].definition
-        super().__init__(plan.redefined(plan.active[0].point, _with_goals(self._definition)))
+        super().__init__(with_goals(plan))
+        self._made_of = plan
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:
         """What the rewards had been, had these been the goals.
@@ -149,6 +146,11 @@ class SimulationGoalEnv(SimulationEnv):
         assert compute is not None
         reward = np.asarray(compute(achieved_goal, desired_goal, info), np.float64)
         return float(reward) if reward.ndim == 0 else reward
+
+
+def with_goals(plan: Plan) -> Plan:
+    """The same plan, with observations that tell the goals of its one decision point."""
+    return plan.redefined(plan.active[0].point, _with_goals(plan.active[0].definition))
 
 
 def _with_goals(definition: Definition) -> Definition:

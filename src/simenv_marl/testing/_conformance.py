@@ -22,7 +22,7 @@ from ._report import (
 )
 from ._runs import (
     TimeUp,
-    all_rules,
+    play_rules,
     seed_global_generators,
     untouched_run,
     within,
@@ -145,8 +145,9 @@ class ConformanceChecks(Checks):
             plain = untouched_run(self._plan, seed, self._deadline())
             env = self._make("aec", {"max_steps": None})
             seed_global_generators(seed)
+            env.reset(seed=seed)
             start = time.perf_counter()
-            within(self._deadline(), partial(all_rules, env, seed))
+            within(self._deadline(), partial(play_rules, env))
             seconds = time.perf_counter() - start
         except (Exception, SystemExit):
             return

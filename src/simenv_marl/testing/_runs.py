@@ -301,6 +301,11 @@ def rule_run(env: Any, seed: int, limit: int, deadline: float, own: Callable[[An
 def all_rules(env: Any, seed: int) -> None:
     """Play an environment of any view with ``RULE`` throughout."""
     env.reset(seed=seed)
+    play_rules(env)
+
+
+def play_rules(env: Any) -> None:
+    """The same, once it has been reset."""
     if not hasattr(env, "agents"):
         while not any(env.step(RULE)[2:4]):
             pass

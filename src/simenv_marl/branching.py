@@ -1,0 +1,212 @@
+"""Exact continuations of an episode that is going on, for planning, counterfactuals and studies of variance."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from selectors import EVENT_READ, DefaultSelector
+from typing import Any, Final, NoReturn, TypeVar
+
+import cloudpickle
+
+from .envs import View
+from .errors import BranchError, OptionValueError, ViewError
+
+Result = TypeVar("Result")
+
+METHODS: Final = ("fork", "replay")
+
+
+def branch(
+    env: Any,
+    function: Callable[[Any, int], Result],
+    n: int = 1,
+    *,
+    method: str | None = None,
+    time_limit: float = 600.0,
+) -> list[Result]:
+    """Call a function on exact continuations of an environment that stands in mid-episode.
+
+    Each of them stands where ``env`` stands, in everything: the model and its random numbers, the environment's
+    generators, wrappers. They are the same bit for bit as long as they are given the same actions. ``env`` itself
+    does not move.
+
+    Args:
+        env: An environment of a single simulation, in any view, in wrappers or not.
+        function: Called with the continuation and its number, from 0 to ``n - 1``. It may do as it likes with it.
+        n: How many continuations.
+        method: "fork": each in a process of its own, split off with the simulation suspended (POSIX, and
+            ``driver="greenlet"``). They run on as many cores as there are, and their results are pickled. "replay":
+            one after the other in this process, in a new simulation with the same seed that is given the same
+            actions; the policies of the option ``policies`` answer as they did, and from there on are asked
+            themselves. None: "fork" where that is possible.
+        time_limit: After how many seconds a forked continuation is ended.
+
+    Returns:
+        What the function has returned, in the order of the numbers.
+
+    Raises:
+        ResetNeededError: There is no episode that could be continued.
+        BranchError: A forked continuation has died, took too long, or has returned what cannot be pickled; or a
+            replay did not come to the same decision.
+        OptionValueError: There is no such method, or not here.
+        BaseException: What the function raises, with a note that says in which continuation.
+    """
+    view = getattr(env, "unwrapped", env)
+    if not isinstance(view, View):
+        raise ViewError(f"branch continues environments of one simulation, and {env!r} is none")
+    if isinstance(n, bool) or not isinstance(n, int) or n < 0:
+        raise OptionValueError(f"n must be a number of continuations, not {n!r}")
+    if method not in (None, *METHODS):
+        raise OptionValueError(f"method must be None or one of {', '.join(map(repr, METHODS))}, not {method!r}")
+    forks = hasattr(os, "fork") and view.driver == "greenlet"
+    if method == "fork" and not forks:
+        raise OptionValueError(
+            'method="fork" needs a platform that can fork, and driver="greenlet": a forked process has none of the'
+            ' other threads; use "replay"'
+        )
+    view.check_pending()
+    if method == "replay" or not forks:
+        return [_replayed(env, view, function, number) for number in range(n)]
+    return _forked(env, function, n, time_limit)
+
+
+# -- by replaying ---------------------------------------------------------------------------------
+
+
+def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
+    twin = view.replayed()
+    try:
+        # Of the wrappers around it each is copied, with all that it remembers.
+        return function(copy.deepcopy(env, {id(view): twin}), number)
+    except Exception as error:
+        error.add_note(f"simenv_marl: in branch {number}")
+        raise
+    finally:
+        twin.close()
+
+
+# -- by forking -----------------------------------------------------------------------------------
+
+
+class _Child:
+    """A process with a continuation, as its parent sees it."""
+
+    def __init__(self, number: int, process: int, pipe: int, time_limit: float) -> None:
+        self.number, self.process, self.pipe = number, process, pipe
+        self.deadline = time.monotonic() + time_limit
+        self.received = bytearray()
+
+    def end(self) -> None:
+        """Bring it to its end."""
+        os.close(self.pipe)
+        os.kill(self.process, signal.SIGKILL)
+        os.waitpid(self.process, 0)
+
+
+def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: float) -> list[Any]:
+    results: list[Any] = [None] * n
+    children: dict[int, _Child] = {}
+    at_once = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    started = 0
+    with DefaultSelector() as selector:
+        try:
+            while started < n or children:
+                while started < n and len(children) < at_once:
+                    child = _fork(env, function, started, list(children), time_limit)
+                    children[child.pipe] = child
+                    selector.register(child.pipe, EVENT_READ)
+                    started += 1
+                first = min(child.deadline for child in children.values())
+                ready = selector.select(max(0.0, first - time.monotonic()))
+                if not ready:
+                    late = min(children.values(), key=lambda child: child.deadline)
+                    raise BranchError(f"branch {late.number} was ended: it took longer than {time_limit} s")
+                for key, _ in ready:
+                    child = children[key.fd]
+                    chunk = os.read(child.pipe, 1 << 16)
+                    child.received += chunk
+                    if not chunk:
+                        selector.unregister(child.pipe)
+                        del children[child.pipe]
+                        results[child.number] = _result(child)
+        finally:
+            for child in children.values():
+                child.end()
+    return results
+
+
+def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: list[int], time_limit: float) -> _Child:
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(Exception):  # what is in it would be written by both processes
+            stream.flush()
+    reading, writing = os.pipe()
+    with warnings.catch_warnings():
+        # Python warns of forks beside threads: locks that they hold are never released in the child. It does no more
+        # than the function does, and has a time limit.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        process = os.fork()
+    if process == 0:
+        _be_child(env, function, number, [reading, *pipes], writing)
+    os.close(writing)
+    return _Child(number, process, reading, time_limit)
+
+
+def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others: list[int], pipe: int) -> NoReturn:
+    """Answer, and end without anything that ends with the parent."""
+    try:
+        for other in others:
+            os.close(other)
+        torch = sys.modules.get("torch")
+        if torch is not None:
+            torch.set_num_threads(1)  # its threads have stayed behind, and would be waited for
+        try:
+            message = _packed(True, function(env, number))
+        except BaseException as error:
+            message = _packed(False, error)
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(Exception):
+                stream.flush()
+        while message:
+            message = message[os.write(pipe, message) :]
+    finally:
+        os._exit(0)
+
+
+def _packed(answered: bool, value: Any) -> bytes:
+    """What a child says: whether it has an answer; that, or the error with its traceback."""
+    story = "" if answered else "".join(traceback.format_exception(value))
+    notes = () if answered else tuple(getattr(value, "__notes__", ()))
+    try:
+        packed: bytes = cloudpickle.dumps((answered, value, notes, story))
+        pickle.loads(packed)  # an error may be pickled and still not be made again
+        return packed
+    except Exception as error:
+        what = "has returned what cannot be pickled" if answered else "has raised what cannot be pickled"
+        return pickle.dumps((False, None, (), f"{what} ({type(error).__name__}: {error})\n{story}"))
+
+
+def _result(child: _Child) -> Any:
+    """The answer of a child that has ended."""
+    number = child.number
+    os.close(child.pipe)
+    status = os.waitpid(child.process, 0)[1]
+    if not child.received:
+        code = os.waitstatus_to_exitcode(status)
+        how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
+        raise BranchError(f"branch {number} has died without an answer, {how}")
+    answered, value, notes, story = pickle.loads(child.received)
+    if answered:
+        return value
+    if not isinstance(value, Exception):  # one that is not even to be raised here, as an exit or an interrupt
+        raise BranchError(f"branch {number} {'has raised' if value is not None else ''} {story}".strip())
+    value.__notes__ = [*notes, f"simenv_marl: in branch {number}, whose traceback was:\n{story}"]
+    raise value

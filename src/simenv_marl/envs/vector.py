@@ -1,0 +1,304 @@
+"""The vector view: many simulations of a kind, stepped together."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, create_empty_array
+from numpy.typing import NDArray
+
+from .._session import checked_seed
+from .._spaces import duplicate
+from ..errors import (
+    ClosedError,
+    CopyError,
+    EpisodeOverError,
+    NotResetError,
+    OptionValueError,
+    ReentrancyError,
+)
+from ._seats import Actions, Batch, Row, Seat, Seating
+from ._view import one_at_a_time
+from ._workers import Recipe, Workers
+
+
+class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
+    """Many simulations as one ``gymnasium.vector.VectorEnv``. Made by ``vector_env``.
+
+    It is ``gymnasium.vector.SyncVectorEnv`` over as many single (or joint) views, and tells the same step by step.
+
+    Attributes:
+        num_envs: How many simulations there are.
+        single_observation_space, single_action_space: The spaces of one of them.
+        observation_space, action_space: Those of all of them, batched.
+        metadata: As that of the view, with ``autoreset_mode``.
+        render_mode: What ``render`` returns of each.
+        closed: Whether it was closed.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        *,
+        num_envs: int,
+        workers: int = 0,
+        copy: bool = True,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        context: Any = None,
+    ) -> None:
+        """Make the environment of a recipe; the other arguments are those of ``vector_env``.
+
+        Raises:
+            SimEnvError: Something in it cannot work; the leaf says what.
+        """
+        super().__init__()
+        self.num_envs = _count(num_envs, "num_envs", 1)
+        workers = _count(workers, "workers", 0)
+        self._mode = _mode(autoreset_mode)
+        self._copy = bool(copy)
+        plan = recipe.plan()
+        seating = Seating(plan, recipe.view)
+        self.render_mode = plan.options.render_mode
+        self.metadata = {**seating.metadata, "autoreset_mode": self._mode}
+        self.single_observation_space = seating.single_observation_space
+        self.single_action_space = seating.single_action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._actions = Actions(seating, self.num_envs)
+        self._begun = self._moving = False
+        self._crew: Row | Workers
+        if workers:
+            self._crew = Workers(recipe, seating, self._mode, self.num_envs, workers, context)
+        else:
+            batch = Batch(create_empty_array(self.single_observation_space, self.num_envs), self.num_envs)
+            self._crew = Row(seating, batch, self._mode, self.num_envs)
+        self._batch = self._crew.batch
+        self._finalizer = weakref.finalize(self, self._crew.abandon)
+        if workers or plan.options.driver == "thread":
+            one_at_a_time(self)
+
+    # -- episodes ---------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset all simulations, or some, and run them to their first decisions.
+
+        Args:
+            seed: An integer: the simulations get ``seed``, ``seed + 1``, ...; a sequence: each gets its own (or None);
+                None: each draws one from its own generator.
+            options: Handed to the simulations' ``reset``, where that takes them, but for ``"reset_mask"``: a bool
+                array of shape ``(num_envs,)`` that says which of them to reset.
+
+        Returns:
+            The observations of all and the infos of those that were reset.
+
+        Raises:
+            OptionValueError: The seeds or the mask are not as they should be.
+            ClosedError: The environment is closed.
+            BaseException: Whatever a simulation or a mapping raises, with a note that says which. All are then to be
+                reset; where one raises, those after it have not been.
+        """
+        self._enter()
+        try:
+            seeds = self._seeds(seed)
+            chosen, options = self._chosen(options)
+            told = self._crew.reset(seeds, options, chosen)
+            self._begun = True
+        finally:
+            self._moving = False
+        infos: dict[str, Any] = {}
+        for number, info in told:
+            infos = self._add_info(infos, info, number)
+        observations = self._batch.observations
+        return duplicate(observations) if self._copy else observations, infos
+
+    def step(
+        self, actions: Any
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Answer the pending decision of each simulation and run it to its next one.
+
+        Args:
+            actions: A batch of the action space. What stands in it for simulations that are now reset is not used.
+
+        Returns:
+            Observations, rewards (float64), terminations and truncations (bool), each of shape ``(num_envs, ...)``,
+            and infos.
+
+        Raises:
+            InvalidActionError: An action is not legal; it says of which simulation. None of them has moved.
+            ResetNeededError: There is no episode to go on with.
+            BaseException: Whatever a simulation or a mapping raises, with a note that says which. All are then to be
+                reset.
+        """
+        self._enter()
+        try:
+            crew = self._crew
+            if not self._begun:
+                raise NotResetError("there is no episode yet; call reset() first")
+            if crew.failed:
+                raise EpisodeOverError("an error has ended the episodes; call reset() to begin the next ones")
+            ended = crew.ended
+            if ended and self._mode == AutoresetMode.DISABLED:
+                raise EpisodeOverError(
+                    f"the episodes of the sub-environments {sorted(ended)[:10]} are over; begin the next ones with"
+                    ' reset(options={"reset_mask": ...})'
+                )
+            parts = self._actions.split(actions, ended)
+            if not self._actions.complete:
+                crew.check(parts)
+            told = crew.step(parts)
+        finally:
+            self._moving = False
+        infos: dict[str, Any] = {}
+        for number, info in told:
+            infos = self._add_info(infos, info, number)
+        batch = self._batch
+        observations = batch.observations
+        return (
+            duplicate(observations) if self._copy else observations,
+            batch.rewards.copy(),
+            batch.terminations.copy(),
+            batch.truncations.copy(),
+            infos,
+        )
+
+    def _enter(self) -> None:
+        if self._moving:
+            raise ReentrancyError("the environment was used from inside its own simulations or mappings")
+        if self.closed:
+            raise ClosedError("the environment is closed; make another one")
+        self._moving = True
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        if seed is None or isinstance(seed, (int, np.integer)):
+            first = checked_seed(seed)
+            return [None if first is None else first + number for number in range(self.num_envs)]
+        seeds = [checked_seed(part) for part in seed]
+        if len(seeds) != self.num_envs:
+            raise OptionValueError(f"there are {len(seeds)} seeds for {self.num_envs} simulations")
+        return seeds
+
+    def _chosen(self, options: dict[str, Any] | None) -> tuple[list[int], dict[str, Any] | None]:
+        """Which simulations are to be reset, and with which options."""
+        everybody = list(range(self.num_envs))
+        if options is None or "reset_mask" not in options:
+            return everybody, options
+        mask = options["reset_mask"]
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
+            raise OptionValueError(f"reset_mask must be a bool array of shape ({self.num_envs},), not {mask!r}")
+        chosen: list[int] = np.flatnonzero(mask).tolist()
+        if not chosen:
+            raise OptionValueError("reset_mask names no simulation that is to be reset")
+        if chosen != everybody and not self._begun:
+            raise NotResetError("there are no episodes yet; call reset() without a reset_mask first")
+        if chosen != everybody and self._crew.failed:
+            raise EpisodeOverError("an error has ended the episodes; call reset() without a reset_mask")
+        return chosen, {name: value for name, value in options.items() if name != "reset_mask"}
+
+    # -- the simulations --------------------------------------------------------------------------
+
+    @property
+    def envs(self) -> list[Seat]:
+        """The Gymnasium environments of the simulations, in their order."""
+        return list(self._crew.seats)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of each sub-environment, or get its attribute.
+
+        Args:
+            name: Its name: an attribute of a single (or joint) view, such as ``simulation``.
+            *args: What it is called with.
+            **kwargs: What it is called with by keyword.
+
+        Returns:
+            What each returns.
+
+        Raises:
+            ClosedError: The environment is closed.
+            BaseException: What a sub-environment raises.
+        """
+        self._enter()
+        try:
+            return tuple(self._crew.call(name, args, kwargs))
+        finally:
+            self._moving = False
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """The attribute of that name of each sub-environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of each sub-environment.
+
+        Args:
+            name: Its name.
+            values: A list or tuple of a value for each; or one value for all.
+
+        Raises:
+            OptionValueError: There are more or fewer values than sub-environments.
+        """
+        if not isinstance(values, (list, tuple)):
+            values = [values] * self.num_envs
+        if len(values) != self.num_envs:
+            raise OptionValueError(f"there are {len(values)} values for {self.num_envs} simulations")
+        self._enter()
+        try:
+            self._crew.set_attr(name, values)
+        finally:
+            self._moving = False
+
+    @property  # type: ignore[misc]  # one generator for each cannot be set as one
+    def np_random(self) -> Any:
+        """The generators of the sub-environments, as a tuple."""
+        return self.get_attr("np_random")
+
+    @property
+    def np_random_seed(self) -> Any:
+        """What the generators of the sub-environments were seeded with, as a tuple."""
+        return self.get_attr("np_random_seed")
+
+    def render(self) -> tuple[Any, ...]:
+        """Render each simulation in ``render_mode``; without one, a tuple of None and a warning."""
+        return self.call("render")
+
+    def close(self, **kwargs: Any) -> None:
+        """Unwind all simulations. The environment cannot be used any more.
+
+        Raises:
+            ReentrancyError, WrongThreadError: It cannot be closed from here, and goes on.
+            BaseException: What the first simulation raises while it unwinds; all are unwound nevertheless.
+        """
+        if self.closed:
+            return
+        self._enter()
+        try:
+            self._crew.close()
+        finally:
+            self._moving = False
+            self.closed = not self._crew.suspended
+            if self.closed:
+                self._finalizer.detach()
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Refuse to be copied or pickled: the stacks of simulations cannot be."""
+        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
+
+
+def _count(value: Any, name: str, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise OptionValueError(f"{name} must be an integer of at least {least}, not {value!r}")
+    return int(value)
+
+
+def _mode(mode: Any) -> AutoresetMode:
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        raise OptionValueError(
+            f"autoreset_mode must be one of {', '.join(repr(known.value) for known in AutoresetMode)}, not {mode!r}"
+        ) from None

@@ -1,0 +1,393 @@
+"""Branches: exact continuations of an episode that is going on."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from examples.greenhouse_coop.env import GreenhouseSim
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from simenv_marl import (
+    RULE,
+    BranchError,
+    EpisodeOverError,
+    NotResetError,
+    OptionValueError,
+    ReentrancyError,
+    ViewError,
+    _episode,
+    aec_env,
+    branch,
+    difference,
+    joint_env,
+    parallel_env,
+    single_env,
+)
+
+from .copied import Walk
+from .many_worlds import Being, beings
+from .models import decision, define, script
+
+ROOT = Path(__file__).parent.parent
+METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
+VIEWS = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
+POINTS = {
+    Walk.choose: None,
+    f"{Walk.__module__}.Walk.drift": define(
+        agent="wind_0",
+        observation_space=spaces.Box(-99, 99, (1,), np.float32),
+        observation_space_mapping=lambda walk: [walk.place],
+        reward_mapping=difference(lambda walk: walk.place),
+    ),
+}
+
+
+def move(env, number=0):
+    """One step of an environment of any view with random actions; what it tells."""
+    unwrapped = env.unwrapped
+    if hasattr(unwrapped, "agent_iter"):
+        observation, *rest = env.last()
+        agent = env.agent_selection
+        ended = rest[1] or rest[2]
+        env.step(None if ended else (env.action_space(agent).sample() + number) % 3)
+        return repr((agent, observation, rest, env.rewards, env.infos, env.agents))
+    if hasattr(unwrapped, "agents"):
+        return repr(env.step({agent: (env.action_space(agent).sample() + number) % 3 for agent in env.agents}))
+    return repr(env.step(env.action_space.sample()))
+
+
+def rest_of(env, number=0):
+    """What all that is left of an episode tells, with the simulation's state."""
+    told = []
+    while getattr(env.unwrapped, "agents", True) and not (told and "True" in told[-1] and not hasattr(env, "agents")):
+        told.append(move(env, number))
+    simulation = env.unwrapped.simulation
+    return told, simulation.steps, simulation.place, simulation.random.random()
+
+
+def short(env, number=0):
+    return rest_of(env)
+
+
+# -- what a branch is -----------------------------------------------------------------------------
+
+
+@METHODS
+@VIEWS
+def test_branches_are_what_the_environment_would_have_done(make, method):
+    """At every point of an episode, and the environment itself has not moved."""
+    points = Walk.choose if make is single_env else POINTS
+    for taken in range(5):
+        env = make(lambda: Walk(6), points)
+        env.reset(seed=3)
+        for _ in range(taken):
+            move(env)
+        found = branch(env, short, 2, method=method)
+        assert found[0] == found[1] == rest_of(env)
+
+
+@METHODS
+def test_branches_may_differ_by_their_actions(method):
+    env = aec_env(lambda: Walk(6), Walk.choose)
+    env.reset(seed=3)
+    env.step(0)
+    found = branch(env, rest_of, 3, method=method)
+    assert len({repr(each) for each in found}) == 3
+    assert found[0] == rest_of(env)
+
+
+@METHODS
+def test_the_environment_stays_where_it_is(method):
+    env = single_env(lambda: Walk(6), Walk.choose)
+    env.reset(seed=3)
+    before = env.step(1)
+
+    def look(twin, number):
+        assert twin.simulation.place == env.simulation.place
+        twin.step(number)
+        return twin.simulation.steps
+
+    assert branch(env, look, 2, method=method) == [[0, -1], [0, 0]]
+    assert env.simulation.steps == [0]
+    assert branch(env, look, 0, method=method) == []
+    env.close()
+    assert before[2] is False
+
+
+@METHODS
+def test_branches_of_branches(method):
+    env = single_env(lambda: Walk(6), Walk.choose)
+    env.reset(seed=3)
+
+    def plan(twin, number):
+        twin.step(number)
+        return branch(twin, lambda deeper, second: (deeper.step(second)[0].tolist(), number, second), 2, method=method)
+
+    found = branch(env, plan, 2, method=method)
+    assert [[entry[1:] for entry in each] for each in found] == [[(0, 0), (0, 1)], [(1, 0), (1, 1)]]
+    assert len({repr(entry[0]) for each in found for entry in each}) > 2
+
+
+@METHODS
+def test_wrappers_come_along(method):
+    env = TimeLimit(single_env(lambda: Walk(9), Walk.choose), 4)
+    env.reset(seed=1)
+    env.step(1)
+
+    def count(twin, number):
+        assert isinstance(twin, TimeLimit)
+        steps = 1
+        while not twin.step(1)[3]:
+            steps += 1
+        return steps
+
+    assert branch(env, count, 2, method=method) == [3, 3]
+    assert env.step(1)[3] is False
+    wrapped = OrderEnforcingWrapper(aec_env(lambda: Walk(3), Walk.choose))
+    wrapped.reset(seed=1)
+    assert branch(wrapped, lambda twin, number: twin.step(1), 1, method=method) == [None]
+
+
+@METHODS
+def test_entities_that_were_born_and_have_died(method):
+    def main(simulation):
+        simulation.crowd = [Being(number) for number in range(3)]
+        for round_ in range(4):
+            for being in list(simulation.crowd):
+                being.health += being.act() + 1
+            simulation.crowd.pop(0).leave()
+            simulation.crowd.append(Being(10 + round_))
+        return [being.number for being in simulation.crowd]
+
+    def finish(env, number=0):
+        told = []
+        for agent in env.agent_iter():
+            observation, *rest = env.last()
+            told.append((agent, observation.tolist(), rest))
+            env.step(None if rest[1] or rest[2] else 2)
+        return told
+
+    env = aec_env(script(main), beings())
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(None if env.terminations[env.agent_selection] else 1)
+    found = branch(env, finish, 2, method=method)
+    assert found[0] == found[1] == finish(env)
+
+
+@pytest.mark.parametrize("options", [{"global_rng": True}, {"driver": "thread"}, {"max_steps": 3}])
+def test_options_hold_in_branches(options):
+    class Drawing(Walk):
+        def drift(self):
+            return random.random() if options.get("global_rng") else 0.0
+
+    env = single_env(lambda: Drawing(6), Walk.choose, **options)
+    env.reset(seed=3)
+    move(env)
+    found = branch(env, short, 2)
+    assert found[0] == found[1] == branch(env, short, 1, method="replay")[0] == rest_of(env)
+
+
+def test_policies_answer_as_they_did():
+    """Those of a replay are not asked again for what they have answered, whatever they would say now."""
+    answers = iter(range(100))
+    env = aec_env(lambda: Walk(6), POINTS, policies={"wind_0": lambda observation: next(answers) % 3})
+    env.reset(seed=3)
+    for _ in range(3):
+        env.step(1)
+    places = branch(env, lambda twin, number: twin.simulation.place, 2, method="replay")
+    assert places == [env.simulation.place] * 2
+    assert next(answers) == 3
+
+
+def test_actions_that_their_user_changes_later():
+    walk = define(agent="walker_0", action_space=spaces.Box(-1, 1, (1,), np.float32), reward_mapping=lambda walk: 0.0)
+    env = single_env(lambda: Walk(6), {f"{Walk.__module__}.Walk.drift": walk})
+    env.reset(seed=3)
+    action = np.array([0.5], np.float32)
+    env.step(action)
+    action[:] = -1
+    assert branch(env, lambda twin, number: twin.simulation.place, 1, method="replay") == [env.simulation.place]
+
+
+def test_the_greenhouse_can_be_planned_in():
+    """A year of watering by looking a few days ahead is better than what the rule does."""
+
+    def ahead(env, number):
+        action = {"waterer_0": np.array([number / 10], np.float32), "ventilator_0": RULE}
+        total = 0.0
+        for _ in range(6):
+            _, rewards, *_ = env.step(action)
+            total += rewards.get("ventilator_0", 0.0)
+            if not env.agents:
+                break
+        return total
+
+    env = parallel_env(GreenhouseSim)
+    env.reset(seed=2)
+    for _ in range(3):
+        values = branch(env, ahead, 3)
+        assert values == branch(env, ahead, 3, method="replay")
+        env.step({"waterer_0": np.array([int(np.argmax(values)) / 10], np.float32), "ventilator_0": RULE})
+    assert env.simulation.greenhouse.alive > 150
+
+
+# -- what goes wrong ------------------------------------------------------------------------------
+
+
+def going_on():
+    env = single_env(lambda: Walk(6), Walk.choose)
+    env.reset(seed=3)
+    env.step(1)
+    return env
+
+
+class Unpicklable(Exception):
+    def __init__(self, one, two):
+        super().__init__(one)
+
+
+@METHODS
+def test_an_error_in_a_branch_surfaces_as_itself(method):
+    def fail(twin, number):
+        twin.step(1)
+        return 1 / (1 - number)
+
+    env = going_on()
+    with pytest.raises(ZeroDivisionError) as caught:
+        branch(env, fail, 3, method=method)
+    assert "in branch 1" in "\n".join(caught.value.__notes__)
+    with pytest.raises(ValueError, match="action"):
+        branch(env, lambda twin, number: twin.step(99), 1, method=method)
+    env.step(1)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda twin, number: os.kill(os.getpid(), signal.SIGKILL), r"branch [01] has died.*signal 9"),
+        (lambda twin, number: os._exit(3), r"branch [01] has died.*exit code 3"),
+        (lambda twin, number: sys.exit(4), r"branch [01] has raised[\s\S]*SystemExit: 4"),
+        (lambda twin, number: (yield), "cannot be pickled"),
+        (lambda twin, number: Unpicklable(1, 2), "cannot be pickled"),
+    ],
+)
+def test_a_branch_that_dies_says_so_and_leaves_the_environment_whole(function, message):
+    env = going_on()
+    with pytest.raises(BranchError, match=message):
+        branch(env, function, 2, method="fork")
+    assert env.step(1)[2] is False
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_an_error_that_cannot_be_pickled():
+    def fail(twin, number):
+        raise Unpicklable(1, 2)
+
+    with pytest.raises(BranchError, match=r"cannot be pickled[\s\S]*Unpicklable: 1"):
+        branch(going_on(), fail, 1, method="fork")
+
+
+def test_a_branch_that_takes_too_long_is_ended():
+    env, begun = going_on(), time.monotonic()
+    with pytest.raises(BranchError, match="longer than"):
+        branch(env, lambda twin, number: time.sleep(60), 2, method="fork", time_limit=0.3)
+    assert time.monotonic() - begun < 30
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+    env.step(1)
+
+
+def test_simulations_that_are_random_for_themselves():
+    class Dice(Walk):
+        def reset(self, seed=None):
+            super().reset()
+
+    env = single_env(lambda: Dice(6), Walk.choose)
+    env.reset(seed=3)
+    env.step(1)
+    with pytest.raises(BranchError, match=r"reset with the same seed[\s\S]*fork"):
+        branch(env, short, 1, method="replay")
+    found = branch(env, short, 2, method="fork")
+    assert found[0] == found[1] == rest_of(env)
+
+
+def test_too_many_decisions_to_be_kept(monkeypatch):
+    monkeypatch.setattr(_episode, "MOST_TAKEN", 3)
+    env = single_env(lambda: Walk(9), Walk.choose)
+    for _ in range(2):
+        env.reset(seed=3)
+        for number in range(5):
+            assert branch(env, short, 1, method="replay")[0] == branch(env, short, 1)[0] if number < 3 else True
+            env.step(1)
+        with pytest.raises(BranchError, match="fork"):
+            branch(env, short, 1, method="replay")
+        found = branch(env, short, 1)
+    assert found == [rest_of(env)]
+    env = single_env(lambda: Walk(9), Walk.choose, max_steps=4)
+    env.reset(seed=3)
+    assert [env.step(1)[3] for _ in range(4)] == [False, False, False, True]
+
+
+def test_what_cannot_be_continued():
+    env = single_env(lambda: Walk(1), Walk.choose)
+    with pytest.raises(NotResetError):
+        branch(env, short)
+    env.reset()
+    for changes in ({"n": -1}, {"n": 2.0}, {"method": "clone"}):
+        with pytest.raises(OptionValueError):
+            branch(env, short, **changes)
+    env.step(1)
+    with pytest.raises(EpisodeOverError):
+        branch(env, short)
+    with pytest.raises(ViewError):
+        branch("env", short)
+    env = single_env(lambda: Walk(1), Walk.choose, driver="thread")
+    env.reset()
+    with pytest.raises(OptionValueError, match="replay"):
+        branch(env, short, method="fork")
+    env.close()
+
+
+def test_not_from_inside_its_own_mappings():
+    envs = []
+
+    def observe():
+        if envs:
+            branch(envs[0], short)
+        return [0, 0]
+
+    ant = decision(agent="ant_0", observation_space_mapping=observe)
+    env = aec_env(script(lambda simulation: [ant(), ant()]), ant)
+    env.reset()
+    envs.append(env)
+    with pytest.raises(ReentrancyError):
+        env.step(1)
+    envs.clear()
+
+
+def test_what_a_branch_prints_is_printed_once():
+    code = """
+    import sys
+    from simenv_marl import branch, single_env
+    from tests.copied import Walk
+    env = single_env(Walk, Walk.choose)
+    env.reset(seed=1)
+    print("before")
+    branch(env, lambda twin, number: print("in", number), 1, method="fork")
+    print("after")
+    """
+    run = [sys.executable, "-W", "error", "-c", textwrap.dedent(code)]
+    ran = subprocess.run(run, capture_output=True, text=True, timeout=60, check=False, cwd=ROOT)
+    assert ran.stdout.split("\n")[:3] == ["before", "in 0", "after"], ran.stderr
+    assert ran.stderr == ""

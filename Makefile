@@ -3,13 +3,20 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint docs benchmark clean
+.PHONY: demo test coverage soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
 
 test: lint docs
 	$(BIN)/python -m pytest
+
+coverage: .venv/.test
+	$(BIN)/python -m pytest --cov --cov-report=term
+
+soak: .venv/.test
+	$(BIN)/python -m benchmarks.soak --driver greenlet
+	$(BIN)/python -m benchmarks.soak --driver thread
 
 lint: .venv/.test
 	$(BIN)/ruff check .

@@ -14,13 +14,12 @@ that a decision function which is called outside any environment finds that out 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import wraps
 from threading import Thread, get_ident
 from typing import Any, Final, Protocol
 
-from .errors import WrongThreadError
+from .errors import WrongThreadError, annotate
 from .simulation import Sentinel
 
 Ask = Callable[[Any, tuple[Any, ...], dict[str, Any]], Any]
@@ -182,7 +181,7 @@ class Watchful:
             if self._refused is not None and self._refused is not error:
                 if isinstance(error, SimulationExit):
                     return FAILED, self.refusal(), None
-                error.add_note(f"simenv_marl: and before that a decision was refused: {self._refused}")
+                annotate(error, f"simenv_marl: and before that a decision was refused: {self._refused}")
             return FAILED, error, None
         return (FINISHED, result, None) if self._refused is None else (FAILED, self.refusal(), None)
 
@@ -294,32 +293,52 @@ def attended() -> bool:
     return thread in RUNNING or thread in EVALUATING or thread in PLUGGED
 
 
-@contextmanager
-def unattended() -> Iterator[None]:
+def interrupted() -> None:
+    """An episode was ended by an error, on its user's side: in this thread nothing of it runs any more."""
+    thread = get_ident()
+    RUNNING.pop(thread, None)
+    EVALUATING.pop(thread, None)
+
+
+class unattended:  # noqa: N801 - it is used like a function
     """Keep apart what runs in this thread from the simulation or mapping that runs around it.
 
     Decision functions run their rule, differences are asked for nobody, and there are no plugins but those of the
-    whole process, until an episode says otherwise.
+    whole process, until an episode says otherwise. This and its like are classes, because a context manager made of
+    a generator cannot pass on errors that refuse to be changed, as frozen dataclasses do.
     """
-    thread = get_ident()
-    ask, memory, plugins = RUNNING.pop(thread, None), EVALUATING.pop(thread, None), PLUGGED.pop(thread, None)
-    try:
-        yield
-    finally:
-        if ask is not None:
-            RUNNING[thread] = ask
-        if memory is not None:
-            EVALUATING[thread] = memory
-        if plugins is not None:
-            PLUGGED[thread] = plugins
+
+    __slots__ = ("_around",)
+
+    def __enter__(self) -> None:
+        thread = get_ident()
+        self._around: tuple[Any, ...] = (
+            RUNNING.pop(thread, None),
+            EVALUATING.pop(thread, None),
+            PLUGGED.pop(thread, None),
+        )
+
+    def __exit__(self, *error: object) -> None:
+        thread = get_ident()
+        books: tuple[dict[int, Any], ...] = (RUNNING, EVALUATING, PLUGGED)
+        for book, before in zip(books, self._around, strict=True):
+            if before is not None:
+                book[thread] = before
+            else:
+                book.pop(thread, None)
 
 
-@contextmanager
-def preparing(offspring: Offspring) -> Iterator[None]:
+class preparing:  # noqa: N801
     """Make or reset a simulation, ``unattended``: nothing is decided, but threads that are started are its own."""
-    thread = get_ident()
-    RUNNING[thread] = offspring
-    try:
-        yield
-    finally:
-        RUNNING.pop(thread, None)
+
+    __slots__ = ("_offspring",)
+
+    def __init__(self, offspring: Offspring) -> None:
+        self._offspring = offspring
+
+    def __enter__(self) -> None:
+        self._offspring.driver = None  # also where an interrupt has kept the episode before from ending
+        RUNNING[get_ident()] = self._offspring
+
+    def __exit__(self, *error: object) -> None:
+        RUNNING.pop(get_ident(), None)

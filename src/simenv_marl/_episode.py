@@ -25,7 +25,7 @@ Views read the records of agents; none of them computes an observation or a rewa
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from operator import length_hint
 from threading import get_ident
@@ -44,6 +44,7 @@ from ._driver import (
     Offspring,
     SimulationExit,
     attended,
+    interrupted,
     unattended,
 )
 from ._greenlets import GreenletDriver
@@ -57,6 +58,7 @@ from .errors import (
     EpisodeOverError,
     NoDecisionError,
     ReentrancyError,
+    annotate,
     warn_user,
 )
 from .simulation import RULE, TRUNCATED, Sentinel
@@ -109,7 +111,7 @@ class Episode:
         offspring: Offspring | None = None,
         foretold: deque[Any] | None = None,
     ) -> None:
-        """Begin an episode of a simulation that has been reset: run it to its first decision.
+        """Prepare an episode of a simulation that has been reset.
 
         Args:
             plan: What the environment is made of.
@@ -117,10 +119,6 @@ class Episode:
             seed: What it was reset with, for those who read an error's notes.
             offspring: The threads that the simulation has started so far; None: it was never used before.
             foretold: What policies are to answer before they are asked themselves, where an episode is replayed.
-
-        Raises:
-            NoDecisionError: There is no decision for the environment's user.
-            BaseException: Whatever the model, a mapping or a policy raises.
         """
         self.pending: Record | None = None
         self.agents: dict[str, Record] = {}
@@ -145,22 +143,33 @@ class Episode:
             self.agents[agent] = Record(agent, binding, None, self.clock)
         make_driver = DRIVERS[plan.options.driver]
         self._driver: Driver | None = make_driver(self._main_loop(), plan.bindings, offspring or Offspring())
+
+    def begin(self) -> None:
+        """Run the simulation to its first decision.
+
+        Raises:
+            NoDecisionError: There is no decision for the environment's user.
+            BaseException: Whatever the model, a mapping or a policy raises.
+        """
+        driver = self._driver
+        assert driver is not None
         with self._kept_apart():
             try:
                 reply = None
                 while self.pending is None and not self.over:
-                    reply = self._take(*self._driver.resume(reply))
+                    reply = self._take(*driver.resume(reply))
                 if not self.over:
                     pending, self.pending = self.pending, None
                     self._foresee(pending)
                     self.pending = pending
             except BaseException as error:
+                self.pending, self.over = None, True
                 self._fail(error)
                 raise
-        if self.pending is None and not plan.unanswered:
+        if self.pending is None and not self._plan.unanswered:
             raise NoDecisionError(
-                f"{type(simulation).__name__}.run() came to its end without a decision of"
-                f" {', '.join(binding.point.name for binding in plan.active)}; does the simulation call the"
+                f"{type(self._simulation).__name__}.run() came to its end without a decision of"
+                f" {', '.join(binding.point.name for binding in self._plan.active)}; does the simulation call the"
                 " decision functions as attributes of their class or module?"
             )
 
@@ -213,13 +222,13 @@ class Episode:
         except Exception as error:
             self._annotate(error)
             raise
-        self.pending = None
-        self.turns = turns = self.turns + 1
-        taken = self.taken
-        taken.append(action)
-        if record.followed_up:
-            record.follow_up()
         try:
+            self.pending = None
+            self.turns = turns = self.turns + 1
+            taken = self.taken
+            taken.append(action)
+            if record.followed_up:
+                record.follow_up()
             while True:
                 # Functions are fetched from attributes before they are called: calling them there is slower.
                 resume = driver.resume
@@ -263,6 +272,7 @@ class Episode:
                 # Else they would keep alive what the model lets go meanwhile.
                 binding = args = kwargs = first = agent = record = None
         except BaseException as error:
+            self.pending, self.over = None, True  # whatever comes in between: an interrupt, the end of the stack
             binding = args = kwargs = first = None  # else the error would keep them alive
             self._fail(error)
             raise
@@ -407,11 +417,12 @@ class Episode:
                 record.observe(args, {})
                 record.choices = None  # which are asked for again when it decides
 
-    def _announced(self) -> Iterator[tuple[Record, tuple[Any, ...]]]:
+    def _announced(self) -> Iterable[tuple[Record, tuple[Any, ...]]]:
         """The live agents that the simulation says are going to decide, with the arguments of their calls."""
         expected = getattr(self._simulation, "expected_calls", None)
         if expected is None:
-            return
+            return ()
+        announced = []  # a generator could not pass on a StopIteration
         agents = self.agents
         for binding in self._plan.active:
             name_agent = binding.name_agent
@@ -425,7 +436,8 @@ class Episode:
                     record = self._meet(agent, binding)
                     if record.policy is not None:
                         continue
-                yield record, args
+                announced.append((record, args))
+        return announced
 
     def _names(self) -> str:
         names = list(self.agents)
@@ -480,11 +492,15 @@ class Episode:
 
     def _fail(self, error: BaseException) -> None:
         """End the episode for an error, which says where it came from."""
-        self._annotate(error)
-        EVALUATING.pop(get_ident(), None)  # an error in a mapping has left it there
         self.pending, self.over = None, True
-        for problem in self._unwind():
-            error.add_note(f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
+        interrupted()
+        self._annotate(error)
+        try:
+            problems = self._unwind()
+        except Warning as warning:  # where these are errors; another one must not take its place
+            problems = [warning]
+        for problem in problems:
+            annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
 
     def _annotate(self, error: BaseException) -> None:
         record = self._latest
@@ -494,7 +510,7 @@ class Episode:
             number = self.turns if self._failed_in_model else self.turns + 1
             where = "in the model, after" if self._failed_in_model else "at"
             where += f" decision {number}, of {record.agent!r} at {record.binding.point.name}"
-        error.add_note(f"simenv_marl: {where}; seed {self._seed}")
+        annotate(error, f"simenv_marl: {where}; seed {self._seed}")
 
     def close(self) -> None:
         """Unwind the simulation, if it is suspended; answer none of its decisions.
@@ -515,6 +531,11 @@ class Episode:
         for problem in self._unwind():
             self._annotate(problem)
             raise problem
+
+    @property
+    def unwound(self) -> bool:
+        """Whether the episode is over, and nothing is left of it in the simulation."""
+        return self.over and self._driver is None
 
     def abandon(self) -> None:
         """Unwind the simulation when its environment is gone, from wherever that is noticed."""
@@ -561,9 +582,9 @@ class Episode:
         return problems
 
     def _let_go_of_driver(self) -> None:
-        if self._driver is not None:
-            self._driver.forget()
-            self._driver = None
+        driver, self._driver = self._driver, None
+        if driver is not None:
+            driver.forget()
 
 
 Blame = Callable[[int, BaseException], None]
@@ -689,6 +710,10 @@ def _resume_together(binding: Binding, episodes: Any, actions: Any, blame: Blame
 
 def _is_exit(error: BaseException | None) -> bool:
     """Whether an error is the exit that was raised in a simulation, passed on in whatever guise."""
-    while error is not None and not isinstance(error, SimulationExit):
+    seen = set()  # causes may go in circles
+    while error is not None and not isinstance(error, SimulationExit) and id(error) not in seen:
+        if isinstance(error, BaseExceptionGroup) and all(_is_exit(member) for member in error.exceptions):
+            return True
+        seen.add(id(error))
         error = error.__cause__
-    return error is not None
+    return isinstance(error, SimulationExit)

@@ -67,8 +67,8 @@ class GreenletDriver(Watchful):
 
     def _run(self, run: Callable[[], Any], _: Any) -> Event:
         self._inside = None  # the first decision sets ``resume`` to what resumes it
-        self._go_in(None)
         try:
+            self._go_in(None)
             return self._live(run)
         finally:
             self._go_out()
@@ -89,13 +89,13 @@ class GreenletDriver(Watchful):
             loop = get_loop()
             if loop is not None or self._users_loop is not None:
                 self._leave_loop()
-        del RUNNING[thread]
         try:
+            del RUNNING[thread]
             reply = switch_out(binding, args, kwargs)
+            RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
         except BaseException:
             self._go_in(loop)
             raise
-        RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
         if get_loop is not None and (loop is not None or get_loop() is not None):
             self._enter_loop(loop)
         if reply is RULE:
@@ -118,9 +118,9 @@ class GreenletDriver(Watchful):
     def _go_out(self) -> None:
         """The simulation's user goes on, in the event loop in which that was."""
         if self._ask is not None:
+            RUNNING.pop(self._thread, None)  # an interrupt may have taken it out already
             if LOOPS in modules:
                 self._leave_loop()
-            del RUNNING[self._thread]
 
     def _leave_loop(self) -> Any:
         events = modules[LOOPS]
@@ -156,7 +156,7 @@ class GreenletDriver(Watchful):
     def throw(self) -> Event:
         """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
         self.enter()
-        if self._body.dead:
+        if not self._body:  # it has ended, or was interrupted before it began
             return FINISHED, None, None
         event: Event = self._inside.throw(SimulationExit())
         return event

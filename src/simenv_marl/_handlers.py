@@ -12,7 +12,6 @@ from __future__ import annotations
 import inspect
 import reprlib
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import update_wrapper
 from itertools import count
@@ -25,7 +24,7 @@ from ._driver import PLUGGED
 from ._patches import Place, title
 from ._wrappers import EXPOSED, generate, is_alone, is_method, kind_of
 from .decision import point_of
-from .errors import HandlerError
+from .errors import HandlerError, annotate
 from .simulation import takes
 
 CALLS: Final = ("before", "after", "instead")
@@ -194,7 +193,7 @@ class Attached:
             return  # that is how items end
         note = f"simenv_marl: in the handler {title(self.handler)}, attached {self.position} {self.target.name}"
         if note not in getattr(error, "__notes__", ()):
-            error.add_note(note)
+            annotate(error, note)
 
 
 def _binds(signature: inspect.Signature, number: int, keywords: list[str]) -> bool:
@@ -290,19 +289,24 @@ class Handlers:
                 item = changed.value
         return item
 
-    @contextmanager
-    def recording(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Iterator[list[Any]]:
+    def recording(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> _Recording:
         """Have a call recorded; its result is to be put into the list."""
-        calls = [record(self.target, args, kwargs) for record in self.recorders]
-        results: list[Any] = []
-        try:
-            yield results
-        except BaseException as error:
-            for call in calls:
-                call.result = f"raised {_repr.repr(error)}"
-            raise
-        for call in calls:
-            call.result = _repr.repr(results[0])
+        return _Recording([record(self.target, args, kwargs) for record in self.recorders])
+
+
+class _Recording:
+    """The records of one call that is going on."""
+
+    def __init__(self, calls: list[Any]) -> None:
+        self._calls, self._results = calls, list[Any]()
+
+    def __enter__(self) -> list[Any]:
+        return self._results
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        result = _repr.repr(self._results[0]) if error is None else f"raised {_repr.repr(error)}"
+        for call in self._calls:
+            call.result = result
 
 
 async def _awaited(attached: Attached, value: Any) -> Any:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from sys import modules
@@ -254,6 +255,8 @@ class Place:
                 self._set()
             except BaseException:
                 del self._levels[level]
+                with suppress(PatchError):
+                    self._set()
                 raise
 
     def let_go(self, level: int) -> None:
@@ -262,7 +265,11 @@ class Place:
             self._levels[level] -= 1
         else:
             del self._levels[level]
-            self._set()
+            try:
+                self._set()
+            except BaseException:  # an interrupt has come in between
+                self._set()
+                raise
 
     @classmethod
     def where(cls, function: Any) -> Place | None:

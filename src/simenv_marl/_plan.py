@@ -7,7 +7,7 @@ options. It holds no state of any episode, so that one plan serves any number of
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from functools import partial
@@ -262,13 +262,15 @@ class Removal:
         self.point = point
         self.of: list[tuple[Binding, Callable[..., Any] | None, type | None]] = []
 
-    def agents(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Iterator[tuple[Binding, Any]]:
+    def agents(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[tuple[Binding, Any]]:
         """The agents that a call ends, with their bindings."""
+        named: list[tuple[Binding, Any]] = []  # a generator could not pass on a StopIteration
         for binding, name, owner in self.of:
             if name is not None:
-                yield binding, name(*args, **kwargs)
+                named.append((binding, name(*args, **kwargs)))
             elif args and (owner is None or isinstance(args[0], owner)):
-                yield binding, binding.agent or binding.name_agent(args[0])
+                named.append((binding, binding.agent or binding.name_agent(args[0])))
+        return named
 
 
 def _same(action: Any) -> Any:

@@ -20,7 +20,7 @@ from ._plan import Plan
 from ._record import Record, not_finite, number
 from ._spaces import duplicate
 from .decision import DIFFERENCES
-from .errors import UnknownAgentError
+from .errors import InvalidActionError, UnknownAgentError
 from .simulation import RULE, Sentinel
 
 MISSING: Final = Sentinel("MISSING")
@@ -37,7 +37,7 @@ class Rounds(Episode):
         offspring: Offspring | None = None,
         foretold: deque[Any] | None = None,
     ) -> None:
-        """Begin an episode, as ``Episode`` does; then reward and observe all agents for the first time."""
+        """Prepare an episode, as ``Episode`` does."""
         # By binding, how its agents are named, where nothing but the mappings is to be seen to.
         self._quick: dict[Any, Any] = {}
         if getattr(simulation, "time", None) is None:
@@ -73,21 +73,20 @@ class Rounds(Episode):
         if getcurrent() is not self._driver.caller:
             self._driver.enter()
         left = self._checked(actions, pending)
-        self.taken.append(
-            {agent: action if type(action) is int else duplicate(action) for agent, action in left.items()}
-        )
-        if len(self.taken) == MOST_TAKEN:
-            self.taken = LOST
-        if actions:
-            self.turns += 1
-        for record in self.agents.values():
-            record.acted = False
-        for record in self.parting:
-            record.acted = False
-        self.parting = []
+        taken = {agent: action if type(action) is int else duplicate(action) for agent, action in left.items()}
         try:
             # Whoever steps an environment from inside a mapping is told so: until the end nothing is pending.
             self.pending = None
+            self.taken.append(taken)
+            if len(self.taken) == MOST_TAKEN:
+                self.taken = LOST
+            if actions:
+                self.turns += 1
+            for record in self.agents.values():
+                record.acted = False
+            for record in self.parting:
+                record.acted = False
+            self.parting = []
             following = self._answer(pending, left)
             if following is None:
                 return
@@ -98,6 +97,7 @@ class Rounds(Episode):
                 self._foresee(following)
                 self.pending = following
         except BaseException as error:
+            self.pending, self.over = None, True
             self._fail(error)
             raise
 
@@ -119,6 +119,8 @@ class Rounds(Episode):
     def _checked(self, actions: Mapping[str, Any], pending: Record) -> dict[str, Any]:
         """The actions, checked as far as they can be before anything moves."""
         checked, agents = {}, self.agents
+        if type(actions) is not dict and not isinstance(actions, Mapping):
+            raise InvalidActionError(f"a round takes a dict of actions by agent, not {actions!r}")
         for agent, action in actions.items():
             record = agents.get(agent)
             if record is None:

@@ -18,7 +18,15 @@ from ._driver import Offspring, preparing, unattended
 from ._episode import LOST, MOST_TAKEN, Episode
 from ._plan import Plan
 from ._surroundings import Surroundings, surrounded
-from .errors import BranchError, ClosedError, NotResetError, OptionValueError, ReentrancyError, warn_user
+from .errors import (
+    BranchError,
+    ClosedError,
+    NotResetError,
+    OptionValueError,
+    ReentrancyError,
+    annotate,
+    warn_user,
+)
 from .simulation import resetter
 
 AnyEpisode = TypeVar("AnyEpisode", bound=Episode)
@@ -49,7 +57,7 @@ class Session:
         self._episode: Episode | None = None
         self._closed = False
         self._starting = False
-        self._held: list[Any] = []
+        self._held: list[Any] = []  # what is set, and is to be put back
         self._surroundings = Surroundings(plan.surroundings())
         self._offspring = Offspring()
         self._hold_patches()
@@ -81,8 +89,8 @@ class Session:
             BaseException: What the model raises.
         """
         self.end()
-        self._closed, self._starting = False, True
         try:
+            self._closed, self._starting = False, True
             return self._begin(seed, options, generator, kind)
         finally:
             self._starting = False
@@ -103,11 +111,18 @@ class Session:
                 self._surroundings.begin(self.seed)
                 self._reset(self.seed, options)
         except BaseException as error:
-            error.add_note(f"simenv_marl: while the simulation was reset; seed {self.seed}")
+            annotate(error, f"simenv_marl: while the simulation was reset; seed {self.seed}")
             raise
-        begin: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
-        episode: AnyEpisode = begin(self.plan, self.simulation, self.seed, self._offspring, foretold)
-        self._episode = episode
+        prepare: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
+        episode: AnyEpisode = prepare(self.plan, self.simulation, self.seed, self._offspring, foretold)
+        try:
+            self._episode = episode  # whenever an interrupt comes from now on, its end is seen to
+            episode.begin()
+        except BaseException:
+            episode.over = True  # it may have been interrupted before it could say so
+            if episode.unwound:
+                self._episode = None
+            raise
         return episode
 
     def replay(self, other: Session) -> Any:
@@ -158,8 +173,13 @@ class Session:
             try:
                 self._episode.close()
             finally:
-                if self._episode.over:
+                if self._episode.unwound:
                     self._episode = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to end."""
+        return self._episode is None
 
     def not_running(self) -> Exception:
         """The error that says why there is no episode."""
@@ -192,9 +212,11 @@ class Session:
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
-        if self._episode is not None:
-            self._episode.abandon()
-        self._let_go_of_patches()
+        try:
+            if self._episode is not None:
+                self._episode.abandon()
+        finally:
+            self._let_go_of_patches()
 
     def _hold_patches(self) -> None:
         if self._held:
@@ -209,7 +231,10 @@ class Session:
 
     def _let_go_of_patches(self) -> None:
         while self._held:
-            self._held.pop().let_go()
+            try:
+                self._held[-1].let_go()
+            finally:
+                self._held.pop()
 
 
 def checked_seed(seed: Any) -> int | None:

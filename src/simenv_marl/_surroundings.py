@@ -7,8 +7,8 @@ afterwards: for each turn, and not for each switch to the simulation. All others
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
@@ -27,15 +27,9 @@ class Surroundings:
     def __bool__(self) -> bool:
         return bool(self._surroundings)
 
-    @contextmanager
-    def entered(self) -> Iterator[None]:
+    def entered(self) -> AbstractContextManager[None]:
         """Keep what runs apart from whatever runs around it, and in these surroundings."""
-        with unattended():
-            self.enter()
-            try:
-                yield
-            finally:
-                self.leave()
+        return _Entered(self)
 
     def begin(self, seed: int) -> None:
         """An episode begins."""
@@ -66,6 +60,27 @@ class Surroundings:
         return run
 
 
+class _Entered(unattended):
+    __slots__ = ("_surroundings",)
+
+    def __init__(self, surroundings: Surroundings) -> None:
+        self._surroundings = surroundings
+
+    def __enter__(self) -> None:
+        super().__enter__()
+        try:
+            self._surroundings.enter()
+        except BaseException:
+            super().__exit__()
+            raise
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            self._surroundings.leave()
+        finally:
+            super().__exit__()
+
+
 class Surrounded(Episode):
     """An episode of a simulation that has surroundings, played in turns or in rounds."""
 
@@ -79,7 +94,7 @@ class Surrounded(Episode):
         *,
         surroundings: Surroundings,
     ) -> None:
-        """Begin an episode, as ``Episode`` does."""
+        """Prepare an episode, as ``Episode`` does."""
         self._surroundings = surroundings
         super().__init__(plan, simulation, seed, offspring, foretold)
         clock = self.clock
@@ -123,5 +138,5 @@ class SurroundedRounds(Surrounded, Rounds):
 
 
 def surrounded(kind: type[Episode], surroundings: Surroundings) -> Callable[..., Episode]:
-    """What begins an episode that is played like those of a kind, in surroundings."""
+    """What prepares an episode that is played like those of a kind, in surroundings."""
     return partial(SurroundedRounds if issubclass(kind, Rounds) else Surrounded, surroundings=surroundings)

@@ -78,6 +78,16 @@ def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
     warnings.warn(message, category, stacklevel=level)
 
 
+def annotate(error: BaseException, note: str) -> None:
+    """Add a note to an error, also to one that refuses to be changed, as a frozen dataclass does."""
+    try:
+        error.add_note(note)
+    except Exception:
+        notes = vars(error).setdefault("__notes__", [])
+        if isinstance(notes, list):
+            notes.append(note)
+
+
 class SimEnvError(Exception):
     """Root of all errors that this library raises on its own account."""
 

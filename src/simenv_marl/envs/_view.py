@@ -6,6 +6,7 @@ import copy
 import os
 import weakref
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from sys import modules
 from threading import RLock
@@ -124,9 +125,12 @@ class View:
         Raises:
             BaseException: What the simulation raises while it unwinds.
         """
-        self._end(self._session.close)
-        # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
-        self._finalizer.detach()
+        try:
+            self._end(self._session.close)
+        finally:
+            if self._session.idle:  # else it was refused, or something came in between
+                # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
+                self._finalizer.detach()
 
     def _make_way(self) -> None:
         """End the episode that runs, and see to it that the next one ends should the environment be abandoned."""
@@ -349,7 +353,13 @@ class _Claim:
     def __enter__(self) -> None:
         if self._process != os.getpid():  # a fork: whoever may have held the lock is not in this process
             self.__init__()  # type: ignore[misc]
-        if not self._lock.acquire(blocking=False):
+        try:
+            claimed = self._lock.acquire(blocking=False)
+        except BaseException:  # an interrupt; whoever has it already keeps it
+            with suppress(RuntimeError):
+                self._lock.release()
+            raise
+        if not claimed:
             raise ReentrancyError(
                 "the environment was used while another thread was stepping, resetting or closing it; any thread may"
                 " use it, but one at a time"

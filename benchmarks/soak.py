@@ -1,0 +1,196 @@
+"""Very many episodes that are cut short at random: what do they leave behind?
+
+Run with ``python -m benchmarks.soak``; ``make soak`` does so with both drivers. Fails if anything is left:
+threads, greenlets, file descriptors, objects, or memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import random
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from greenlet import greenlet
+from gymnasium import spaces
+
+from simenv_marl import RULE, aec_env, joint_env, make_step, parallel_env, single_env
+
+DRIVERS = ("greenlet", "thread")
+WARM = 0.1
+"""The part of the episodes after which nothing may grow any more."""
+MEGABYTES = 8
+"""How much more memory may be in use at the end: allocators keep some for later."""
+
+
+class Failed(Exception):
+    """What the model raises now and then."""
+
+
+class Animal:
+    """One of those that decide."""
+
+    def __init__(self, model: Model, number: int) -> None:
+        self.model, self.number, self.load = model, number, bytearray(2000)
+
+    def move(self) -> int:
+        """Decide how far to go."""
+        if self.model.random.random() < 0.002:
+            raise Failed
+        return self.model.random.randrange(4)
+
+
+class Model:
+    """Animals that are born and die, and a keeper who decides inside a generator."""
+
+    def reset(self, seed: int | None = None) -> None:
+        self.random = random.Random(seed)
+        self.animals = [Animal(self, number) for number in range(4)]
+        self.born, self.moved = 4, 0
+
+    def run(self) -> None:
+        self.days = self.live()
+        for _ in self.days:
+            for animal in list(self.animals):
+                self.moved += animal.move()
+
+    def live(self) -> Iterator[None]:
+        try:
+            for _ in range(20):
+                if self.keep():
+                    self.animals.append(Animal(self, self.born))
+                    self.born += 1
+                elif len(self.animals) > 1:
+                    self.remove(self.animals[0])
+                yield
+        finally:
+            self.animals.clear()
+
+    def keep(self) -> int:
+        """Decide whether there is to be another one."""
+        return self.random.randrange(2)
+
+    def remove(self, animal: Animal) -> None:
+        self.animals.remove(animal)
+
+    def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
+        """The next calls."""
+        return [(animal,) for animal in self.animals] if point.endswith("move") else [(self,)]
+
+
+NAME = f"{Model.__module__}.Model"
+NAMED = f"{Animal.__module__}.Animal.move"
+COMMON: dict[str, Any] = {
+    "observation_space": spaces.Box(-1e6, 1e6, (2,), np.float64),
+    "action_space_mapping": int,
+    "reward_mapping": lambda thing: 1.0,
+}
+KEEP = make_step(
+    **COMMON,
+    action_space=spaces.Discrete(2),
+    observation_space_mapping=lambda model: [model.moved, model.born],
+    agent="keeper",
+)
+MOVE = make_step(
+    **COMMON,
+    action_space=spaces.Discrete(4),
+    observation_space_mapping=lambda animal: [animal.number, 0],
+    agent=lambda animal: f"animal_{animal.number}",
+    removed_by={f"{NAME}.remove": lambda model, animal: f"animal_{animal.number}"},
+)
+
+
+def environments(driver: str) -> list[Callable[[], Any]]:
+    """What makes an environment of each view."""
+    both = {f"{NAME}.keep": KEEP, NAMED: MOVE}
+    roster = {NAMED: [f"animal_{number}" for number in range(30)]}
+    return [
+        lambda: aec_env(Model, both, driver=driver),
+        lambda: parallel_env(Model, both, driver=driver),
+        lambda: joint_env(Model, both, possible_agents=roster, driver=driver),
+        lambda: single_env(Model, {f"{NAME}.keep": KEEP}, driver=driver),
+    ]
+
+
+def episode(env: Any, draw: random.Random) -> None:
+    """Play some of an episode."""
+    env.reset(seed=draw.randrange(2**31))
+    for _ in range(draw.randrange(12)):
+        if hasattr(env, "agent_selection"):
+            env.step(None if env.terminations[env.agent_selection] else draw.choice([0, 1, RULE]))
+        elif hasattr(env, "agents"):
+            env.step({agent: draw.choice([0, 1, RULE]) for agent in env.agents if draw.random() < 0.9})
+        else:
+            env.step(RULE if hasattr(env.action_space, "spaces") else draw.choice([0, 1, RULE]))
+
+
+def play(driver: str, number: int, draw: random.Random) -> None:
+    """Play so many episodes, and end each in some way or other."""
+    makers = environments(driver)
+    kept = [make() for make in makers]
+    for _ in range(number):
+        at = draw.randrange(len(kept))
+        try:
+            episode(kept[at], draw)
+        except Failed:
+            continue
+        end = draw.random()
+        if end < 0.3:
+            kept[at].close()
+        elif end < 0.4:
+            kept[at] = makers[at]()  # the one before is abandoned
+    for env in kept:
+        env.close()
+
+
+def figures() -> dict[str, int]:
+    """What there is in this process."""
+    gc.collect()
+    things = gc.get_objects()
+    with open("/proc/self/statm") as statm:
+        resident = int(statm.read().split()[1]) * resource.getpagesize()
+    return {
+        "threads": threading.active_count(),
+        "greenlets": sum(isinstance(thing, greenlet) for thing in things),
+        "descriptors": len(os.listdir("/proc/self/fd")),
+        "objects": len(things),
+        "KiB": resident // 1024,
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--driver", choices=DRIVERS, default=DRIVERS[0])
+    parser.add_argument("--episodes", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=1)
+    chosen = parser.parse_args()
+    draw = random.Random(chosen.seed)
+    warm = int(chosen.episodes * WARM)
+    play(chosen.driver, warm, draw)
+    before = figures()
+    start = time.perf_counter()
+    play(chosen.driver, chosen.episodes - warm, draw)
+    seconds = time.perf_counter() - start
+    after = figures()
+    print(f"{chosen.driver}: {chosen.episodes} episodes, {(chosen.episodes - warm) / seconds:.0f} a second")
+    for name, value in after.items():
+        print(f"  {name:12} {before[name]:>9} after {warm}, {value:>9} after all")
+    grown = [name for name in ("threads", "greenlets", "descriptors") if after[name] > before[name]]
+    if after["objects"] > before["objects"] + 100:
+        grown.append("objects")
+    if after["KiB"] > before["KiB"] + MEGABYTES * 1024:
+        grown.append("memory")
+    if grown:
+        print(f"  left behind: {', '.join(grown)}")
+    return bool(grown)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -36,9 +36,12 @@ from simenv_marl import (
     vector_env,
 )
 
-from .counters import MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
+from .counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
 from .models import notes, stacks
 from .worlds import FuseError, designs, seeds
+
+pytestmark = FORKS
+
 
 # -- what is told -----------------------------------------------------------------------------------
 
@@ -132,7 +135,7 @@ def test_it_tells_what_gymnasium_tells_of_as_many_joint_views(flatten, mode):
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     agree(ours, theirs, 20, np.random.default_rng(0))
-    workers = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode, workers=2, context="fork")
+    workers = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode, workers=2, context=FORK)
     agree(workers, ours, 20, np.random.default_rng(0))
     for envs in (ours, theirs, workers):
         envs.close()
@@ -601,7 +604,7 @@ def test_gymnasium_makes_it_of_registered_ids():
             agree(ours, theirs, 12, np.random.default_rng(0))
             ours.close()
             theirs.close()
-        envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context="fork")
+        envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
         assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         envs.reset(seed=0)
         envs.close()

@@ -32,14 +32,13 @@ from simenv_marl import (
     vector_env,
 )
 
-from .counters import MODES, POINT, VARIETY, Counter, agree, definition, made, same
+from .counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
 from .models import notes
 from .worlds import designs, seeds
 
 ROOT = Path(__file__).parent.parent
 
-FORK = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-"""The quickest way to start a worker; which one it is makes no difference once it runs."""
+pytestmark = FORKS
 
 
 def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
@@ -465,7 +464,7 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
     path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-X", "dev", str(path)],
+        [sys.executable, "-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev", str(path)],
         env=environment,
         capture_output=True,
         text=True,
@@ -479,6 +478,27 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
         assert done.stderr == ""
         assert done.returncode == 0
     assert "leaked" not in done.stderr
+
+
+@pytest.mark.skipif(FORK != "fork", reason="there is no fork")
+def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
+    envs = workers()
+    envs.reset(seed=0)
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            envs.step(ONES)
+        except WorkerError:
+            code = 0
+        finally:
+            del envs
+            gc.collect()
+            os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
+    observations, *_ = envs.step(ONES)
+    assert observations[:, 0].tolist() == [1, 1, 1, 1]
+    envs.close()
 
 
 def test_contexts_that_do_not_exist_are_refused():

@@ -456,6 +456,7 @@ class Workers:
             WorkerError: One is dead.
             BaseException: What the first raises that raises anything.
         """
+        self._be_theirs()
         self._identity += 1
         asked = []
         messages = [(worker, arguments(worker)) for worker in self._workers]
@@ -464,6 +465,17 @@ class Workers:
             worker.send(message)
             asked.append(worker)
         return self._gather(asked, self._identity)
+
+    def _be_theirs(self) -> None:
+        """Make sure that this is the process that they talk to.
+
+        Raises:
+            WorkerError: It is a fork of that.
+        """
+        if os.getpid() != self._process:
+            raise WorkerError(
+                "the workers are those of the process of which this one is a fork; make another environment"
+            )
 
     def _gather(self, asked: list[Worker], identity: int) -> list[tuple[Worker, Any]]:
         """Wait for answers.
@@ -571,6 +583,7 @@ class Workers:
         Raises:
             BaseException: What the first simulation raises that raises anything; the others are unwound all the same.
         """
+        self._be_theirs()
         try:
             self._identity += 1
             there = [worker for worker in self._workers if worker.there]

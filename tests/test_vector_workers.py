@@ -175,6 +175,24 @@ def test_models_and_mappings_that_no_module_holds_are_sent_along():
     envs.close()
 
 
+def test_functions_may_be_named_while_another_environment_decides_them():
+    points = {Plain.decide: definition()}
+    first = vector_env(Plain, points, num_envs=2)
+    second = vector_env(Plain, points, num_envs=2, workers=1)
+    third = vector_env(Plain, {Plain.decide: definition()}, num_envs=2, workers=1)
+    agree(first, second, 10, np.random.default_rng(0))
+    agree(first, third, 10, np.random.default_rng(0))
+    for envs in (first, second, third):
+        envs.close()
+
+
+class Plain(Counter):
+    """Decides by a function that nobody has decorated."""
+
+    def decide(self) -> int:
+        return 1
+
+
 def test_what_cannot_be_sent_is_refused():
     lock = threading.Lock()
     with pytest.raises(OptionValueError, match="cannot be sent to another process"):

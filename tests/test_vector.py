@@ -394,6 +394,28 @@ def test_an_error_in_a_mapping_says_where_it_was(mapping, culprit):
     assert stacks(1) == 1
 
 
+def test_an_error_after_another_one_was_reset_has_all_be_reset():
+    def fail_at_three(action: int) -> int:
+        if action == 3:
+            raise FuseError
+        return 1
+
+    envs = vector_env(Counter, {POINT: definition(action_space_mapping=fail_at_three)}, num_envs=2)
+    goals = {seed: int(np.random.default_rng(seed).integers(3, 12)) for seed in range(10)}
+    envs.reset(seed=[max(goals, key=goals.__getitem__), min(goals, key=goals.__getitem__)])
+    while not (told := envs.step([1, 1]))[2].any() and not told[3].any():
+        pass
+    assert (told[2] | told[3]).tolist() == [False, True]
+    with pytest.raises(FuseError) as caught:
+        envs.step([3, 1])
+    assert "sub-environment 0" in notes(caught.value)
+    with pytest.raises(EpisodeOverError):
+        envs.step([1, 1])
+    envs.reset(seed=0)
+    envs.step([1, 1])
+    envs.close()
+
+
 def test_an_error_in_a_reset_says_where_it_was():
     class Fragile(Counter):
         def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:

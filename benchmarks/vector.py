@@ -134,18 +134,26 @@ def steps(env: Any, size: int, number: int) -> Contender:
 
 
 class Threads:
-    """A thread for each simulation, which takes turns with its user by two queues, as RLlib's ExternalEnv has it."""
+    """A thread for each simulation, which takes turns with its user as RLlib's ExternalEnv has it.
+
+    Each has a queue for what it tells and one for its actions, and all share a condition that says that somebody has
+    told something.
+    """
 
     def __init__(self, number: int) -> None:
-        self.queues = [(queue.Queue[Any](), queue.Queue[Any]()) for _ in range(number)]
+        self.told = threading.Condition()
+        self.queues: list[Any] = [(queue.Queue(), queue.Queue()) for _ in range(number)]
         self.threads = [threading.Thread(target=self._run, args=pair, daemon=True) for pair in self.queues]
 
-    @staticmethod
-    def _run(observed: queue.Queue[Any], decided: queue.Queue[Any]) -> None:
-        model = Model()
-        observed.put((model.observe(), 0.0, False, False, {}))
-        while decided.get() is not None:
-            observed.put((model.observe(), 1.0, False, False, {}))
+    def _run(self, observed: queue.Queue[Any], decided: queue.Queue[Any]) -> None:
+        model, reward = Model(), 0.0
+        while True:
+            with self.told:
+                observed.put_nowait((model.observe(), reward, False, False, {}))
+                self.told.notify()
+            if decided.get(timeout=60.0) is None:
+                return
+            reward = 1.0
 
     def reset(self, seed: int) -> None:
         for thread in self.threads:
@@ -153,7 +161,14 @@ class Threads:
         self._observe()
 
     def _observe(self) -> Any:
-        told = [observed.get() for observed, _ in self.queues]
+        rows: dict[int, Any] = {}
+        while len(rows) < len(self.queues):
+            with self.told:
+                while not (ready := [n for n, (observed, _) in enumerate(self.queues) if not observed.empty()]):
+                    self.told.wait()
+                for number in ready:
+                    rows[number] = self.queues[number][0].get_nowait()
+        told = [rows[number] for number in range(len(rows))]
         return np.stack([row[0] for row in told]), np.array([row[1] for row in told])
 
     def step(self, actions: Any) -> Any:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from typing import Any
 
 import numpy as np
+import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
@@ -13,6 +15,12 @@ from simenv_marl import RULE, TRUNCATED, joint_env, make_step, single_env, vecto
 from .worlds import FuseError, World, advised, agent_of, points_of
 
 MODES = list(AutoresetMode)
+
+FORK = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+"""The quickest way to start a worker; which one it is makes no difference once it runs."""
+
+FORKS = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+"""That numpy has threads does not matter here: they have nothing to do when a worker is forked."""
 
 
 class Counter:

@@ -36,9 +36,12 @@ from simenv_marl import (
     vector_env,
 )
 
-from .counters import MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
+from .counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
 from .models import notes, stacks
 from .worlds import FuseError, designs, seeds
+
+pytestmark = FORKS
+
 
 # -- what is told -----------------------------------------------------------------------------------
 
@@ -132,7 +135,7 @@ def test_it_tells_what_gymnasium_tells_of_as_many_joint_views(flatten, mode):
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
     agree(ours, theirs, 20, np.random.default_rng(0))
-    workers = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode, workers=2, context="fork")
+    workers = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode, workers=2, context=FORK)
     agree(workers, ours, 20, np.random.default_rng(0))
     for envs in (ours, theirs, workers):
         envs.close()
@@ -391,6 +394,28 @@ def test_an_error_in_a_mapping_says_where_it_was(mapping, culprit):
     assert stacks(1) == 1
 
 
+def test_an_error_after_another_one_was_reset_has_all_be_reset():
+    def fail_at_three(action: int) -> int:
+        if action == 3:
+            raise FuseError
+        return 1
+
+    envs = vector_env(Counter, {POINT: definition(action_space_mapping=fail_at_three)}, num_envs=2)
+    goals = {seed: int(np.random.default_rng(seed).integers(3, 12)) for seed in range(10)}
+    envs.reset(seed=[max(goals, key=goals.__getitem__), min(goals, key=goals.__getitem__)])
+    while not (told := envs.step([1, 1]))[2].any() and not told[3].any():
+        pass
+    assert (told[2] | told[3]).tolist() == [False, True]
+    with pytest.raises(FuseError) as caught:
+        envs.step([3, 1])
+    assert "sub-environment 0" in notes(caught.value)
+    with pytest.raises(EpisodeOverError):
+        envs.step([1, 1])
+    envs.reset(seed=0)
+    envs.step([1, 1])
+    envs.close()
+
+
 def test_an_error_in_a_reset_says_where_it_was():
     class Fragile(Counter):
         def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
@@ -601,7 +626,7 @@ def test_gymnasium_makes_it_of_registered_ids():
             agree(ours, theirs, 12, np.random.default_rng(0))
             ours.close()
             theirs.close()
-        envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context="fork")
+        envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
         assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         envs.reset(seed=0)
         envs.close()

@@ -32,14 +32,13 @@ from simenv_marl import (
     vector_env,
 )
 
-from .counters import MODES, POINT, VARIETY, Counter, agree, definition, made, same
+from .counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
 from .models import notes
 from .worlds import designs, seeds
 
 ROOT = Path(__file__).parent.parent
 
-FORK = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
-"""The quickest way to start a worker; which one it is makes no difference once it runs."""
+pytestmark = FORKS
 
 
 def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
@@ -174,6 +173,24 @@ def test_models_and_mappings_that_no_module_holds_are_sent_along():
     assert observations.tolist() == [[5], [7], [9]]
     assert rewards.tolist() == [5.0, 7.0, 9.0]
     envs.close()
+
+
+def test_functions_may_be_named_while_another_environment_decides_them():
+    points = {Plain.decide: definition()}
+    first = vector_env(Plain, points, num_envs=2)
+    second = vector_env(Plain, points, num_envs=2, workers=1)
+    third = vector_env(Plain, {Plain.decide: definition()}, num_envs=2, workers=1)
+    agree(first, second, 10, np.random.default_rng(0))
+    agree(first, third, 10, np.random.default_rng(0))
+    for envs in (first, second, third):
+        envs.close()
+
+
+class Plain(Counter):
+    """Decides by a function that nobody has decorated."""
+
+    def decide(self) -> int:
+        return 1
 
 
 def test_what_cannot_be_sent_is_refused():
@@ -465,7 +482,7 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
     path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-X", "dev", str(path)],
+        [sys.executable, "-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev", str(path)],
         env=environment,
         capture_output=True,
         text=True,
@@ -479,6 +496,27 @@ def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
         assert done.stderr == ""
         assert done.returncode == 0
     assert "leaked" not in done.stderr
+
+
+@pytest.mark.skipif(FORK != "fork", reason="there is no fork")
+def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
+    envs = workers()
+    envs.reset(seed=0)
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            envs.step(ONES)
+        except WorkerError:
+            code = 0
+        finally:
+            del envs
+            gc.collect()
+            os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
+    observations, *_ = envs.step(ONES)
+    assert observations[:, 0].tolist() == [1, 1, 1, 1]
+    envs.close()
 
 
 def test_contexts_that_do_not_exist_are_refused():

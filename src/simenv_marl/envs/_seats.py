@@ -475,14 +475,14 @@ class Row:
         seats, mode = self.seats, self._mode
         waiting = self.ended
         if waiting:
-            for number in waiting:
+            for number in sorted(waiting):
                 self._again(number)
             moving = [number for number in range(len(seats)) if number not in waiting]
             others = moving and turn_together(
                 self._binding,
                 [seats[number]._episode for number in moving],
                 [actions[number] for number in moving],
-                lambda number, error: self._fail(moving[number], error),
+                lambda number, error: self._fail(moving[number], error, first=-1),
             )
             others = sorted((*waiting, *(moving[number] for number in others)))
         else:
@@ -540,6 +540,7 @@ class Row:
         return observation, info
 
     def _fail(self, number: int, error: BaseException, first: int = 0) -> None:
+        """Tell whose error it is; if anything has moved, all are to be reset. ``first`` is who was to move first."""
         error.add_note(f"simenv_marl: in sub-environment {self._offset + number}")
         if number != first or not self.seats[number].pending:  # else nothing has moved
             self.failed = True

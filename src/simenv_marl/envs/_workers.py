@@ -10,6 +10,7 @@ process that is killed.
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import pickle
@@ -34,7 +35,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from .._plan import Plan
-from ..decision import point_of, registered_names
+from ..decision import point_of, registered_names, unwrapped
 from ..errors import OptionValueError, WorkerError, warn_user
 from ._seats import Batch, Row, Seating, Told
 
@@ -137,21 +138,36 @@ class _Pickler(cloudpickle.Pickler):
     """Pickles whatever can be, by value where another process could not import it."""
 
     def reducer_override(self, thing: Any) -> Any:
-        """Decision functions are made anew of their rule where they cannot be imported."""
-        if isinstance(thing, FunctionType) and not _importable(thing):
-            known = point_of(thing)
-            if known is not None and known[1] is not None:
-                return known[1], (known[0].rule,)
-        return super().reducer_override(thing)
+        """Have decision functions, and what they stand in front of, be found or made anew where they arrive."""
+        if not isinstance(thing, FunctionType):
+            return super().reducer_override(thing)
+        held = None if thing.__module__ == "__main__" else _look_up(thing.__module__, thing.__qualname__)
+        if held is thing:
+            return super().reducer_override(thing)
+        known = point_of(thing)
+        if held is not None and unwrapped(held) is unwrapped(thing):
+            # An environment has set a decision function there for now.
+            return _look_up_rule, (thing.__module__, thing.__qualname__)
+        if known is None:
+            return super().reducer_override(thing)
+        point, definition = known
+        return _itself if definition is None else definition, (point.rule,)
 
 
-def _importable(function: FunctionType) -> bool:
-    found: Any = sys.modules.get(function.__module__)
-    if function.__module__ == "__main__":
-        return False
-    for name in function.__qualname__.split("."):
+def _look_up(module: str, path: str) -> Any:
+    found: Any = sys.modules.get(module)
+    for name in path.split("."):
         found = getattr(found, name, None)
-    return found is function
+    return found
+
+
+def _look_up_rule(module: str, path: str) -> Any:
+    importlib.import_module(module)
+    return unwrapped(_look_up(module, path))
+
+
+def _itself(function: Any) -> Any:
+    return function
 
 
 def dumps(thing: Any) -> bytes:
@@ -456,6 +472,7 @@ class Workers:
             WorkerError: One is dead.
             BaseException: What the first raises that raises anything.
         """
+        self._be_theirs()
         self._identity += 1
         asked = []
         messages = [(worker, arguments(worker)) for worker in self._workers]
@@ -464,6 +481,17 @@ class Workers:
             worker.send(message)
             asked.append(worker)
         return self._gather(asked, self._identity)
+
+    def _be_theirs(self) -> None:
+        """Make sure that this is the process that they talk to.
+
+        Raises:
+            WorkerError: It is a fork of that.
+        """
+        if os.getpid() != self._process:
+            raise WorkerError(
+                "the workers are those of the process of which this one is a fork; make another environment"
+            )
 
     def _gather(self, asked: list[Worker], identity: int) -> list[tuple[Worker, Any]]:
         """Wait for answers.
@@ -571,6 +599,7 @@ class Workers:
         Raises:
             BaseException: What the first simulation raises that raises anything; the others are unwound all the same.
         """
+        self._be_theirs()
         try:
             self._identity += 1
             there = [worker for worker in self._workers if worker.there]

@@ -21,7 +21,7 @@ from ..errors import (
     OptionValueError,
     ReentrancyError,
 )
-from ._seats import Actions, Batch, Row, Seat, Seating
+from ._seats import Actions, Batch, Row, Seat, Seating, Told
 from ._view import one_at_a_time
 from ._workers import Recipe, Workers
 
@@ -111,11 +111,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             self._begun = True
         finally:
             self._moving = False
-        infos: dict[str, Any] = {}
-        for number, info in told:
-            infos = self._add_info(infos, info, number)
         observations = self._batch.observations
-        return duplicate(observations) if self._copy else observations, infos
+        return duplicate(observations) if self._copy else observations, _merged(told, self.num_envs)
 
     def step(
         self, actions: Any
@@ -154,9 +151,6 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             told = crew.step(parts)
         finally:
             self._moving = False
-        infos: dict[str, Any] = {}
-        for number, info in told:
-            infos = self._add_info(infos, info, number)
         batch = self._batch
         observations = batch.observations
         return (
@@ -164,7 +158,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             batch.rewards.copy(),
             batch.terminations.copy(),
             batch.truncations.copy(),
-            infos,
+            _merged(told, self.num_envs),
         )
 
     def _enter(self) -> None:
@@ -287,6 +281,42 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled: the stacks of simulations cannot be."""
         raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
+
+
+def _merged(told: Told, number: int) -> dict[str, Any]:
+    """The infos of many as one: what ``VectorEnv._add_info`` makes of them one by one, but a key at a time."""
+    columns: dict[str, tuple[list[int], list[Any]]] = {}
+    for index, info in told:
+        for key, value in info.items():
+            column = columns.get(key)
+            if column is None:
+                column = columns[key] = [], []
+            column[0].append(index)
+            column[1].append(value)
+    infos: dict[str, Any] = {}
+    for key, (indices, values) in columns.items():
+        infos[f"_{key}"] = mask = np.zeros(number, np.bool_)
+        mask[indices] = True
+        infos[key] = _column(key, indices, values, number)
+    return infos
+
+
+def _column(key: str, indices: list[int], values: list[Any], number: int) -> Any:
+    first = values[0]
+    column: NDArray[Any]
+    if isinstance(first, dict) and key != "final_obs":
+        return _merged(list(zip(indices, values, strict=True)), number)
+    if key != "final_obs" and (type(first) in (int, float, bool) or isinstance(first, np.number)):
+        column = np.zeros(number, type(first))
+        column[indices] = values
+    elif key != "final_obs" and isinstance(first, np.ndarray):
+        column = np.zeros((number, *first.shape), first.dtype)
+        column[indices] = values
+    else:
+        column = np.full(number, None, object)
+        for index, value in zip(indices, values, strict=True):
+            column[index] = value
+    return column
 
 
 def _count(value: Any, name: str, least: int) -> int:

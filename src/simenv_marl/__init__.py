@@ -24,6 +24,11 @@ The layers, each importing only from those above it::
     _surroundings what an environment's simulation finds around it whenever it is at work
     _session      a simulation over all episodes of one environment
     policies      policies back in the model's own loop
+    _stacks       observations, actions and masks of many decisions, stacked
+    _batches      many simulations whose decisions are answered together
+    _ledger       what learners want to know of many episodes
+    _parcels      work that is spread over processes, and what crosses to them
+    many          the public functions for many simulations at once
     envs          views: an episode read as a PettingZoo or Gymnasium environment
     registration  into the registries of Gymnasium and PettingZoo
     testing       checks of a simulation; imported by its users alone
@@ -46,6 +51,7 @@ from .envs import (
     single_env,
 )
 from .errors import *  # noqa: F403 - the whole tree is public
+from .many import Trajectories, collect_episodes, simulate_many
 from .plugins import (
     attach_handler,
     attached_handlers,
@@ -75,10 +81,12 @@ __all__ = [
     "SimulationInterface",
     "SimulationJointEnv",
     "SimulationParallelEnv",
+    "Trajectories",
     "Variant",
     "aec_env",
     "attach_handler",
     "attached_handlers",
+    "collect_episodes",
     "decision_points",
     "difference",
     "errors",
@@ -93,6 +101,7 @@ __all__ = [
     "register_simulation",
     "remove_handler",
     "simulate",
+    "simulate_many",
     "single_env",
     "trace",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from ._driver import Offspring, Surrounding, attended, unattended
 from ._episode import Episode
@@ -117,4 +117,10 @@ class SurroundedRounds(Surrounded, Rounds):
 
 def surrounded(kind: type[Episode], surroundings: Surroundings) -> Callable[..., Episode]:
     """What begins an episode that is played like those of a kind, in surroundings."""
-    return partial(SurroundedRounds if issubclass(kind, Rounds) else Surrounded, surroundings=surroundings)
+    if kind not in _SURROUNDED:
+        _SURROUNDED[kind] = type(f"Surrounded{kind.__name__}", (Surrounded, kind), {})
+    return partial(_SURROUNDED[kind], surroundings=surroundings)
+
+
+_SURROUNDED: Final[dict[type[Episode], type[Surrounded]]] = {Episode: Surrounded, Rounds: SurroundedRounds}
+"""By kind, the kind of episodes that are played like those, in surroundings. All but rounds are played in turns."""

@@ -26,6 +26,8 @@
     |   `-- ClosedError                      ... because the environment was closed
     |-- ReentrancyError      (RuntimeError)  an environment stepped from inside itself
     |-- WrongThreadError     (RuntimeError)  an environment used from another thread
+    |-- MissingExtraError    (ImportError)   a package that only an extra installs
+    |-- WorkerError          (RuntimeError)  an error in another process that cannot be brought here as itself
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
 Every error is raised with its message alone, so that it survives pickling.
@@ -45,6 +47,7 @@ __all__ = [
     "HandlerError",
     "InvalidActionError",
     "MaskError",
+    "MissingExtraError",
     "NoDecisionError",
     "NotResetError",
     "ObservationError",
@@ -60,6 +63,7 @@ __all__ = [
     "UnknownPointError",
     "UnknownTargetError",
     "ViewError",
+    "WorkerError",
     "WrongThreadError",
 ]
 
@@ -168,6 +172,14 @@ class ReentrancyError(SimEnvError, RuntimeError):
 
 class WrongThreadError(SimEnvError, RuntimeError):
     """An environment was used from a thread other than the one that has reset it."""
+
+
+class MissingExtraError(SimEnvError, ImportError):
+    """A package is missing that one of the extras installs."""
+
+
+class WorkerError(SimEnvError, RuntimeError):
+    """In another process an error was raised that cannot be brought here as itself. Its message has the traceback."""
 
 
 class CheckFailedError(SimEnvError, AssertionError):

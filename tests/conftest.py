@@ -14,8 +14,8 @@ settings.load_profile("tests")
 DRIVERS = ("greenlet", "thread")
 
 CONTRACT = (
-    "conformance", "environments", "episodes", "errors", "goals_and_time", "joint", "many_agents", "mesa", "properties",
-    "rounds", "side_by_side", "simulate", "simulations", "unwinding",
+    "collected", "conformance", "environments", "episodes", "errors", "goals_and_time", "joint", "many_agents",
+    "mesa", "properties", "rounds", "side_by_side", "simulate", "simulate_many", "simulations", "unwinding",
 )  # fmt: skip
 """Modules of tests that say what happens when, whatever the driver. All others have nothing to do with one."""
 

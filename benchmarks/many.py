@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -61,8 +62,7 @@ def perceptron() -> list[tuple[Any, Any]]:
     generator = np.random.default_rng(0)
     sizes = (WIDTH, 64, 64, ACTIONS)
     return [
-        (generator.normal(0, n**-0.5, (n, m)).astype(np.float32), np.zeros(m, np.float32))
-        for n, m in zip(sizes, sizes[1:], strict=False)
+        (generator.normal(0, n**-0.5, (n, m)).astype(np.float32), np.zeros(m, np.float32)) for n, m in pairwise(sizes)
     ]
 
 
@@ -146,7 +146,9 @@ def measure(rounds: int, number: int) -> Section:
             min(rounds, 7),
         )
         single, many = times
-        section.ratio(f"one by one / {SIMULATIONS} at once, MLP 64x64, {name}", ratio(times, single, many), *limits[name])
+        section.ratio(
+            f"one by one / {SIMULATIONS} at once, MLP 64x64, {name}", ratio(times, single, many), *limits[name]
+        )
         section.times(times)
     _measure_workers(section, min(rounds, 5), policies["numpy"])
     return section

@@ -198,7 +198,6 @@ class Asking(Episode):
         pending: As in every episode; those for whom policies answer are ``Waiting``.
     """
 
-    _make_record = Waiting
     place: int
     seed: int
     session: Session
@@ -284,13 +283,15 @@ class Unrewarded(Asking):
                 # Else they would keep alive what the model lets go meanwhile.
                 binding = args = kwargs = first = agent = record = None
         except BaseException as error:
-            binding = args = kwargs = first = None  # else the error would keep them alive
+            binding = args = kwargs = first = driver = resume = None  # else the error would keep them alive
             self._fail(error)
             raise
 
 
 class Rewarded(Asking):
     """An episode in which those for whom policies answer are rewarded and end, as in an AEC environment."""
+
+    _make_record = Waiting
 
     def _enroll(self, agent: str, binding: Binding) -> Record:
         record = super()._enroll(agent, binding)
@@ -385,7 +386,9 @@ class _Batches:
         observations = group.stack([episode.pending.observation for episode in waiting])  # type: ignore[union-attr]
         if watcher is None:
             actions, _ = group.ask(observations, waiting)
-            for episode, action in zip(waiting, actions, strict=True):
+            waiting.reverse()  # taken out one by one, so that nothing holds those that have ended
+            for action in actions:
+                episode = waiting.pop()
                 episode.turn(action)
                 record: Any = episode.pending
                 if record is None:
@@ -401,7 +404,9 @@ class _Batches:
             kept = group.stack([episode.pending.observation for episode in waiting])  # type: ignore[union-attr]
             actions, extras = group.ask(observations, waiting)
             watcher.asking(group, waiting, kept)
-            for episode, action in zip(waiting, actions, strict=True):
+            waiting.reverse()
+            for action in actions:
+                episode = waiting.pop()
                 episode.turn(action)
                 self._settle(episode)
             watcher.answered(group, actions, extras)

@@ -10,7 +10,9 @@ from __future__ import annotations
 import io
 import pickle
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from math import ceil
 from types import FunctionType
@@ -74,13 +76,28 @@ def spread(
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
     except ValueError:  # this backend tells nothing before everything is done
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
-    results = iter(parallel(joblib.delayed(_work)(parcel, part) for part in parts))
-    for part in parts:
-        try:
-            result = next(results)
-        except _Failed as failed:
-            raise _unpacked(failed.args[0]) from None
-        yield len(part), _unpacked(result)
+    results = parallel(joblib.delayed(_work)(parcel, part) for part in parts)
+    with _closing(results):
+        remaining = iter(results)
+        for part in parts:
+            try:
+                result = next(remaining)
+            except _Failed as failed:
+                raise _unpacked(failed.args[0]) from None
+            yield len(part), _unpacked(result)
+
+
+@contextmanager
+def _closing(results: Any) -> Iterator[None]:
+    """Cancel what is still to be done where nobody wants to know its results any more."""
+    try:
+        yield
+    finally:
+        close = getattr(results, "close", None)
+        if close is not None:
+            with warnings.catch_warnings():  # that it cancels what it was to cancel
+                warnings.simplefilter("ignore")
+                close()
 
 
 class _Failed(Exception):

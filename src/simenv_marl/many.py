@@ -76,7 +76,7 @@ def simulate_many(
     plan = Plan.draw_up(simulation, points, {**options, "policies": entries(arguments[1])}, unanswered=True)
     bar = progress_bar(len(checked)) if progress else None
     try:
-        if not workers:
+        if not workers or not checked:
             return _simulate(plan, collect, int(batch_size), checked, bar)
         results: list[Any] = []
         for number, part in spread(_simulate_part, arguments, checked, int(workers), int(batch_size)):

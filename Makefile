@@ -3,13 +3,25 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint docs benchmark clean
+.PHONY: demo test test-clusters lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
 
 test: lint docs
 	$(BIN)/python -m pytest
+
+# Local clusters, on the loopback address alone. Each has an environment of its own, because of what it pins.
+test-clusters: .venv-dask/.many .venv-ray/.many
+	.venv-dask/bin/python -m tests.clusters.check dask
+	RAY_USAGE_STATS_ENABLED=0 .venv-ray/bin/python -m tests.clusters.check ray
+
+.venv-dask/.many: CLUSTER := dask[distributed]>=2025.1
+.venv-ray/.many: CLUSTER := ray>=2.40
+.venv-dask/.many .venv-ray/.many: pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[many]' '$(CLUSTER)'
+	touch $@
 
 lint: .venv/.test
 	$(BIN)/ruff check .
@@ -30,4 +42,4 @@ benchmark: .venv/.test
 	touch $@
 
 clean:
-	rm -rf .venv docs/_build
+	rm -rf .venv .venv-dask .venv-ray docs/_build

@@ -80,10 +80,9 @@ def spread(
     with _closing(results):
         remaining = iter(results)
         for part in parts:
-            try:
-                result = next(remaining)
-            except _Failed as failed:
-                raise _unpacked(failed.args[0]) from None
+            failed, result = next(remaining)
+            if failed:
+                raise _unpacked(result)
             yield len(part), _unpacked(result)
 
 
@@ -100,19 +99,20 @@ def _closing(results: Any) -> Iterator[None]:
                 close()
 
 
-class _Failed(Exception):
-    """What a worker raises; its argument is the parcel with the error."""
+def _work(parcel: bytes, seeds: list[int]) -> tuple[bool, bytes]:
+    """In a worker: do the work.
 
-
-def _work(parcel: bytes, seeds: list[int]) -> bytes:
-    """In a worker: do the work."""
+    Returns:
+        Whether that has failed, and a parcel with what came of it or with the error, which joblib's backends would pass
+        on each in its own guise.
+    """
     try:
         work, arguments = _unpacked(parcel)
-        return _packed(work(*arguments, seeds))
+        return False, _packed(work(*arguments, seeds))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise _Failed(_packed_error(error)) from None
+        return True, _packed_error(error)
 
 
 def _packed_error(error: BaseException) -> bytes:

@@ -1,7 +1,7 @@
 """What it brings to have policies answer many simulations at once, and to have several processes share the work.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only many``. Torch is measured where it is
-installed. Processes are compared only where there are several cores: run it alone, and not pinned to one.
+Run with ``make benchmark``, which is pinned to one core, or alone with ``python -m benchmarks.core --only many``, not
+pinned, for what several processes bring. Torch is measured where it is installed.
 """
 
 from __future__ import annotations
@@ -13,45 +13,37 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
+from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE
 from benchmarks.measure import Contender, Section, Times, ratio, side_by_side
-from simenv_marl import make_step, simulate, simulate_many
+from benchmarks.noop import Model
+from simenv_marl import simulate, simulate_many
 
-SIMULATIONS, DECISIONS = 1000, 20
+SIMULATIONS, DECISIONS = 1000, 100
+FEW = 128
+"""Simulations of which all fit into a processor's cache."""
 SLOWLY = 100e-6
 """Seconds that a decision of the slow simulation takes."""
 
-WIDTH, ACTIONS = 8, 4
 
+class Turns:
+    """A simulation that does nothing but decide, so that the machinery is all that remains."""
 
-class Walk:
-    """A simulation that does next to nothing between its decisions."""
-
-    def reset(self, seed: int) -> None:
-        self.state = np.full(WIDTH, seed % 7, np.float32)
-
-    @make_step(
-        observation_space=spaces.Box(-1e6, 1e6, (WIDTH,), np.float32),
-        observation_space_mapping=lambda walk: walk.state,
-        action_space=spaces.Discrete(ACTIONS),
-        action_space_mapping=lambda action: action,
-        reward_mapping=lambda walk: 0.0,
-    )
-    def decide(self) -> int:
-        return 0
+    def reset(self) -> None:
+        self.model = Model()
 
     def run(self) -> None:
+        model = self.model
         for _ in range(DECISIONS):
-            self.state[self.decide()] += 1
+            model.left()
 
 
-class SlowWalk(Walk):
+class SlowTurns(Turns):
     """The same, and every decision is followed by a while of work."""
 
     def run(self) -> None:
-        for _ in range(DECISIONS):
-            self.state[self.decide()] += 1
+        for _ in range(DECISIONS // 10):
+            self.model.left()
             end = time.perf_counter() + SLOWLY
             while time.perf_counter() < end:
                 pass
@@ -60,7 +52,7 @@ class SlowWalk(Walk):
 def perceptron() -> list[tuple[Any, Any]]:
     """The weights of a network with two hidden layers of 64."""
     generator = np.random.default_rng(0)
-    sizes = (WIDTH, 64, 64, ACTIONS)
+    sizes = (OBSERVATION_SPACE.shape[0], 64, 64, int(ACTION_SPACE.n))
     return [
         (generator.normal(0, n**-0.5, (n, m)).astype(np.float32), np.zeros(m, np.float32)) for n, m in pairwise(sizes)
     ]
@@ -98,6 +90,11 @@ def torch_policy() -> Callable[[Any], Any] | None:
     return policy
 
 
+def zeros(observations: Any) -> Any:
+    """A policy that costs nothing."""
+    return np.zeros(len(observations), np.int64)
+
+
 def nothing(simulation: Any) -> None:
     """Keep nothing of a simulation."""
 
@@ -106,32 +103,51 @@ def one_by_one(policy: Callable[[Any], Any], number: int) -> Contender:
     def run() -> float:
         start = time.perf_counter()
         for seed in range(number):
-            simulate(Walk, {Walk.decide: policy}, seed=seed)
+            simulate(Turns, {Model.left: policy}, seed=seed)
         return (time.perf_counter() - start) / number / DECISIONS * 1e6
 
     return run
 
 
-def at_once(
-    policy: Callable[[Any], Any], number: int, *, model: type[Walk] = Walk, size: int = SIMULATIONS, workers: int = 0
-) -> Contender:
+def at_once(policy: Callable[[Any], Any], number: int, size: int) -> Contender:
     def run() -> float:
         start = time.perf_counter()
-        seeds = range(number)
-        simulate_many(model, {model.decide: policy}, seeds=seeds, batch_size=size, workers=workers, collect=nothing)
+        simulate_many(Turns, {Model.left: policy}, seeds=range(number), batch_size=size, collect=nothing)
         return (time.perf_counter() - start) / number / DECISIONS * 1e6
+
+    return run
+
+
+def slowly(policy: Callable[[Any], Any], number: int, workers: int) -> Contender:
+    def run() -> float:
+        start = time.perf_counter()
+        simulate_many(SlowTurns, {Model.left: policy}, seeds=range(number), workers=workers, collect=nothing)
+        return (time.perf_counter() - start) / number / (DECISIONS // 10) * 1e6
 
     return run
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure many simulations.
+    """Measure many simulations: pinned to one core, the policies; else, the processes.
 
     Args:
         rounds: How many rounds, at most; a few are enough here.
         number: Not used: there are always as many decisions as a thousand simulations make.
     """
     section = Section("Many simulations", "microseconds per decision")
+    if (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) == 1:
+        _measure_policies(section, min(rounds, 7))
+        section.remarks.append(
+            "Many simulations: pinned to one core, so that several processes were not measured. They are with"
+            " `python -m benchmarks.core --only many`, not pinned."
+        )
+    else:
+        _measure_workers(section, min(rounds, 7))
+        section.remarks.append("Many simulations: not pinned to one core, so that only processes were measured.")
+    return section
+
+
+def _measure_policies(section: Section, rounds: int) -> None:
     policies: dict[str, Any] = {"numpy": numpy_policy(), "torch": torch_policy()}
     limits = {"numpy": (3.0, 4.0), "torch": (10.0, 15.0)}
     for name, policy in policies.items():
@@ -140,28 +156,20 @@ def measure(rounds: int, number: int) -> Section:
             continue
         times = side_by_side(
             {
-                f"one by one with simulate, {name}": one_by_one(policy, SIMULATIONS // 5),
-                f"{SIMULATIONS} at once, {name}": at_once(policy, SIMULATIONS),
+                f"one by one with simulate, {name}": one_by_one(policy, SIMULATIONS // 10),
+                f"{SIMULATIONS} at once, {name}": at_once(policy, SIMULATIONS, SIMULATIONS),
+                f"{SIMULATIONS}, {FEW} of them at once, {name}": at_once(policy, SIMULATIONS, FEW),
             },
-            min(rounds, 7),
+            rounds,
         )
-        single, many = times
-        section.ratio(
-            f"one by one / {SIMULATIONS} at once, MLP 64x64, {name}", ratio(times, single, many), *limits[name]
-        )
+        single, many, few = times
+        what = f"one by one / {SIMULATIONS} at once, MLP 64x64, {name}"
+        section.ratio(what, ratio(times, single, many), *limits[name])
+        section.ratio(f"one by one / {SIMULATIONS}, {FEW} at once, MLP 64x64, {name}", ratio(times, single, few))
         section.times(times)
-    _measure_workers(section, min(rounds, 5), policies["numpy"])
-    return section
 
 
-def _measure_workers(section: Section, rounds: int, policy: Callable[[Any], Any]) -> None:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if cores < 2:
-        section.remarks.append(
-            "Many simulations: pinned to one core, so that several processes were not measured; they are with"
-            " `python -m benchmarks.core --only many`."
-        )
-        return
+def _measure_workers(section: Section, rounds: int) -> None:
     try:
         import joblib  # noqa: F401
     except ImportError:
@@ -169,8 +177,8 @@ def _measure_workers(section: Section, rounds: int, policy: Callable[[Any], Any]
         return
     times: Times = side_by_side(
         {
-            "100 us per decision, this process": at_once(policy, SIMULATIONS, model=SlowWalk),
-            "100 us per decision, two workers": at_once(policy, SIMULATIONS, model=SlowWalk, workers=2),
+            "100 us per decision, this process": slowly(zeros, SIMULATIONS, 0),
+            "100 us per decision, two workers": slowly(zeros, SIMULATIONS, 2),
         },
         rounds,
     )

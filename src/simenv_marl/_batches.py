@@ -104,15 +104,18 @@ class Group:
         binding: One of the points at which they are decided; the others are alike.
         stack: Stacks observations.
         waiting: The episodes whose decisions wait.
+        observations: Theirs.
         book: What is noted of them; None where nobody wants to know.
     """
 
-    __slots__ = ("_discrete", "asked", "binding", "book", "stack", "waiting")
+    __slots__ = ("_discrete", "asked", "binding", "book", "observations", "stack", "waiting")
 
     def __init__(self, asked: Asked, binding: Binding) -> None:
         self.asked, self.binding = asked, binding
         self.stack = stacker(binding.definition.observation_space)
         self.waiting: list[Asking] = []
+        # Kept beside the episodes: to ask every one of many suspended episodes again is to wait for their memory.
+        self.observations: list[Any] = []
         self.book: Any = None
         self._discrete = not binding.definition.action_space.shape
 
@@ -140,7 +143,12 @@ class Group:
             BaseException: Whatever the policy raises.
         """
         asked = self.asked
-        infos = [episode.pending.info for episode in waiting] if asked.informed else []  # type: ignore[union-attr]
+        infos: list[Any] = []
+        if asked.informed:
+            for episode in waiting:
+                record: Any = episode.pending
+                infos.append(record.info)
+                record.info = {}  # what a policy does to its own is not to be seen at the next decision
         policy = asked.policy
         try:
             answers = policy(observations, infos)
@@ -265,7 +273,8 @@ class Unrewarded(Asking):
                     if record is not None and (record.binding is not binding or type(record) is not Waiting):
                         record = None
                 if record is not None:
-                    # What ``_take``, ``_consult`` and ``Record.observe`` do, for the calls of most models.
+                    # What ``_take``, ``_consult`` and ``Record.observe`` do, for the calls of most models. Their info
+                    # is empty.
                     self._latest = record
                     (first,) = args
                     if DIFFERENCES:
@@ -274,7 +283,6 @@ class Unrewarded(Asking):
                     record.observation = cast(observe(first))
                     if DIFFERENCES:
                         EVALUATING.pop(get_ident(), None)
-                    record.info = {}
                     self.pending = record
                     return
                 reply = self._take(binding, args, kwargs, agent)
@@ -381,9 +389,10 @@ class _Batches:
 
     def _answer(self, group: Group) -> None:
         waiting, group.waiting = group.waiting, []
+        seen, group.observations = group.observations, []
         del self._by_size[len(waiting).bit_length() - 1][group]
         watcher = self._watcher
-        observations = group.stack([episode.pending.observation for episode in waiting])  # type: ignore[union-attr]
+        observations = group.stack(seen)
         if watcher is None:
             actions, _ = group.ask(observations, waiting)
             waiting.reverse()  # taken out one by one, so that nothing holds those that have ended
@@ -395,13 +404,15 @@ class _Batches:
                     self._end(episode)
                     continue
                 # ``_wait``, without the call.
-                gathered = record.group.waiting
+                following = record.group
+                gathered = following.waiting
                 gathered.append(episode)
+                following.observations.append(record.observation)
                 number = len(gathered)
                 if not number & (number - 1):
-                    self._grow(record.group, number)
+                    self._grow(following, number)
         else:
-            kept = group.stack([episode.pending.observation for episode in waiting])  # type: ignore[union-attr]
+            kept = group.stack(seen)
             actions, extras = group.ask(observations, waiting)
             watcher.asking(group, waiting, kept)
             waiting.reverse()
@@ -422,11 +433,12 @@ class _Batches:
 
     def _wait(self, episode: Asking) -> None:
         record: Any = episode.pending
-        gathered = record.group.waiting
-        gathered.append(episode)
-        number = len(gathered)
+        group = record.group
+        group.waiting.append(episode)
+        group.observations.append(record.observation)
+        number = len(group.waiting)
         if not number & (number - 1):
-            self._grow(record.group, number)
+            self._grow(group, number)
 
     def _grow(self, group: Group, number: int) -> None:
         """So many decisions of a group wait now, a power of two."""

@@ -70,11 +70,6 @@ def stack_masks(masks: Sequence[Any]) -> Any:
     return np.stack(masks)
 
 
-def copied(stack: Any) -> Any:
-    """A copy of a stack."""
-    return _each(np.copy, stack)
-
-
 def taken(stack: Any, index: NDArray[Any]) -> Any:
     """The rows of a stack that an index names, in its order."""
     return _each(lambda array: array[index], stack)

@@ -181,17 +181,19 @@ class Waiting(Record):
 
     Attributes:
         group: With whose decisions its own are asked.
+        swift: Whether it alone decides at its point, and nothing but the mappings is to be seen to.
         entry: The policy that answers for it.
         trajectory, row, steps: In the group's book: of which trajectory its actions are, where its latest action
             stands, and how many there have been; none yet.
     """
 
-    __slots__ = ("entry", "group", "row", "steps", "trajectory")
+    __slots__ = ("entry", "group", "row", "steps", "swift", "trajectory")
 
     def __init__(self, agent: str, binding: Binding, policy: Any, clock: Callable[[], float] | None) -> None:
         super().__init__(agent, binding, policy, clock)
         self.entry: Any = None
         self.group: Any = None
+        self.swift = False
         self.trajectory = self.row = -1
         self.steps = 0
 
@@ -231,7 +233,8 @@ class Unrewarded(Asking):
         record.observe(args, kwargs)
         binding = record.binding
         if self.clock is None and binding.legal is None and binding.point.alone:
-            self._swift[binding] = NAMED_AT_CALL if binding.agent is None else record
+            record.swift = binding.agent is not None
+            self._swift[binding] = record if record.swift else NAMED_AT_CALL
         self.pending = record
         return None
 
@@ -264,7 +267,9 @@ class Unrewarded(Asking):
                 resume = driver.resume
                 binding, args, kwargs = resume(reply)
                 agent = UNNAMED
-                record = self._swift.get(binding)
+                if record is None or binding is not record.binding or not record.swift:
+                    record = self._swift.get(binding)
+                # Else the agent decides again that has decided before, and its record is at hand.
                 if record is NAMED_AT_CALL:
                     (first,) = args
                     name_agent = binding.name_agent
@@ -388,6 +393,7 @@ class _Batches:
         return next(iter(next(groups for groups in reversed(self._by_size) if groups)))
 
     def _answer(self, group: Group) -> None:
+        """Have decisions answered, and let each simulation go on to its next one."""
         waiting, group.waiting = group.waiting, []
         seen, group.observations = group.observations, []
         del self._by_size[len(waiting).bit_length() - 1][group]
@@ -408,6 +414,7 @@ class _Batches:
                 gathered = following.waiting
                 gathered.append(episode)
                 following.observations.append(record.observation)
+                record.observation = None
                 number = len(gathered)
                 if not number & (number - 1):
                     self._grow(following, number)

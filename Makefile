@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test coverage soak lint docs benchmark clean
+.PHONY: demo test test-clusters coverage soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -17,6 +17,18 @@ coverage: .venv/.test
 soak: .venv/.test
 	$(BIN)/python -m benchmarks.soak --driver greenlet
 	$(BIN)/python -m benchmarks.soak --driver thread
+
+# Local clusters, on the loopback address alone. Each has an environment of its own, because of what it pins.
+test-clusters: .venv-dask/.many .venv-ray/.many
+	.venv-dask/bin/python -m tests.clusters.check dask
+	RAY_USAGE_STATS_ENABLED=0 .venv-ray/bin/python -m tests.clusters.check ray
+
+.venv-dask/.many: CLUSTER := dask[distributed]>=2025.1
+.venv-ray/.many: CLUSTER := ray>=2.40
+.venv-dask/.many .venv-ray/.many: pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[many]' '$(CLUSTER)'
+	touch $@
 
 lint: .venv/.test
 	$(BIN)/ruff check .
@@ -37,4 +49,4 @@ benchmark: .venv/.test
 	touch $@
 
 clean:
-	rm -rf .venv docs/_build
+	rm -rf .venv .venv-dask .venv-ray docs/_build

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.measure import Report
 
-SECTIONS = ("decisions", "rounds", "plugins", "vector", "wolf_sheep", "greenhouse")
+SECTIONS = ("decisions", "rounds", "plugins", "vector", "many", "wolf_sheep", "greenhouse")
 """In the order in which they run. The greenhouse comes last, and each is imported when it runs, because the
 greenhouse's ``difference()`` makes all environments that are made afterwards say for whom they evaluate a mapping."""
 

@@ -14,8 +14,9 @@ settings.load_profile("tests")
 DRIVERS = ("greenlet", "thread")
 
 CONTRACT = (
-    "conformance", "ends", "environments", "episodes", "errors", "faults", "goals_and_time", "identity", "joint",
-    "many_agents", "mesa", "properties", "rounds", "side_by_side", "simulate", "simulations", "unwinding",
+    "collected", "conformance", "ends", "environments", "episodes", "errors", "faults", "goals_and_time", "identity",
+    "joint", "many_agents", "mesa", "properties", "rounds", "side_by_side", "simulate", "simulate_many", "simulations",
+    "unwinding",
 )  # fmt: skip
 """Modules of tests that say what happens when, whatever the driver. All others have nothing to do with one."""
 

@@ -29,7 +29,7 @@ from .models import Script, calling, culprits, decision, decisions, define, note
 # -- the tree -------------------------------------------------------------------------------------
 
 LEAVES = [value for value in vars(errors).values() if inspect.isclass(value) and issubclass(value, SimEnvError)]
-BUILTINS = (ValueError, TypeError, LookupError, RuntimeError, AssertionError)
+BUILTINS = (ValueError, TypeError, LookupError, RuntimeError, AssertionError, ImportError)
 
 
 def test_there_is_one_root():

@@ -25,6 +25,11 @@ The layers, each importing only from those above it::
     _surroundings what an environment's simulation finds around it whenever it is at work
     _session      a simulation over all episodes of one environment
     policies      policies back in the model's own loop
+    _stacks       observations, actions and masks of many decisions, stacked
+    _batches      many simulations whose decisions are answered together
+    _ledger       what learners want to know of many episodes
+    _parcels      work that is spread over processes, and what crosses to them
+    many          the public functions for many simulations at once
     envs          views: an episode read as a PettingZoo or Gymnasium environment
     branching     exact continuations of an episode that is going on
     registration  into the registries of Gymnasium and PettingZoo
@@ -51,6 +56,7 @@ from .envs import (
     vector_env,
 )
 from .errors import *  # noqa: F403 - the whole tree is public
+from .many import Trajectories, collect_episodes, simulate_many
 from .plugins import (
     attach_handler,
     attached_handlers,
@@ -81,11 +87,13 @@ __all__ = [
     "SimulationJointEnv",
     "SimulationParallelEnv",
     "SimulationVectorEnv",
+    "Trajectories",
     "Variant",
     "aec_env",
     "attach_handler",
     "attached_handlers",
     "branch",
+    "collect_episodes",
     "decision_points",
     "difference",
     "errors",
@@ -100,6 +108,7 @@ __all__ = [
     "register_simulation",
     "remove_handler",
     "simulate",
+    "simulate_many",
     "single_env",
     "trace",
     "vector_env",

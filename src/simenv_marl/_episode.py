@@ -103,6 +103,8 @@ class Episode:
         clock: Returns the simulation's time; None where it has none.
     """
 
+    _make_record: type[Record] = Record
+
     def __init__(
         self,
         plan: Plan,
@@ -139,8 +141,8 @@ class Episode:
         self._max_turns = MOST_TAKEN if self._most_turns < 0 else min(self._most_turns, MOST_TAKEN)
         self._failed_in_model = False
         self.clock = getattr(simulation, "time", None)
-        for agent, binding in () if plan.unanswered else plan.roster.items():
-            self.agents[agent] = Record(agent, binding, None, self.clock)
+        for agent, binding in plan.roster.items():
+            self.agents[agent] = self._make_record(agent, binding, None, self.clock)
         make_driver = DRIVERS[plan.options.driver]
         self._driver: Driver | None = make_driver(self._main_loop(), plan.bindings, offspring or Offspring())
 
@@ -347,18 +349,23 @@ class Episode:
                     f"the agent {agent!r} decides at {binding.point.name} after its end; let agent= give each entity"
                     " a name of its own, and removed_by= name what really ends it"
                 )
-            policy = self._plan.policies.get(agent) or binding.policy
-            if policy is None and self._plan.unanswered:
-                policy = RULE
-            elif policy is None and self._plan.complete:
-                policy = self._undeclared(agent, binding)
-            record = Record(agent, binding, policy, self.clock)
-            (self.agents if policy is None else self._answered)[agent] = record
+            record = self._enroll(agent, binding)
         elif record.binding is not binding:
             raise AgentError(
                 f"the agent {agent!r} decides at {record.binding.point.name} and at {binding.point.name};"
                 " an agent has one decision point: give each point's agents names of their own"
             )
+        return record
+
+    def _enroll(self, agent: str, binding: Binding) -> Record:
+        """Make the record of an agent that is there for the first time, and find out who answers for it."""
+        policy = self._plan.policies.get(agent) or binding.policy
+        if policy is None and self._plan.unanswered:
+            policy = RULE
+        elif policy is None and self._plan.complete:
+            policy = self._undeclared(agent, binding)
+        record = self._make_record(agent, binding, policy, self.clock)
+        (self.agents if policy is None else self._answered)[agent] = record
         return record
 
     def _undeclared(self, agent: str, binding: Binding) -> Any:

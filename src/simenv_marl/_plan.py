@@ -336,6 +336,8 @@ class Plan:
         roster: By name: the agents that are known beforehand, in the order of the points.
         complete: Whether no others may join.
         unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
+        asked: Of what kind are the policies whose agents are agents of the environment all the same, with rewards and
+            ends, because somebody else asks these policies; None: there are no such.
         plugins: The handlers for its simulation alone; None if it has none.
         sites: Where decision functions must be set while the environment is in use.
     """
@@ -348,6 +350,7 @@ class Plan:
         render_modes: list[str],
         *,
         unanswered: bool = False,
+        asked: type | None = None,
         spare: list[Any] | None = None,
         variant: Variant | None = None,
     ) -> None:
@@ -359,6 +362,7 @@ class Plan:
             raise OptionValueError(
                 f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
             )
+        self.unanswered, self.asked = unanswered, asked
         agents = _name_agents(named)
         by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
         everything = [*named, *extra]
@@ -370,7 +374,7 @@ class Plan:
             if policy is RULE and not excepted:
                 continue  # nobody needs to be asked
             binding = self.bindings[point.point] = Binding(point, agent, policy)
-            if policy is None and agent not in self.policies:
+            if self._is_asked(agent, policy) if asked is not None else policy is None and agent not in self.policies:
                 active.append(binding)
         self.active = active
         self.sites: list[Site] = [point.site for point in everything if point.site is not None]
@@ -379,11 +383,16 @@ class Plan:
                 self.bindings.setdefault(other, bound)
         self._find_removals()
         self.plugins = Plugins(options.plugins) if options.plugins else None
-        self.unanswered = unanswered
         if not active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
-        self.roster, self.complete = _call_the_roll(active, options.possible_agents)
-        self.roster = {name: binding for name, binding in self.roster.items() if name not in self.policies}
+        self.roster: dict[str, Binding] = {}
+        self.complete = False
+        if asked is not None:
+            self.roster = {binding.agent: binding for binding in active if binding.agent is not None}
+        else:
+            roster, self.complete = _call_the_roll(active, options.possible_agents)
+            if not unanswered:
+                self.roster = {name: binding for name, binding in roster.items() if name not in self.policies}
 
     @property
     def possible_agents(self) -> list[str] | None:
@@ -399,6 +408,12 @@ class Plan:
         """What the simulation of one environment is to find around it, from the outermost to the innermost."""
         found: list[Surrounding] = [GlobalRandom()] if self.options.global_rng else []
         return found if self.plugins is None else [*found, Plugged(self.plugins)]
+
+    def _is_asked(self, agent: str | None, policy: Any) -> bool:
+        """Whether somebody else may ask a policy at a point of that agent (None: of many) and with that policy."""
+        assert self.asked is not None
+        policies = [self.policies.get(agent, policy)] if agent is not None else [policy, *self.policies.values()]
+        return any(isinstance(policy, self.asked) for policy in policies)
 
     def _find_removals(self) -> None:
         for binding in dict.fromkeys(self.bindings.values()):
@@ -420,7 +435,15 @@ class Plan:
                     self.sites.append(site)
 
     @classmethod
-    def draw_up(cls, source: Any, points: Any, options: Mapping[str, Any], *, unanswered: bool = False) -> Plan:
+    def draw_up(
+        cls,
+        source: Any,
+        points: Any,
+        options: Mapping[str, Any],
+        *,
+        unanswered: bool = False,
+        asked: type | None = None,
+    ) -> Plan:
         """Make a plan of what users say.
 
         Args:
@@ -428,6 +451,7 @@ class Plan:
             points: The active decision points, as ``generate_env`` takes them.
             options: The options, by name.
             unanswered: Whether there is no environment's user.
+            asked: Of what kind are the policies whose agents are agents of the environment all the same.
 
         Raises:
             SimEnvError: Something in them cannot work; the leaf says what.
@@ -444,7 +468,9 @@ class Plan:
             spare.append(model)
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
         named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
-        return cls(source, named, checked, list(modes), unanswered=unanswered, spare=spare, variant=variant)
+        return cls(
+            source, named, checked, list(modes), unanswered=unanswered, asked=asked, spare=spare, variant=variant
+        )
 
     def __deepcopy__(self, memory: Any) -> Plan:
         return self  # it holds nothing of any environment
@@ -581,7 +607,7 @@ def _assign(
     by_agent: dict[str, Any] = {}
     extra: list[NamedPoint] = []
     for key, value in policies.items():
-        policy = value if value is RULE else _two_arguments(value)
+        policy = value if value is RULE else two_arguments(value)
         if isinstance(key, str) and key in agents:
             by_agent[key] = policy
             continue
@@ -606,7 +632,7 @@ def _assign(
     return by_point, by_agent, extra
 
 
-def _two_arguments(policy: Callable[..., Any]) -> Policy:
+def two_arguments(policy: Callable[..., Any]) -> Policy:
     """Let a policy be called with observation and info, whether it takes the info or not."""
     try:
         parameters = list(inspect.signature(policy).parameters.values())

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from ._driver import Offspring, Surrounding, attended, unattended
 from ._episode import Episode
@@ -139,4 +139,10 @@ class SurroundedRounds(Surrounded, Rounds):
 
 def surrounded(kind: type[Episode], surroundings: Surroundings) -> Callable[..., Episode]:
     """What prepares an episode that is played like those of a kind, in surroundings."""
-    return partial(SurroundedRounds if issubclass(kind, Rounds) else Surrounded, surroundings=surroundings)
+    if kind not in _SURROUNDED:
+        _SURROUNDED[kind] = type(f"Surrounded{kind.__name__}", (Surrounded, kind), {})
+    return partial(_SURROUNDED[kind], surroundings=surroundings)
+
+
+_SURROUNDED: Final[dict[type[Episode], type[Surrounded]]] = {Episode: Surrounded, Rounds: SurroundedRounds}
+"""By kind, the kind of episodes that are played like those, in surroundings. All but rounds are played in turns."""

@@ -27,6 +27,7 @@
     |   `-- ClosedError                      ... because the environment was closed
     |-- ReentrancyError      (RuntimeError)  an environment used while it is moving
     |-- WrongThreadError     (RuntimeError)  a thread or process that cannot go on from here
+    |-- MissingExtraError    (ImportError)   a package that only an extra installs
     |-- WorkerError          (RuntimeError)  a process with simulations that died, or has raised what cannot be told
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
@@ -48,6 +49,7 @@ __all__ = [
     "HandlerError",
     "InvalidActionError",
     "MaskError",
+    "MissingExtraError",
     "NoDecisionError",
     "NotResetError",
     "ObservationError",
@@ -190,6 +192,10 @@ class WrongThreadError(SimEnvError, RuntimeError):
 
 class WorkerError(SimEnvError, RuntimeError):
     """A process with simulations in it died, or something was raised there that cannot be told here as it was."""
+
+
+class MissingExtraError(SimEnvError, ImportError):
+    """A package is missing that one of the extras installs."""
 
 
 class CheckFailedError(SimEnvError, AssertionError):

@@ -6,7 +6,9 @@ import copy
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from types import FunctionType, MethodType
 from typing import Any, Final, final
+from weakref import WeakKeyDictionary
 
 from .errors import SimulationError
 
@@ -107,7 +109,7 @@ def resetter(simulation: Any) -> Callable[[int | None, dict[str, Any] | None], N
         A function of seed and options that resets the simulation with as much of them as it takes. Its
         attribute of the signature is looked at once, here.
     """
-    seeded, optioned = takes(simulation.reset, "seed"), takes(simulation.reset, "options")
+    seeded, optioned = _taken(simulation.reset)
 
     def reset(seed: int | None, options: dict[str, Any] | None) -> None:
         arguments: dict[str, Any] = {}
@@ -118,6 +120,21 @@ def resetter(simulation: Any) -> Callable[[int | None, dict[str, Any] | None], N
         simulation.reset(**arguments)
 
     return reset
+
+
+_TAKEN: WeakKeyDictionary[Any, tuple[bool, bool]] = WeakKeyDictionary()
+"""By function: what it takes. To find that out takes longer than all else that a simulation is made ready by."""
+
+
+def _taken(reset: Any) -> tuple[bool, bool]:
+    """Whether a ``reset`` takes a seed, and options."""
+    function = reset.__func__ if type(reset) is MethodType and type(reset.__func__) is FunctionType else None
+    found = None if function is None else _TAKEN.get(function)
+    if found is None:
+        found = takes(reset, "seed"), takes(reset, "options")
+        if function is not None:
+            _TAKEN[function] = found
+    return found
 
 
 def takes(function: Callable[..., Any], name: str) -> bool:

@@ -1,0 +1,187 @@
+"""What it brings to have policies answer many simulations at once, and to have several processes share the work.
+
+Run with ``make benchmark``, which is pinned to one core, or alone with ``python -m benchmarks.core --only many``, not
+pinned, for what several processes bring. Torch is measured where it is installed.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE
+from benchmarks.measure import Contender, Section, Times, ratio, side_by_side
+from benchmarks.noop import Model
+from simenv_marl import simulate, simulate_many
+
+SIMULATIONS, DECISIONS = 1000, 100
+FEW = 128
+"""Simulations of which all fit into a processor's cache."""
+SLOWLY = 100e-6
+"""Seconds that a decision of the slow simulation takes."""
+
+
+class Turns:
+    """A simulation that does nothing but decide, so that the machinery is all that remains."""
+
+    def reset(self) -> None:
+        self.model = Model()
+
+    def run(self) -> None:
+        model = self.model
+        for _ in range(DECISIONS):
+            model.left()
+
+
+class SlowTurns(Turns):
+    """The same, and every decision is followed by a while of work."""
+
+    def run(self) -> None:
+        for _ in range(DECISIONS // 10):
+            self.model.left()
+            end = time.perf_counter() + SLOWLY
+            while time.perf_counter() < end:
+                pass
+
+
+def perceptron() -> list[tuple[Any, Any]]:
+    """The weights of a network with two hidden layers of 64."""
+    generator = np.random.default_rng(0)
+    sizes = (OBSERVATION_SPACE.shape[0], 64, 64, int(ACTION_SPACE.n))
+    return [
+        (generator.normal(0, n**-0.5, (n, m)).astype(np.float32), np.zeros(m, np.float32)) for n, m in pairwise(sizes)
+    ]
+
+
+def numpy_policy() -> Callable[[Any], Any]:
+    """A policy of one observation or of many."""
+    (w0, b0), (w1, b1), (w2, b2) = perceptron()
+
+    def policy(observations: Any) -> Any:
+        hidden = np.tanh(observations @ w0 + b0)
+        return (np.tanh(hidden @ w1 + b1) @ w2 + b2).argmax(-1)
+
+    return policy
+
+
+def torch_policy() -> Callable[[Any], Any] | None:
+    """The same with torch; None where that is not installed."""
+    try:
+        import torch
+    except ImportError:
+        return None
+    torch.set_num_threads(1)
+    layers: list[Any] = []
+    for weights, biases in perceptron():
+        layer = torch.nn.Linear(*weights.shape)
+        layer.load_state_dict({"weight": torch.tensor(weights.T), "bias": torch.tensor(biases)})
+        layers += [layer, torch.nn.Tanh()]
+    network = torch.nn.Sequential(*layers[:-1])
+
+    def policy(observations: Any) -> Any:
+        with torch.no_grad():
+            return network(torch.from_numpy(observations)).argmax(-1).numpy()
+
+    return policy
+
+
+def zeros(observations: Any) -> Any:
+    """A policy that costs nothing."""
+    return np.zeros(len(observations), np.int64)
+
+
+def nothing(simulation: Any) -> None:
+    """Keep nothing of a simulation."""
+
+
+def one_by_one(policy: Callable[[Any], Any], number: int) -> Contender:
+    def run() -> float:
+        start = time.perf_counter()
+        for seed in range(number):
+            simulate(Turns, {Model.left: policy}, seed=seed)
+        return (time.perf_counter() - start) / number / DECISIONS * 1e6
+
+    return run
+
+
+def at_once(policy: Callable[[Any], Any], number: int, size: int) -> Contender:
+    def run() -> float:
+        start = time.perf_counter()
+        simulate_many(Turns, {Model.left: policy}, seeds=range(number), batch_size=size, collect=nothing)
+        return (time.perf_counter() - start) / number / DECISIONS * 1e6
+
+    return run
+
+
+def slowly(policy: Callable[[Any], Any], number: int, workers: int) -> Contender:
+    def run() -> float:
+        start = time.perf_counter()
+        simulate_many(SlowTurns, {Model.left: policy}, seeds=range(number), workers=workers, collect=nothing)
+        return (time.perf_counter() - start) / number / (DECISIONS // 10) * 1e6
+
+    return run
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure many simulations: pinned to one core, the policies; else, the processes.
+
+    Args:
+        rounds: How many rounds, at most; a few are enough here.
+        number: Not used: there are always as many decisions as a thousand simulations make.
+    """
+    section = Section("Many simulations", "microseconds per decision")
+    if (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) == 1:
+        _measure_policies(section, min(rounds, 7))
+        section.remarks.append(
+            "Many simulations: pinned to one core, so that several processes were not measured. They are with"
+            " `python -m benchmarks.core --only many`, not pinned."
+        )
+    else:
+        _measure_workers(section, min(rounds, 7))
+        section.remarks.append("Many simulations: not pinned to one core, so that only processes were measured.")
+    return section
+
+
+def _measure_policies(section: Section, rounds: int) -> None:
+    policies: dict[str, Any] = {"numpy": numpy_policy(), "torch": torch_policy()}
+    limits = {"numpy": (3.0, 4.0), "torch": (10.0, 15.0)}
+    for name, policy in policies.items():
+        if policy is None:
+            section.remarks.append(f"Many simulations: {name} is not installed, and was not measured.")
+            continue
+        times = side_by_side(
+            {
+                f"one by one with simulate, {name}": one_by_one(policy, SIMULATIONS // 10),
+                f"{SIMULATIONS} at once, {name}": at_once(policy, SIMULATIONS, SIMULATIONS),
+                f"{SIMULATIONS}, {FEW} of them at once, {name}": at_once(policy, SIMULATIONS, FEW),
+            },
+            rounds,
+        )
+        single, many, few = times
+        what = f"one by one / {SIMULATIONS} at once, MLP 64x64, {name}"
+        section.ratio(what, ratio(times, single, many), *limits[name])
+        section.ratio(f"one by one / {SIMULATIONS}, {FEW} at once, MLP 64x64, {name}", ratio(times, single, few))
+        section.times(times)
+
+
+def _measure_workers(section: Section, rounds: int) -> None:
+    try:
+        import joblib  # noqa: F401
+    except ImportError:
+        section.remarks.append("Many simulations: joblib is not installed, and several processes were not measured.")
+        return
+    times: Times = side_by_side(
+        {
+            "100 us per decision, this process": slowly(zeros, SIMULATIONS, 0),
+            "100 us per decision, two workers": slowly(zeros, SIMULATIONS, 2),
+        },
+        rounds,
+    )
+    alone, shared = times
+    section.ratio("100 us per decision: one process / two workers, not pinned", ratio(times, alone, shared), 1.7, 1.9)
+    section.times(times)

@@ -1,0 +1,105 @@
+"""Spread many simulations over a local cluster, and compare with this process alone. Run by ``make test-clusters``.
+
+``python -m tests.clusters.check dask`` or ``... ray``, each in an environment of its own, because of what it pins.
+Everything listens on the loopback address alone.
+"""
+
+import argparse
+import os
+from contextlib import contextmanager
+
+import joblib
+import numpy as np
+from gymnasium import spaces
+
+from simenv_marl import collect_episodes, make_step, simulate_many
+
+
+class Model:
+    """In ``__main__`` and so nothing that a worker could import."""
+
+    @make_step(
+        observation_space=spaces.Box(-1e6, 1e6, (2,), np.float64),
+        observation_space_mapping=lambda model: [model.level, len(model.log)],
+        action_space=spaces.Discrete(7),
+        action_space_mapping=lambda action: action,
+        reward_mapping=lambda model: float(model.level),
+    )
+    def decide(self):
+        return 0
+
+    def reset(self, seed):
+        self.generator, self.level, self.log = np.random.default_rng(seed), seed, []
+
+    def run(self):
+        for _ in range(int(self.generator.integers(1, 20))):
+            self.level += self.decide() - int(self.generator.integers(5))
+            self.log.append(self.level)
+
+
+def policy(observations):
+    return observations.sum(axis=1).astype(int) % 7
+
+
+def failing(observations):
+    raise ZeroDivisionError("on purpose")
+
+
+@contextmanager
+def dask_cluster():
+    from dask.distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster,
+        Client(cluster),
+        joblib.parallel_config(backend="dask"),
+    ):
+        yield
+
+
+@contextmanager
+def ray_cluster():
+    import ray
+    from ray.util.joblib import register_ray
+
+    ray.init(num_cpus=2, include_dashboard=False, _node_ip_address="127.0.0.1", log_to_driver=False)
+    register_ray()
+    try:
+        with joblib.parallel_config(backend="ray"):
+            yield
+    finally:
+        ray.shutdown()
+
+
+def check():
+    """Everything that crosses to the workers and back."""
+    policies, seeds = {Model.decide: policy}, range(50)
+    alone = simulate_many(Model, policies, seeds=seeds, collect=lambda model: model.log)
+    for workers in (2, -1):
+        found = simulate_many(
+            Model, policies, seeds=seeds, workers=workers, progress=True, collect=lambda model: (model.log, os.getpid())
+        )
+        assert [log for log, _ in found] == alone
+        assert os.getpid() not in {process for _, process in found}
+    one, other = (collect_episodes(Model, policies, seeds=seeds, workers=workers)[Model.decide] for workers in (0, 2))
+    assert np.array_equal(one.rewards, other.rewards)
+    assert np.array_equal(one.observations, other.observations)
+    assert one.seeds == other.seeds
+    raised = None
+    try:
+        simulate_many(Model, {Model.decide: failing}, seeds=seeds, workers=2)
+    except ZeroDivisionError as error:
+        raised = error
+    assert raised is not None
+    assert raised.args == ("on purpose",)
+    assert "seed" in "".join(raised.__notes__)
+    assert simulate_many(Model, policies, seeds=seeds, workers=2, collect=lambda model: model.log) == alone
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cluster", choices=["dask", "ray"])
+    name = parser.parse_args().cluster
+    with {"dask": dask_cluster, "ray": ray_cluster}[name]():
+        check()
+    print(f"{name}: all is as in one process")

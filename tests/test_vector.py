@@ -344,6 +344,7 @@ def test_observations_are_copies_unless_told_otherwise(kind, copy):
 
 
 def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset():
+    stacks_before = stacks()
     envs = vector_env(Counter, Counter.decide, num_envs=3)
     envs.reset(seed=0)
     envs.envs[1].simulation.failing = True
@@ -360,12 +361,14 @@ def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset():
     agree(envs, fresh, 10, np.random.default_rng(0))
     envs.close()
     fresh.close()
-    assert stacks(1) == 1
+    assert stacks(stacks_before) == stacks_before
 
 
 @pytest.mark.parametrize("mapping", ["observation_space_mapping", "reward_mapping", "action_space_mapping"])
 @pytest.mark.parametrize("culprit", [0, 2])
 def test_an_error_in_a_mapping_says_where_it_was(mapping, culprit):
+    stacks_before = stacks()
+
     def fail(thing: Any) -> Any:
         if isinstance(thing, Counter):
             if thing.seed == culprit and thing.count:
@@ -391,7 +394,7 @@ def test_an_error_in_a_mapping_says_where_it_was(mapping, culprit):
     envs.step([1, 1, 1])
     assert counts(envs) == [1, 1, 1]
     envs.close()
-    assert stacks(1) == 1
+    assert stacks(stacks_before) == stacks_before
 
 
 def test_an_error_after_another_one_was_reset_has_all_be_reset():
@@ -534,6 +537,7 @@ def test_it_cannot_be_copied_or_pickled():
 
 
 def test_close_unwinds_all_and_only_once():
+    stacks_before = stacks()
     for prepare in (
         lambda envs: None,
         lambda envs: envs.reset(),
@@ -549,10 +553,12 @@ def test_close_unwinds_all_and_only_once():
         for use in (envs.reset, lambda envs=envs: envs.step([1, 1]), lambda envs=envs: envs.call("simulation")):
             with pytest.raises(ClosedError):
                 use()
-    assert stacks(1) == 1
+    assert stacks(stacks_before) == stacks_before
 
 
 def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
+    stacks_before = stacks()
+
     class Stubborn(Counter):
         def run(self) -> Any:
             try:
@@ -571,17 +577,18 @@ def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
     assert "sub-environment 2: LookupError" in notes(caught.value)
     assert all(simulation.unwound for simulation in simulations)
     assert envs.closed
-    assert stacks(1) == 1
+    assert stacks(stacks_before) == stacks_before
 
 
 def test_one_that_is_dropped_unwinds_all():
+    stacks_before = stacks()
     envs = vector_env(Counter, Counter.decide, num_envs=2)
     envs.reset(seed=0)
     simulations = envs.get_attr("simulation")
     del envs
     gc.collect()
     assert all(simulation.unwound for simulation in simulations)
-    assert stacks(1) == 1
+    assert stacks(stacks_before) == stacks_before
 
 
 # -- beside Gymnasium ---------------------------------------------------------------------------------

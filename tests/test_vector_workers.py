@@ -49,9 +49,10 @@ def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
 
 @pytest.fixture(autouse=True)
 def _nothing_is_left():
+    before = set(multiprocessing.active_children())  # joblib keeps its own for the next time
     yield
     gc.collect()
-    assert multiprocessing.active_children() == []
+    assert set(multiprocessing.active_children()) <= before
 
 
 class Odd(Exception):

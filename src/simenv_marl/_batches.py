@@ -24,7 +24,7 @@ from ._record import Record
 from ._session import Session
 from ._stacks import rows, stacker
 from .decision import DIFFERENCES
-from .errors import InvalidActionError
+from .errors import InvalidActionError, annotate
 from .simulation import RULE
 
 # -- who is asked ---------------------------------------------------------------------------------
@@ -165,9 +165,10 @@ class Group:
         except BaseException as error:
             seeds = [str(episode.seed) for episode in waiting]
             several = f"seeds {', '.join(seeds[:5])}{' and others' if len(seeds) > 5 else ''}"
-            error.add_note(
+            annotate(
+                error,
                 f"simenv_marl: in {asked!r}, asked for {len(seeds)} decisions at once;"
-                f" {several if len(seeds) > 1 else f'seed {seeds[0]}'}"
+                f" {several if len(seeds) > 1 else f'seed {seeds[0]}'}",
             )
             raise
         return actions, extras
@@ -462,7 +463,7 @@ class _Batches:
             try:
                 session = Session(self._plan)
             except BaseException as error:
-                error.add_note(f"simenv_marl: while the simulation was made; seed {seed}")
+                annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
             self._open[place] = session
             episode = session.start(seed, None, self._generator, self._kind)
@@ -476,7 +477,7 @@ class _Batches:
         try:
             self._finish(place, session.simulation)
         except BaseException as error:
-            error.add_note(f"simenv_marl: after the simulation's end; seed {episode.seed}")
+            annotate(error, f"simenv_marl: after the simulation's end; seed {episode.seed}")
             raise
 
     def _unwind(self, error: BaseException) -> None:
@@ -485,8 +486,9 @@ class _Batches:
             try:
                 session.close()
             except BaseException as problem:
-                error.add_note(
+                annotate(
+                    error,
                     f"simenv_marl: and the simulation of seed {self._seeds[place]}, when it was unwound, raised"
-                    f" {problem!r}"
+                    f" {problem!r}",
                 )
         self._open.clear()

@@ -22,7 +22,7 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 
 from ._wrappers import DECISION, EXPOSED, stands_in
 from .decision import DecisionPoint, Definition, point_of, restored_point, unwrapped
-from .errors import MissingExtraError, WorkerError
+from .errors import MissingExtraError, WorkerError, annotate
 from .plugins import expose_to_plugins
 
 
@@ -117,7 +117,7 @@ def _work(parcel: bytes, seeds: list[int]) -> tuple[bool, bytes]:
 
 def _packed_error(error: BaseException) -> bytes:
     lines = "".join(traceback.format_exception(error))
-    error.add_note(f"simenv_marl: in a worker process, where its traceback was\n{lines}")
+    annotate(error, f"simenv_marl: in a worker process, where its traceback was\n{lines}")
     error.__cause__ = error.__context__ = error.__traceback__ = None
     try:
         parcel = _packed(error)

@@ -18,7 +18,7 @@ from typing import Any, Final, NoReturn, TypeVar
 import cloudpickle
 
 from .envs import View
-from .errors import BranchError, OptionValueError, ViewError
+from .errors import BranchError, OptionValueError, ViewError, annotate
 
 Result = TypeVar("Result")
 
@@ -88,7 +88,7 @@ def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], numb
         # Of the wrappers around it each is copied, with all that it remembers.
         return function(copy.deepcopy(env, {id(view): twin}), number)
     except Exception as error:
-        error.add_note(f"simenv_marl: in branch {number}")
+        annotate(error, f"simenv_marl: in branch {number}")
         raise
     finally:
         twin.close()

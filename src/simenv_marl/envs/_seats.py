@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .._episode import turn_together
 from .._plan import Plan
 from .._session import AnyEpisode, Session, checked_seed, seed_space
-from ..errors import InvalidActionError, OptionValueError
+from ..errors import InvalidActionError, OptionValueError, annotate
 from ..simulation import RULE
 from ._view import OneAgentView
 from .joint import SimulationJointEnv
@@ -399,7 +399,7 @@ class Row:
             for _ in range(number):
                 self.seats.append(seating.seat())
         except BaseException as error:
-            error.add_note(f"simenv_marl: in sub-environment {offset + len(self.seats)}")
+            annotate(error, f"simenv_marl: in sub-environment {offset + len(self.seats)}")
             self.abandon()
             raise
 
@@ -541,7 +541,7 @@ class Row:
 
     def _fail(self, number: int, error: BaseException, first: int = 0) -> None:
         """Tell whose error it is; if anything has moved, all are to be reset. ``first`` is who was to move first."""
-        error.add_note(f"simenv_marl: in sub-environment {self._offset + number}")
+        annotate(error, f"simenv_marl: in sub-environment {self._offset + number}")
         if number != first or not self.seats[number].pending:  # else nothing has moved
             self.failed = True
 
@@ -574,11 +574,11 @@ class Row:
             try:
                 seat.close()
             except BaseException as error:
-                error.add_note(f"simenv_marl: in sub-environment {self._offset + number}")
+                annotate(error, f"simenv_marl: in sub-environment {self._offset + number}")
                 if raised is None:
                     raised = error
                 else:
-                    raised.add_note(f"simenv_marl: and in sub-environment {self._offset + number}: {error!r}")
+                    annotate(raised, f"simenv_marl: and in sub-environment {self._offset + number}: {error!r}")
         if raised is not None:
             raise raised
 

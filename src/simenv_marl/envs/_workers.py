@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from .._plan import Plan
 from ..decision import point_of, registered_names, unwrapped
-from ..errors import OptionValueError, WorkerError, warn_user
+from ..errors import OptionValueError, WorkerError, annotate, warn_user
 from ._seats import Batch, Row, Seating, Told
 
 SECONDS_TO_CLOSE: Final = 10.0
@@ -222,7 +222,7 @@ def _unpacked(parts: Any, message: str, notes: list[str], text: str) -> BaseExce
     except Exception:
         error = WorkerError(f"a worker has raised what cannot be pickled: {message}")
         for note in notes:
-            error.add_note(note)
+            annotate(error, note)
     error.__cause__ = RemoteTraceback(text)
     return error
 
@@ -533,7 +533,7 @@ class Workers:
                     results[worker] = answer
                 else:
                     errors[worker] = _unpacked(*answer)
-                    errors[worker].add_note(f"simenv_marl: in {worker.name}")
+                    annotate(errors[worker], f"simenv_marl: in {worker.name}")
         return {worker: results[worker] for worker in asked if worker in results}, errors
 
     # -- what a row does --------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 from benchmarks import soak
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
-from simenv_marl._plan import Options
+from simenv_marl._options import Options
 
 from .models import decision, define, script
 
@@ -27,7 +27,7 @@ needs_signals = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="thi
 PRELUDE = """
     import os, random, signal, sys, threading, time
     from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
-    from simenv_marl._plan import Options
+    from simenv_marl._options import Options
     from tests.models import calling, decision, script
     Options.__init__.__kwdefaults__["driver"] = {driver!r}
 """

@@ -17,10 +17,13 @@ The layers, each importing only from those above it::
     plugins       handlers for everybody, for a while, for one environment; traces
     _points       what ``points=`` names
     variants      a model with all that an experiment changes, under one name
+    _options      the options of environments
+    _bindings     decision points under an environment's definitions, ready to be called
     _plan         what an environment is made of, checked before anything runs
     _record       what an episode knows of one agent; rewards and observations
     _provenance   what an environment was made of, for results files
     _episode      what happens when: decisions, rewards, observations, ends, errors
+    _together     the turns of many episodes taken together
     _rounds       the same in rounds, in which all agents may act
     _surroundings what an environment's simulation finds around it whenever it is at work
     _session      a simulation over all episodes of one environment

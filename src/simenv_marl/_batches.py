@@ -17,9 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 from greenlet import getcurrent
 
+from ._bindings import Binding
 from ._driver import EVALUATING, unattended
 from ._episode import NAMED_AT_CALL, UNNAMED, Episode
-from ._plan import Binding, Plan, two_arguments
+from ._plan import Plan, two_arguments
 from ._record import Record
 from ._session import Session
 from ._stacks import rows, stacker

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._batches import Asking, Entry, Group, Waiting
-from ._plan import Binding, Plan
+from ._bindings import Binding
+from ._plan import Plan
 from ._spaces import blank
 from ._stacks import empty, joined, stack_masks, stacker, taken
 from .errors import AgentError, OptionValueError

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ._plan import Options, Plan
+from ._options import Options
+from ._plan import Plan
 
 DEPENDENCIES = ("greenlet", "gymnasium", "numpy", "pettingzoo", "simenv-marl")
 

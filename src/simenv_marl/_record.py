@@ -11,8 +11,8 @@ from weakref import ref
 import numpy as np
 
 from . import _spaces
+from ._bindings import Binding
 from ._driver import EVALUATING
-from ._plan import Binding
 from .decision import DIFFERENCES
 from .errors import MaskError, RewardError
 

@@ -17,9 +17,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, concatenate, iterate
 from numpy.typing import NDArray
 
-from .._episode import turn_together
 from .._plan import Plan
 from .._session import AnyEpisode, Session, checked_seed, seed_space
+from .._together import turn_together
 from ..errors import InvalidActionError, OptionValueError, annotate
 from ..simulation import RULE
 from ._view import OneAgentView

@@ -17,8 +17,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 
+from .._bindings import Binding
 from .._episode import Episode
-from .._plan import Binding, Plan
+from .._plan import Plan
 from .._provenance import describe
 from .._session import AnyEpisode, Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast

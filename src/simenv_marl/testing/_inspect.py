@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from .._plan import Binding, Plan
+from .._bindings import Binding
+from .._plan import Plan
 from ..envs import VIEWS, SimulationJointEnv, view_class
 from ..errors import (
     SimEnvError,

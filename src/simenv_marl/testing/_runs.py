@@ -20,8 +20,9 @@ from zlib import crc32
 
 import numpy as np
 
+from .._bindings import Binding
 from .._driver import RUNNING, SimulationExit
-from .._plan import Binding, Plan
+from .._plan import Plan
 from .._spaces import MASK
 from .._surroundings import Surroundings
 from ..decision import DecisionPoint

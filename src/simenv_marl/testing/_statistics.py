@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from .._plan import Binding, Plan
+from .._bindings import Binding
+from .._plan import Plan
 from .._spaces import MASK
 from ._fingerprint import shown
 from ._report import ComponentStatistics, Finding, PointStatistics

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
-from .._plan import Binding
+from .._bindings import Binding
 from ..envs import VIEWS
 from ..errors import (
     AgentError,

@@ -28,10 +28,11 @@ The layers, each importing only from those above it::
     _surroundings what an environment's simulation finds around it whenever it is at work
     _session      a simulation over all episodes of one environment
     policies      policies back in the model's own loop
+    _parcels      what crosses from one process to another
     _stacks       observations, actions and masks of many decisions, stacked
     _batches      many simulations whose decisions are answered together
     _ledger       what learners want to know of many episodes
-    _parcels      work that is spread over processes, and what crosses to them
+    _spread       work that is spread over processes by joblib
     many          the public functions for many simulations at once
     envs          views: an episode read as a PettingZoo or Gymnasium environment
     branching     exact continuations of an episode that is going on

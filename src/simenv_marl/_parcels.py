@@ -1,149 +1,112 @@
-"""Work that is spread over processes, here or elsewhere, and what crosses over to them.
+"""What crosses from one process to another: simulations, points, policies, results, errors.
 
-What crosses are simulations, points, policies and options, as users have given them: by reference where they can be
-imported, and by value where not, as in a script or a notebook. There decision functions are a matter of their own,
-because they have to ask the environments of the process in which they are called.
+They cross by reference where they can be imported, and by value where not, as in a script or a notebook. Functions are
+a matter of their own: others may stand in their places for as long as an environment is in use, and decision
+functions have to ask the environments of the process in which they are called.
 """
 
 from __future__ import annotations
 
 import io
 import pickle
+import sys
 import traceback
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
-from math import ceil
 from types import FunctionType
 from typing import Any
 from uuid import uuid4
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
+import cloudpickle
+
 from ._wrappers import DECISION, EXPOSED, stands_in
-from .decision import DecisionPoint, Definition, point_of, restored_point, unwrapped
-from .errors import MissingExtraError, WorkerError, annotate
+from .decision import DecisionPoint, Definition, point_of, unwrapped
+from .errors import WorkerError, annotate
 from .plugins import expose_to_plugins
 
 
-def progress_bar(total: int) -> Any:
-    """A bar that shows how many simulations have ended.
+def pack(thing: Any) -> bytes:
+    """Pickle something for another process.
 
     Raises:
-        MissingExtraError: tqdm is not installed.
+        Exception: What pickling it raises.
     """
-    try:
-        from tqdm.auto import tqdm  # type: ignore[import-untyped]
-    except ImportError:
-        raise _missing("progress=True", "tqdm") from None
-    return tqdm(total=total, unit="simulation")
-
-
-def _missing(what: str, package: str) -> MissingExtraError:
-    return MissingExtraError(f"{what} needs {package}: install simenv-marl[many]")
-
-
-def spread(
-    work: Callable[..., Any], arguments: tuple[Any, ...], seeds: Sequence[int], workers: int, least: int
-) -> Iterator[tuple[int, Any]]:
-    """Have worker processes do some work, each of a part of the seeds.
-
-    Args:
-        work: Called with the arguments and a list of seeds; a function of this package.
-        arguments: What it is called with.
-        seeds: All seeds.
-        workers: How many processes; -1: as many as joblib's backend has.
-        least: How many seeds are not to be parted, if every worker is to have some.
-
-    Yields:
-        How many seeds a part has, and what came of it; in the order of the seeds.
-
-    Raises:
-        MissingExtraError: joblib is not installed.
-        WorkerError: An error in a worker cannot be brought here as itself.
-        BaseException: What the work raises.
-    """
-    try:
-        import cloudpickle  # noqa: F401
-        import joblib
-    except ImportError:
-        raise _missing(f"workers={workers}", "joblib and cloudpickle") from None
-    processes = max(1, joblib.effective_n_jobs(workers))
-    size = max(1, ceil(len(seeds) / (4 * processes)), min(least, ceil(len(seeds) / processes)))
-    parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]
-    parcel = _packed((work, arguments))
-    try:
-        parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
-    except ValueError:  # this backend tells nothing before everything is done
-        parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
-    results = parallel(joblib.delayed(_work)(parcel, part) for part in parts)
-    with _closing(results):
-        remaining = iter(results)
-        for part in parts:
-            failed, result = next(remaining)
-            if failed:
-                raise _unpacked(result)
-            yield len(part), _unpacked(result)
-
-
-@contextmanager
-def _closing(results: Any) -> Iterator[None]:
-    """Cancel what is still to be done where nobody wants to know its results any more."""
-    try:
-        yield
-    finally:
-        close = getattr(results, "close", None)
-        if close is not None:
-            with warnings.catch_warnings():  # that it cancels what it was to cancel
-                warnings.simplefilter("ignore")
-                close()
-
-
-def _work(parcel: bytes, seeds: list[int]) -> tuple[bool, bytes]:
-    """In a worker: do the work.
-
-    Returns:
-        Whether that has failed, and a parcel with what came of it or with the error, which joblib's backends would pass
-        on each in its own guise.
-    """
-    try:
-        work, arguments = _unpacked(parcel)
-        return False, _packed(work(*arguments, seeds))
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:
-        return True, _packed_error(error)
-
-
-def _packed_error(error: BaseException) -> bytes:
-    lines = "".join(traceback.format_exception(error))
-    annotate(error, f"simenv_marl: in a worker process, where its traceback was\n{lines}")
-    error.__cause__ = error.__context__ = error.__traceback__ = None
-    try:
-        parcel = _packed(error)
-        if type(_unpacked(parcel)) is type(error):
-            return parcel
-    except Exception:  # whatever its pickling raises
-        pass
-    return _packed(WorkerError(f"in a worker process, an error that cannot be brought here as itself:\n{lines}"))
-
-
-# -- what crosses ---------------------------------------------------------------------------------
-
-
-def _packed(thing: Any) -> bytes:
-    import cloudpickle
-
-    class Pickler(cloudpickle.Pickler):
-        """Packs decision functions so that they ask where they are unpacked."""
-
-        def reducer_override(self, obj: Any) -> Any:
-            reduced = _reduced(obj)
-            return super().reducer_override(obj) if reduced is None else reduced
-
     buffer = io.BytesIO()
-    Pickler(buffer).dump(thing)
+    _Pickler(buffer, 5).dump(thing)
     return buffer.getvalue()
+
+
+def pack_plainly(thing: Any) -> bytes:
+    """The same, and faster, for a process that ``multiprocessing`` has started from the same script.
+
+    Raises:
+        Exception: What pickling it raises.
+    """
+    with suppress(Exception):  # what is wrong will be said below
+        plain = pickle.dumps(thing, 5)
+        # What stands in a notebook or in an interactive session is found in no other process.
+        if b"__main__" not in plain or hasattr(sys.modules["__main__"], "__file__"):
+            return plain
+    return pack(thing)
+
+
+def unpack(parcel: bytes) -> Any:
+    """What was packed."""
+    return pickle.loads(parcel)
+
+
+# -- errors ---------------------------------------------------------------------------------------
+
+
+class RemoteTraceback(Exception):
+    """The cause of an error that was raised in another process: its traceback there, as text."""
+
+    def __str__(self) -> str:
+        return f"\n\n{self.args[0]}"
+
+
+def pack_error(error: BaseException) -> bytes:
+    """Pickle an error for another process, so that it can be rebuilt there, or at least be told of."""
+    text = "".join(traceback.format_exception(error))
+    parts = None
+    with suppress(Exception):
+        parts = pack_plainly((type(error), error.args, vars(error)))
+        _rebuilt(parts)
+    return pickle.dumps((parts, f"{type(error).__name__}: {error}", list(getattr(error, "__notes__", ())), text), 5)
+
+
+def unpack_error(parcel: bytes) -> BaseException:
+    """The error that was packed, with its traceback as its cause; a ``WorkerError`` if it cannot be rebuilt."""
+    parts, message, notes, text = pickle.loads(parcel)
+    try:
+        error = _rebuilt(parts)
+    except Exception:
+        error = WorkerError(f"another process has raised what cannot be pickled: {message}")
+        for note in notes:
+            annotate(error, note)
+    error.__cause__ = RemoteTraceback(text)
+    return error
+
+
+def _rebuilt(parts: bytes) -> BaseException:
+    kind, args, state = pickle.loads(parts)
+    error: BaseException = kind.__new__(kind, *args)  # not called: its arguments may be others than its ``args``
+    error.args = args
+    vars(error).update(state)
+    return error
+
+
+# -- functions ------------------------------------------------------------------------------------
+
+
+class _Pickler(cloudpickle.Pickler):
+    """Packs functions so that they are found or made anew where they arrive."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        reduced = _reduced(obj)
+        return super().reducer_override(obj) if reduced is None else reduced
 
 
 def _reduced(thing: Any) -> tuple[Any, ...] | None:
@@ -153,7 +116,7 @@ def _reduced(thing: Any) -> tuple[Any, ...] | None:
         known = point_of(there)
         if known is not None and known[0] is thing:
             return _point_at, (thing.rule.__module__, thing.rule.__qualname__)
-        return _restore_point, (_token(thing), thing.parts())
+        return None
     if not isinstance(thing, FunctionType):
         return None
     there = _found_at(thing.__module__, thing.__qualname__, bound=True)
@@ -193,10 +156,6 @@ def _point_at(module: str, path: str) -> Any:
     return point_of(_found_at(module, path))[0]  # type: ignore[index]
 
 
-def _unpacked(parcel: bytes) -> Any:
-    return pickle.loads(parcel)
-
-
 _tokens: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
 """What has crossed, in either direction: coming back, it is what it was."""
@@ -216,11 +175,6 @@ def _restored(token: str, make: Callable[[], Any]) -> Any:
         thing = _known[token] = make()
         _tokens[thing] = token
     return thing
-
-
-def _restore_point(token: str, parts: tuple[Any, ...]) -> DecisionPoint:
-    point: DecisionPoint = _restored(token, lambda: restored_point(*parts))
-    return point
 
 
 def _restore_decision(token: str, point: DecisionPoint, definition: Definition | None) -> Any:

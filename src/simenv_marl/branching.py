@@ -8,17 +8,15 @@ import pickle
 import signal
 import sys
 import time
-import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from selectors import EVENT_READ, DefaultSelector
 from typing import Any, Final, NoReturn, TypeVar
 
-import cloudpickle
-
+from ._parcels import pack, pack_error, unpack, unpack_error
 from .envs import View
-from .errors import BranchError, OptionValueError, ViewError, annotate
+from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate
 
 Result = TypeVar("Result")
 
@@ -169,9 +167,9 @@ def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others
         if torch is not None:
             torch.set_num_threads(1)  # its threads have stayed behind, and would be waited for
         try:
-            message = _packed(True, function(env, number))
+            message = pickle.dumps((True, _answer(function(env, number))))
         except BaseException as error:
-            message = _packed(False, error)
+            message = pickle.dumps((False, pack_error(error)))
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
                 stream.flush()
@@ -181,17 +179,13 @@ def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others
         os._exit(0)
 
 
-def _packed(answered: bool, value: Any) -> bytes:
-    """What a child says: whether it has an answer; that, or the error with its traceback."""
-    story = "" if answered else "".join(traceback.format_exception(value))
-    notes = () if answered else tuple(getattr(value, "__notes__", ()))
+def _answer(value: Any) -> bytes:
     try:
-        packed: bytes = cloudpickle.dumps((answered, value, notes, story))
-        pickle.loads(packed)  # an error may be pickled and still not be made again
-        return packed
+        parcel = pack(value)
+        unpack(parcel)  # what can be pickled cannot always be made again
     except Exception as error:
-        what = "has returned what cannot be pickled" if answered else "has raised what cannot be pickled"
-        return pickle.dumps((False, None, (), f"{what} ({type(error).__name__}: {error})\n{story}"))
+        raise BranchError(f"it has returned what cannot be pickled ({type(error).__name__}: {error})") from error
+    return parcel
 
 
 def _result(child: _Child) -> Any:
@@ -203,10 +197,13 @@ def _result(child: _Child) -> Any:
         code = os.waitstatus_to_exitcode(status)
         how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
         raise BranchError(f"branch {number} has died without an answer, {how}")
-    answered, value, notes, story = pickle.loads(child.received)
+    answered, parcel = pickle.loads(child.received)
     if answered:
-        return value
-    if not isinstance(value, Exception):  # one that is not even to be raised here, as an exit or an interrupt
-        raise BranchError(f"branch {number} {'has raised' if value is not None else ''} {story}".strip())
-    value.__notes__ = [*notes, f"simenv_marl: in branch {number}, whose traceback was:\n{story}"]
-    raise value
+        return unpack(parcel)
+    error = unpack_error(parcel)
+    if not isinstance(error, Exception):  # which is not to be raised here, as an exit or an interrupt
+        raise BranchError(f"branch {number} has raised {type(error).__name__}: {error}") from error
+    if type(error) is WorkerError:
+        raise BranchError(f"branch {number}: {error}") from error.__cause__
+    annotate(error, f"simenv_marl: in branch {number}")
+    raise error

@@ -309,24 +309,9 @@ class DecisionPoint:
         self.wrappers.add(wrapper)
         return wrapper
 
-    def parts(self) -> tuple[Any, ...]:
-        """What ``restored_point`` makes the same point of, in another process."""
-        return self.rule, self.name, self.bound, self.alone, self.kind, self.definition, registered(self.name) is self
-
     def family(self) -> list[DecisionPoint]:
         """The other points of the same rule."""
         return [point for point in _FAMILIES[self.rule] if point is not self]
-
-
-def restored_point(
-    rule: FunctionType, name: str, bound: bool, alone: bool, kind: str, definition: Definition | None, decorated: bool
-) -> DecisionPoint:
-    """Make a point of its ``parts``, as they have come from another process."""
-    point = DecisionPoint(rule, name, bound=bound)
-    point.bound, point.alone, point.kind, point.definition = bound, alone, kind, definition
-    if decorated:
-        _REGISTRY[name] = point
-    return point
 
 
 def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:

@@ -9,9 +9,9 @@ import numpy as np
 
 from ._batches import Entry, Watcher, entries, run
 from ._ledger import Ledger, Trajectories, merged
-from ._parcels import progress_bar, spread
 from ._plan import Plan
 from ._session import checked_seed
+from ._spread import progress_bar, spread
 from .errors import OptionValueError
 
 __all__ = ["Trajectories", "collect_episodes", "simulate_many"]

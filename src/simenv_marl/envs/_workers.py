@@ -10,32 +10,27 @@ process that is killed.
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
 import pickle
 import signal
-import sys
-import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from io import BytesIO
 from math import prod
 from multiprocessing.connection import Connection, wait
 from time import monotonic
-from types import FunctionType
 from typing import Any, Final
 
-import cloudpickle
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
+from .._parcels import pack_error, pack_plainly, unpack_error
 from .._plan import Plan
-from ..decision import point_of, registered_names, unwrapped
+from ..decision import registered_names
 from ..errors import OptionValueError, WorkerError, annotate, warn_user
 from ._seats import Batch, Row, Seating, Told
 
@@ -134,99 +129,6 @@ class Recipe:
         return Recipe(self.simulation, points, options, "single" if seating.single else "joint")
 
 
-class _Pickler(cloudpickle.Pickler):
-    """Pickles whatever can be, by value where another process could not import it."""
-
-    def reducer_override(self, thing: Any) -> Any:
-        """Have decision functions, and what they stand in front of, be found or made anew where they arrive."""
-        if not isinstance(thing, FunctionType):
-            return super().reducer_override(thing)
-        held = None if thing.__module__ == "__main__" else _look_up(thing.__module__, thing.__qualname__)
-        if held is thing:
-            return super().reducer_override(thing)
-        known = point_of(thing)
-        if held is not None and unwrapped(held) is unwrapped(thing):
-            # An environment has set a decision function there for now.
-            return _look_up_rule, (thing.__module__, thing.__qualname__)
-        if known is None:
-            return super().reducer_override(thing)
-        point, definition = known
-        return _itself if definition is None else definition, (point.rule,)
-
-
-def _look_up(module: str, path: str) -> Any:
-    found: Any = sys.modules.get(module)
-    for name in path.split("."):
-        found = getattr(found, name, None)
-    return found
-
-
-def _look_up_rule(module: str, path: str) -> Any:
-    importlib.import_module(module)
-    return unwrapped(_look_up(module, path))
-
-
-def _itself(function: Any) -> Any:
-    return function
-
-
-def dumps(thing: Any) -> bytes:
-    """Pickle something for another process.
-
-    Raises:
-        Exception: What pickling it raises.
-    """
-    try:
-        plain = pickle.dumps(thing, 5)
-        # What stands in a notebook or in an interactive session is found in no other process.
-        if b"__main__" not in plain or hasattr(sys.modules["__main__"], "__file__"):
-            return plain
-    except Exception:  # cloudpickle will say what is wrong
-        pass
-    buffer = BytesIO()
-    _Pickler(buffer, 5).dump(thing)
-    return buffer.getvalue()
-
-
-# -- errors on their way back ---------------------------------------------------------------------
-
-
-class RemoteTraceback(Exception):
-    """The cause of an error that was raised in a worker: its traceback there, as text."""
-
-    def __str__(self) -> str:
-        return f"\n\n{self.args[0]}"
-
-
-def _packed(error: BaseException) -> tuple[Any, ...]:
-    """What an error is rebuilt of: class, arguments and state (None, where these cannot be pickled), and texts."""
-    text = "".join(traceback.format_exception(error))
-    parts = None
-    with suppress(Exception):
-        parts = dumps((type(error), error.args, vars(error)))
-        _rebuilt(parts)
-    return parts, f"{type(error).__name__}: {error}", list(getattr(error, "__notes__", ())), text
-
-
-def _rebuilt(parts: bytes) -> BaseException:
-    kind, args, state = pickle.loads(parts)
-    error: BaseException = kind.__new__(kind, *args)  # not called: its arguments may be others than its ``args``
-    error.args = args
-    vars(error).update(state)
-    return error
-
-
-def _unpacked(parts: Any, message: str, notes: list[str], text: str) -> BaseException:
-    try:
-        error = _rebuilt(parts)
-    except Exception:
-        error = WorkerError(f"a worker has raised what cannot be pickled: {message}")
-        for note in notes:
-            annotate(error, note)
-    error.__cause__ = RemoteTraceback(text)
-    return error
-
-
 # -- in a worker ----------------------------------------------------------------------------------
 
 
@@ -280,7 +182,7 @@ def _serve(pipe: Connection, row: Row, sends_rows: bool, message: bytes) -> None
         result = getattr(row, method)(*arguments)
         if method in ("reset", "step"):
             result = result, row.observed if sends_rows else None
-        answer = dumps((identity, True, result))
+        answer = pack_plainly((identity, True, result))
     except BaseException as error:
         _send(pipe, identity, error=error)
         return
@@ -288,7 +190,7 @@ def _serve(pipe: Connection, row: Row, sends_rows: bool, message: bytes) -> None
 
 
 def _send(pipe: Connection, identity: int, *, error: BaseException | None = None) -> None:
-    pipe.send_bytes(pickle.dumps((identity, error is None, None if error is None else _packed(error)), 5))
+    pipe.send_bytes(pickle.dumps((identity, error is None, None if error is None else pack_error(error)), 5))
 
 
 # -- in the process of its user -------------------------------------------------------------------
@@ -430,7 +332,7 @@ class Workers:
         self._context = _context(context)
         self._space, self._mode, self._number = seating.single_observation_space, mode, number
         try:
-            self._recipe = dumps(recipe.spelt_out(seating))
+            self._recipe = pack_plainly(recipe.spelt_out(seating))
         except Exception as error:
             raise OptionValueError(
                 f"what the simulations are made of cannot be sent to another process ({type(error).__name__}: {error});"
@@ -476,7 +378,9 @@ class Workers:
         self._identity += 1
         asked = []
         messages = [(worker, arguments(worker)) for worker in self._workers]
-        packed = [(worker, dumps((self._identity, method, given))) for worker, given in messages if given is not None]
+        packed = [
+            (worker, pack_plainly((self._identity, method, given))) for worker, given in messages if given is not None
+        ]
         for worker, message in packed:
             worker.send(message)
             asked.append(worker)
@@ -532,7 +436,7 @@ class Workers:
                 if fine:
                     results[worker] = answer
                 else:
-                    errors[worker] = _unpacked(*answer)
+                    errors[worker] = unpack_error(answer)
                     annotate(errors[worker], f"simenv_marl: in {worker.name}")
         return {worker: results[worker] for worker in asked if worker in results}, errors
 
@@ -605,7 +509,7 @@ class Workers:
             there = [worker for worker in self._workers if worker.there]
             for worker in there:
                 with suppress(WorkerError):
-                    worker.send(dumps((self._identity, "close", ())))
+                    worker.send(pack_plainly((self._identity, "close", ())))
             there = [worker for worker in there if worker.there]
             results, errors = self._collect(there, self._identity, SECONDS_TO_CLOSE)
             if len(results) + len(errors) < len(there):

@@ -47,7 +47,7 @@ def by_hand(number: int) -> Any:
 
 def measure(rounds: int, number: int) -> Section:
     """Measure in so many rounds, with so many decisions of a contender in each."""
-    section = Section("Many simulations", "microseconds per simulation and step, and KiB")
+    section = Section("Vector environments", "microseconds per simulation and step, and KiB")
     rounds = max(3, rounds // 3)
     for size in SIZES:
         _compare(section, size, rounds, number)

@@ -4,6 +4,7 @@ import gc
 import sys
 import weakref
 from collections import Counter
+from time import sleep
 from typing import ClassVar
 
 import numpy as np
@@ -636,3 +637,26 @@ def test_what_is_missing_is_named(monkeypatch, missing, wanted):
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(MissingExtraError, match=r"simenv-marl\[many\]"):
         simulate_many(Going, seeds=[1, 2], **wanted)
+
+
+def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch):
+    """Few at first, which stay in the processor's caches; never more than asked for, and the same comes of it."""
+    monkeypatch.setattr("simenv_marl._batches.CROWD", 4)
+    ant = decision(agent="ant_0")
+    source = calling(*[ant] * 6)
+
+    def crowds(pause, **options):
+        seen = []
+
+        def policy(observations):
+            sleep(pause)
+            seen.append(len(observations))
+            return [1] * len(observations)
+
+        found = simulate_many(source, {ant: policy}, points=ant, seeds=range(40), **options)
+        assert [simulation.log for simulation in found] == [[1] * 6] * 40
+        return max(seen)
+
+    assert crowds(0.01) > 8
+    assert crowds(0.01, batch_size=6) == 6
+    assert crowds(0.01, batch_size=3) == 3

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from threading import get_ident
-from typing import Any, Protocol
+from time import perf_counter
+from typing import Any, Final, Protocol
 
 import numpy as np
 from greenlet import getcurrent
@@ -362,6 +363,11 @@ def run(
         _Batches(plan, seeds, size, finish, watcher).run()
 
 
+CROWD: Final = 256
+"""So many simulations are under way at first. Of more, each has left the processor's caches when its turn comes again,
+and takes twice as long. A policy that takes longer than all of them is worth that: then there may be more."""
+
+
 class _Batches:
     """The simulations that are under way."""
 
@@ -371,6 +377,7 @@ class _Batches:
         self._plan, self._seeds, self._size = plan, seeds, size
         self._finish, self._watcher = finish, watcher
         self._kind: type[Asking] = Unrewarded if watcher is None else Rewarded
+        self._crowd = min(size, CROWD)
         self._next = 0
         self._open: dict[int, Session] = {}
         # By the power of two that is not above their number: groups of which so many decisions wait.
@@ -399,10 +406,11 @@ class _Batches:
         waiting, group.waiting = group.waiting, []
         seen, group.observations = group.observations, []
         del self._by_size[len(waiting).bit_length() - 1][group]
-        watcher = self._watcher
-        observations = group.stack(seen)
+        watcher, number = self._watcher, len(waiting)
+        observations, begun = group.stack(seen), perf_counter()
         if watcher is None:
             actions, _ = group.ask(observations, waiting)
+            asked = perf_counter()
             waiting.reverse()  # taken out one by one, so that nothing holds those that have ended
             for action in actions:
                 episode = waiting.pop()
@@ -417,12 +425,13 @@ class _Batches:
                 gathered.append(episode)
                 following.observations.append(record.observation)
                 record.observation = None
-                number = len(gathered)
-                if not number & (number - 1):
-                    self._grow(following, number)
+                many = len(gathered)
+                if not many & (many - 1):
+                    self._grow(following, many)
         else:
             kept = group.stack(seen)
             actions, extras = group.ask(observations, waiting)
+            asked = perf_counter()
             watcher.asking(group, waiting, kept)
             waiting.reverse()
             for action in actions:
@@ -430,6 +439,8 @@ class _Batches:
                 episode.turn(action)
                 self._settle(episode)
             watcher.answered(group, actions, extras)
+        if 2 * number > self._crowd < self._size and asked - begun > perf_counter() - asked:
+            self._crowd = min(self._size, 2 * self._crowd)
         self._refill()
 
     def _settle(self, episode: Asking) -> None:
@@ -458,7 +469,7 @@ class _Batches:
 
     def _refill(self) -> None:
         """Begin simulations, until there are as many as there may be."""
-        while self._next < len(self._seeds) and len(self._open) < self._size:
+        while self._next < len(self._seeds) and len(self._open) < self._crowd:
             place, seed = self._next, self._seeds[self._next]
             self._next += 1
             try:

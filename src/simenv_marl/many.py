@@ -49,7 +49,8 @@ def simulate_many(
         points: The decision points, as ``generate_env`` takes them. None and no policies: none.
         collect: Called with each simulation as soon as it has ended; returns what is to be kept of it. None: the
             simulation itself.
-        batch_size: How many simulations may be suspended together; in each worker.
+        batch_size: How many simulations may be suspended together; in each worker. No more than 256 of them are
+            as long as policies take less time than simulations do.
         workers: How many processes share the work, by ``joblib``: 0 for none but this one, -1 for as many as
             joblib's backend has. The simulation, the points, the policies, the options and what is collected have to
             be such as can be pickled, by reference or by value.
@@ -139,7 +140,8 @@ def collect_episodes(
             of shape ``(batch, ...)`` (log-probabilities, values), which become ``extras``; always of the same names.
         seeds: What the simulations are reset with, non-negative integers.
         points: The decision points, as ``generate_env`` takes them.
-        batch_size: How many simulations may be suspended together; in each worker.
+        batch_size: How many simulations may be suspended together; in each worker. No more than 256 of them are
+            as long as policies take less time than simulations do.
         workers: How many processes share the work: see ``simulate_many``.
         progress: Whether to show a bar, by ``tqdm``.
         **options: As ``aec_env`` takes them. ``max_steps`` truncates. Whoever has a policy is declared, whatever

@@ -140,7 +140,7 @@ def test_what_is_defined_anywhere_crosses():
 
 
 def test_undecorated_models_variants_and_closures_cross():
-    number = 7
+    number, before = 7, vars(Creature)["act"]
     points = {Creature.act: colony_points(overseen=False)[Creature.act]}
     variant = Variant(
         "mine", Colony, parameters={"design": DESIGN}, points=points, policies={"creature_0": lambda o: 3}
@@ -152,7 +152,7 @@ def test_undecorated_models_variants_and_closures_cross():
     arguments = {"seeds": range(4), "collect": lambda simulation: simulation.trace}
     alone = simulate_many(variant, {Creature.act: of_many}, **arguments)
     assert simulate_many(variant, {Creature.act: of_many}, workers=2, **arguments) == alone
-    assert vars(Creature)["act"].__code__.co_filename == __file__.replace("test_workers", "many_worlds")
+    assert vars(Creature)["act"] is before
 
 
 def failing(error, match=None, **arguments):

@@ -18,7 +18,6 @@ from ._driver import EVALUATING, RUNNING, Offspring, unattended
 from ._episode import LOST, MOST_TAKEN, UNNAMED, Episode
 from ._plan import Plan
 from ._record import Record, not_finite, number
-from ._spaces import duplicate
 from .decision import DIFFERENCES
 from .errors import InvalidActionError, UnknownAgentError
 from .simulation import RULE, Sentinel
@@ -47,6 +46,7 @@ class Rounds(Episode):
                 if binding.name_agent is not None and binding.legal is None and binding.point.alone
             }
         super().__init__(plan, simulation, seed, offspring, foretold)
+        self._announces = getattr(simulation, "expected_calls", None) is not None
 
     def play(self, actions: Mapping[str, Any]) -> None:
         """Answer decisions with actions, each once, up to the first whose action is missing; or to the end.
@@ -73,7 +73,7 @@ class Rounds(Episode):
         if getcurrent() is not self._driver.caller:
             self._driver.enter()
         left = self._checked(actions, pending)
-        taken = {agent: action if type(action) is int else duplicate(action) for agent, action in left.items()}
+        taken = left.copy()  # of actions that are nobody else's any more
         try:
             # Whoever steps an environment from inside a mapping is told so: until the end nothing is pending.
             self.pending = None
@@ -84,17 +84,21 @@ class Rounds(Episode):
                 self.turns += 1
             for record in self.agents.values():
                 record.acted = False
-            for record in self.parting:
-                record.acted = False
-            self.parting = []
+            if self.parting:
+                for record in self.parting:
+                    record.acted = False
+                self.parting = []
             following = self._answer(pending, left)
             if following is None:
                 return
             if self.turns == self._most_turns and actions:
                 self._foresee(following, settle=False)
                 self._finish(truncated=True)
-            else:
+            elif self._announces:
                 self._foresee(following)
+                self.pending = following
+            else:
+                self._settle_all(following)
                 self.pending = following
         except BaseException as error:
             self.pending, self.over = None, True

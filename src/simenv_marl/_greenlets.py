@@ -99,7 +99,7 @@ class GreenletDriver(Watchful):
         if get_loop is not None and (loop is not None or get_loop() is not None):
             self._enter_loop(loop)
         if reply is RULE:
-            return point.rule(*args, **kwargs)
+            return point.rule(*args, **kwargs) if kwargs else point.rule(*args)
         return reply if deliver is None else deliver(reply, *args, **kwargs)
 
     def _come_back_here(self) -> None:

@@ -7,14 +7,13 @@ with actions for everybody, and a round with one action.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from threading import get_ident
 from typing import Any, Final
 
 from greenlet import getcurrent
 
-from ._driver import EVALUATING, RUNNING, Offspring, unattended
+from ._driver import EVALUATING, RUNNING, unattended
 from ._episode import LOST, MOST_TAKEN, UNNAMED, Episode
 from ._plan import Plan
 from ._record import Record, not_finite, number
@@ -28,14 +27,7 @@ MISSING: Final = Sentinel("MISSING")
 class Rounds(Episode):
     """An episode that is played round by round, and not turn by turn."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        simulation: Any,
-        seed: int | None,
-        offspring: Offspring | None = None,
-        foretold: deque[Any] | None = None,
-    ) -> None:
+    def __init__(self, plan: Plan, simulation: Any, *others: Any) -> None:
         """Prepare an episode, as ``Episode`` does."""
         # By binding, how its agents are named, where nothing but the mappings is to be seen to.
         self._quick: dict[Any, Any] = {}
@@ -45,7 +37,7 @@ class Rounds(Episode):
                 for binding in plan.active
                 if binding.name_agent is not None and binding.legal is None and binding.point.alone
             }
-        super().__init__(plan, simulation, seed, offspring, foretold)
+        super().__init__(plan, simulation, *others)
         self._announces = getattr(simulation, "expected_calls", None) is not None
 
     def play(self, actions: Mapping[str, Any]) -> None:

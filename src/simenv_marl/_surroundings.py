@@ -6,13 +6,12 @@ afterwards: for each turn, and not for each switch to the simulation. All others
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any, Final
 
-from ._driver import Offspring, Surrounding, attended, unattended
+from ._driver import Surrounding, attended, unattended
 from ._episode import Episode
 from ._plan import Plan
 from ._rounds import Rounds
@@ -84,19 +83,10 @@ class _Entered(unattended):
 class Surrounded(Episode):
     """An episode of a simulation that has surroundings, played in turns or in rounds."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        simulation: Any,
-        seed: int | None,
-        offspring: Offspring | None = None,
-        foretold: deque[Any] | None = None,
-        *,
-        surroundings: Surroundings,
-    ) -> None:
+    def __init__(self, plan: Plan, simulation: Any, *others: Any, surroundings: Surroundings) -> None:
         """Prepare an episode, as ``Episode`` does."""
         self._surroundings = surroundings
-        super().__init__(plan, simulation, seed, offspring, foretold)
+        super().__init__(plan, simulation, *others)
         clock = self.clock
         if clock is not None:
             self.clock = lambda: self._tell(clock)

@@ -68,16 +68,19 @@ OF_ERRORS: Final[tuple[tuple[type[BaseException], str, str], ...]] = (
 
 
 def first_lines(text: str, most: int = 300) -> str:
+    """The first lines of a text, which may go on for long."""
     text = " ".join(text.split())
     return text if len(text) <= most else f"{text[: most - 4]} ..."
 
 
 def at(error: BaseException) -> str:
+    """Where an error was raised, in brackets; nothing where that is not known."""
     place = culprit(error)
     return f" ({place})" if place else ""
 
 
 def seeds_in_words(seeds: Iterable[int]) -> str:
+    """Some seeds, in words."""
     return ", ".join(map(str, seeds))
 
 
@@ -112,6 +115,7 @@ def step_difference(one: list[Step], other: list[Step], error: BaseException | N
 
 
 def parts_in_words(parts: list[tuple[str, Any, Any]], here: str = "first", there: str = "then") -> str:
+    """What differs, in words."""
     listed = [f"{path} is {here} {shown(left)}, {there} {shown(right)}" for path, left, right in parts[:3]]
     more = f"; {len(parts) - 3} more" if len(parts) > 3 else ""
     return "; ".join(listed) + more

@@ -289,9 +289,15 @@ class Worker:
         code = process.exitcode
         self.end_now()
         how = "closed its pipe" if code is None else f"died with exit code {code}"
+        script = (
+            '. In a script, environments with workers are made under `if __name__ == "__main__":`, because each worker'
+            " runs the script once more"
+            if code == 1  # of an error, before it could tell of one
+            else ""
+        )
         return WorkerError(
             f"{self.name} {how}; it was killed, or its simulations have ended the process. reset() puts another one"
-            " in its place"
+            f" in its place{script}"
         )
 
     def end_now(self, seconds: float = 0.0) -> None:

@@ -353,6 +353,18 @@ def test_too_many_decisions_to_be_kept(monkeypatch):
     assert [env.step(1)[3] for _ in range(4)] == [False, False, False, True]
 
 
+def test_too_many_rounds_to_be_kept(monkeypatch):
+    monkeypatch.setattr("simenv_marl._rounds.MOST_TAKEN", 2)
+    env = parallel_env(lambda: Walk(9), Walk.choose)
+    env.reset(seed=3)
+    env.step({"walker_0": 1})
+    assert branch(env, short, 1, method="replay") == branch(env, short, 1)
+    env.step({"walker_0": 1})
+    with pytest.raises(BranchError, match="fork"):
+        branch(env, short, 1, method="replay")
+    assert branch(env, short, 1) == [rest_of(env)]
+
+
 def test_what_cannot_be_continued():
     env = single_env(lambda: Walk(1), Walk.choose)
     with pytest.raises(NotResetError):

@@ -560,3 +560,9 @@ def test_rosters_may_be_iterators():
     (point,) = beings()
     cls = generate_env(script(main), beings(), possible_agents={point: (f"being_{number}" for number in range(2))})
     assert cls().possible_agents == cls().possible_agents == ["being_0", "being_1"]
+
+
+@pytest.mark.parametrize("roster", [5, {"being_0": 5}])
+def test_what_is_no_roster(roster):
+    with pytest.raises(OptionValueError, match="possible_agents"):
+        aec_env(script(lambda simulation: None), beings(), possible_agents=roster)

@@ -103,6 +103,11 @@ def _longest_module(parts: list[str]) -> tuple[ModuleType | None, list[str]]:
     return module, parts[-1:]
 
 
+def leads_there(name: str) -> bool:
+    """Whether a dotted name is sure to lead to the same in another process."""
+    return "<" not in name and not name.startswith("__main__.")
+
+
 def title(key: Any) -> str:
     """What to call whatever somebody has named."""
     return key if isinstance(key, str) else getattr(key, "__qualname__", repr(key))

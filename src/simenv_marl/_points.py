@@ -13,7 +13,19 @@ from types import FunctionType
 from typing import Any, ClassVar, Final
 from weakref import WeakValueDictionary
 
-from ._patches import DECIDED, Place, Purpose, all_classes, found_at, held_at, owner_at_hand, plain, resolve, title
+from ._patches import (
+    DECIDED,
+    Place,
+    Purpose,
+    all_classes,
+    found_at,
+    held_at,
+    leads_there,
+    owner_at_hand,
+    plain,
+    resolve,
+    title,
+)
 from ._wrappers import beneath, exposure
 from .decision import DecisionPoint, Definition, point_of, registered, registered_names, unbind, unwrapped
 from .errors import DefinitionError, PatchError, UnknownPointError
@@ -57,7 +69,7 @@ def portable(key: Any, name: str | None = None) -> Any:
     if not isinstance(function, FunctionType):
         return key
     name = name or f"{function.__module__}.{function.__qualname__}"
-    return function if "<" in name or name.startswith("__main__.") else name
+    return name if leads_there(name) else function
 
 
 def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[NamedPoint]:

@@ -24,6 +24,7 @@ from ._patches import (
     found_at,
     held_at,
     lasting,
+    leads_there,
     owner_at_hand,
     places_of,
     plain,
@@ -442,7 +443,7 @@ class Plugins:
     def portable(self) -> list[Entry]:
         """The same as ``entries``, but for targets that are not named the same in another process."""
         return [
-            (handler, target if "<" not in target and not target.startswith("__main__.") else given, position)
+            (handler, target if leads_there(target) else given, position)
             for (handler, target, position), given in zip(self.entries, self._given, strict=True)
         ]
 

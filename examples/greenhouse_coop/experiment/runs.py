@@ -11,15 +11,17 @@ import argparse
 import json
 import multiprocessing
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from ..env import raw_env
 from ..train import OUT, Team
 from .questions import CURVE, FINAL, QUESTIONS, Question, Verdict, judge
+
+Job, Result = TypeVar("Job"), TypeVar("Result")
 
 RUNS: Final = OUT / "experiment"
 """Where runs are kept, unless ``--out`` says otherwise. Nothing of it is under version control."""
@@ -155,18 +157,25 @@ def carry_out(library: str, learn: Callable[[Run], Verdict], options: argparse.N
     ]
     # Those who need what another run has learnt come after all others.
     for stage in ([run for run in runs if not run.asked.needs], [run for run in runs if run.asked.needs]):
-        _carry_out([run for run in stage if not _done(run)], learn, options.workers)
+        pending = [run for run in stage if not _done(run)]
+        for run, verdict in zip(pending, each(learn, pending, options.workers), strict=True):
+            _tell(run, verdict)
 
 
-def _carry_out(runs: Sequence[Run], learn: Callable[[Run], Verdict], workers: int) -> None:
-    if workers == 1 or len(runs) < 2:
-        for run in runs:
-            _tell(run, learn(run))
+def each(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
+    """Do jobs, one after the other or several at a time; what comes out stands in their order.
+
+    Args:
+        function: Does a job; such as can be pickled.
+        jobs: What is to be done.
+        workers: In how many processes; 1: in this one.
+    """
+    if workers == 1 or len(jobs) < 2:
+        yield from map(function, jobs)
         return
     context = multiprocessing.get_context("spawn")  # forks of a process that may have threads are no good
-    with ProcessPoolExecutor(min(workers, len(runs)), context) as executor:
-        for run, verdict in zip(runs, executor.map(learn, runs), strict=True):
-            _tell(run, verdict)
+    with ProcessPoolExecutor(min(workers, len(jobs)), context) as executor:
+        yield from executor.map(function, jobs)
 
 
 def _done(run: Run) -> bool:

@@ -7,15 +7,14 @@ What its environments are is all there is to a question. Learning is the same fo
 - Actions are rescaled from [-1, 1] by Gymnasium's wrapper, as the library wants them.
 - Rewards are divided by the deviation of returns, by the library's ``VecNormalize``. Observations are what they are:
   all of them lie between 0 and 1.
-- The deviation of actions begins with 0.37 instead of 1 (``log_std_init``): at 1 nearly a third of all actions would lie
-  outside of the space, and be clipped to one of its ends.
+- The deviation of actions begins with 0.37 instead of 1 (``log_std_init``): at 1 nearly a third of all actions would
+  lie outside of the space, and be clipped to one of its ends.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import gymnasium
@@ -126,7 +125,7 @@ def load(run: Run) -> Team:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Carry out what has not been carried out before."""
     questions = ("1", "2", "3", "5a", "5b", "5c")
-    options = parser(__doc__ or "", budget=100_000, questions=questions).parse_args(arguments)
+    options = parser(__doc__ or "", budget=60_000, questions=questions).parse_args(arguments)
     carry_out(LIBRARY, learn, options)
 
 

@@ -50,3 +50,23 @@ benchmark: .venv/.test
 
 clean:
 	rm -rf .venv .venv-dask .venv-ray docs/_build
+
+# The cooperative experiment, all of it: about an hour on two cores. What is done already is not done again.
+.PHONY: experiment
+EXPERIMENT := examples.greenhouse_coop.experiment
+EXPERIMENT_OUT ?= examples/greenhouse_coop/out/experiment
+EXPERIMENT_WORKERS ?= 2
+experiment: export OMP_NUM_THREADS = 1
+experiment: .venv-experiment/.experiment .venv-experiment-rllib/.experiment-rllib
+	for script in baselines sb3 torchrl; do \
+	    $(<D)/bin/python -m $(EXPERIMENT).$$script --out $(EXPERIMENT_OUT) --workers $(EXPERIMENT_WORKERS) || exit; \
+	done
+	.venv-experiment-rllib/bin/python -m $(EXPERIMENT).rllib --out $(EXPERIMENT_OUT) --workers $(EXPERIMENT_WORKERS)
+	$(<D)/bin/python -m $(EXPERIMENT).results --runs $(EXPERIMENT_OUT)
+	$(<D)/bin/python -m $(EXPERIMENT).back_in_the_model $(EXPERIMENT_OUT)/sb3-3-0.zip $(EXPERIMENT_OUT)/torchrl-4b-0.pt
+	.venv-experiment-rllib/bin/python -m $(EXPERIMENT).back_in_the_model $(EXPERIMENT_OUT)/rllib-4a-0
+
+.venv-experiment/.experiment .venv-experiment-rllib/.experiment-rllib: pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
+	touch $@

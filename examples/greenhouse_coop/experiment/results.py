@@ -83,38 +83,34 @@ def gather(runs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     Returns:
         Learning curves, a row for each point, and what came out, a row for each run.
     """
+    found = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(runs.glob("*.json"))]
+    learnt = [run for run in found if run["library"] != "baselines"]
+    searches = [run for run in found if run["library"] == "baselines"]
+    if not learnt:
+        raise SystemExit(f"there are no runs in {runs}")
     curves: list[dict[str, Any]] = []
-    finals: list[dict[str, Any]] = []
-    for path in sorted(runs.glob("*.json")):
-        run = json.loads(path.read_text(encoding="utf-8"))
-        if run["library"] == "baselines":
-            finals += _baselines(run)
-            continue
+    finals = _baselines(searches)
+    for run in learnt:
         key = {name: run[name] for name in ("library", "question", "seed")}
         curves += [{**key, **point} for point in run["curve"]]
-        finals.append({**key, "days": run["days"], **run["final"], "seconds": run["seconds"]})
-    if not finals:
-        raise SystemExit(f"there are no runs in {runs}")
+        finals.append({**key, "days": run["days"], **run["final"]})
     return pd.DataFrame(curves), pd.DataFrame(finals)
 
 
-def _baselines(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of one search: what evolution brings depends on its episodes, all else is shown once."""
-    rows = []
-    for team, verdict in found["teams"].items():
-        evolved = team.startswith("CMA-ES")
-        title = f"{team}, {found['episodes']} episodes"
-        if evolved or found["episodes"] == 3600:
-            days = found["episodes"] * DAYS if evolved else 0
-            rows.append(
-                {
-                    "library": "baselines",
-                    "question": title if evolved else team,
-                    "seed": found["seed"],
-                    "days": days,
-                    **verdict,
-                }
-            )
+def _baselines(searches: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What evolution brings is shown for each number of episodes; all else once, as the longest searches found it."""
+    most = max((search["episodes"] for search in searches), default=0)
+    rows: list[dict[str, Any]] = []
+    for search in searches:
+        seed, episodes = search["seed"], search["episodes"]
+        for team, verdict in search["teams"].items():
+            if team.startswith("CMA-ES"):
+                row = {"question": f"{team}, {episodes} episodes", "seed": seed, "days": episodes * DAYS}
+            elif episodes == most:
+                row = {"question": team, "seed": seed, "days": 0}
+            else:
+                continue
+            rows.append({"library": "baselines", **row, **verdict})
     return rows
 
 
@@ -207,7 +203,7 @@ def _draw_lines(axes: Axes, finals: pd.DataFrame) -> None:
 def draw_finals(finals: pd.DataFrame, path: Path) -> None:
     """Draw what came out: a dot for each seed, a stroke for the median, and a bar between quartiles."""
     groups = list(finals.groupby(["library", "question"], sort=False))
-    groups.sort(key=lambda group: _place(*group[0], group[1].value.median()), reverse=True)
+    groups.sort(key=lambda group: _place(group[0][0], group[0][1], group[1].value.median()), reverse=True)
     figure = Figure(figsize=(10, 0.8 + 0.34 * len(groups)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()

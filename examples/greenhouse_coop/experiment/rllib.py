@@ -152,7 +152,7 @@ def act(modules: Sequence[RLModule], observation: NDArray[np.float32]) -> NDArra
     batch = {"obs": torch.from_numpy(observation)[None]}
     with torch.no_grad():
         means = [float(module.forward_inference(batch)["action_dist_inputs"][0, 0]) for module in modules]
-    return (np.clip(np.array(means, np.float32), -1, 1) + 1) / 2
+    return np.asarray((np.clip(means, -1, 1) + 1) / 2, np.float32)
 
 
 def load(run: Run) -> Team:

@@ -21,7 +21,8 @@ from ..env import raw_env
 from ..train import OUT, Team
 from .questions import CURVE, FINAL, QUESTIONS, Question, Verdict, judge
 
-Job, Result = TypeVar("Job"), TypeVar("Result")
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 RUNS: Final = OUT / "experiment"
 """Where runs are kept, unless ``--out`` says otherwise. Nothing of it is under version control."""
@@ -77,7 +78,7 @@ class Log:
         """
         self._run, self._settings = run, dict(settings)
         self._environment = raw_env()
-        self._began = time.monotonic()
+        self._began = time.process_time()
         self._curve: list[dict[str, Any]] = []
 
     def judge(self, days: int, team: Team) -> None:
@@ -96,7 +97,7 @@ class Log:
             days: How many have been simulated for learning.
             team: As it plays in the end.
         """
-        seconds = time.monotonic() - self._began
+        seconds = time.process_time() - self._began
         verdict = judge(self._environment, team, FINAL)
         self._environment.close()
         write(

@@ -110,7 +110,7 @@ def act(model: PPO, observation: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     (size,) = model.observation_space.shape
     actions, _ = model.predict(np.tile(observation, size // len(observation)), deterministic=True)
-    return np.clip((actions + 1) / 2, 0, 1, dtype=np.float32)
+    return np.asarray(np.clip((actions + 1) / 2, 0, 1), np.float32)
 
 
 def load(run: Run) -> Team:

@@ -32,10 +32,10 @@ from torchrl.envs import EnvBase, GymWrapper, MarlGroupMapType, PettingZooWrappe
 from torchrl.modules import MLP, MultiAgentMLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
-import simenv_marl
+from simenv_marl import parallel_env
 
-from ..env import DAYS, HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, OBSERVED, POT_CAPACITY, GreenhouseSim, joint_env
-from ..env import parallel_env as parallel
+from ..env import DAYS, OBSERVED, GreenhouseSim, joint_env
+from ..model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, POT_CAPACITY
 from ..train import Team
 from .questions import Verdict, team_of
 from .runs import Log, Run, carry_out, parser
@@ -83,12 +83,11 @@ def environment(run: Run) -> EnvBase:
     if run.question == "3":
         made = GymWrapper(joint_env(flatten=True))
         return TransformedEnv(made, RewardScaling(0.0, SETTINGS["reward_scale"]))
-    rounds = simenv_marl.parallel_env(WholeGreenhouse, state_space=STATE) if run.question == "4b" else parallel()
+    central = run.question == "4b"
+    rounds = parallel_env(WholeGreenhouse, state_space=STATE) if central else parallel_env(GreenhouseSim)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "PettingZoo in TorchRL is tested", UserWarning)
-        made = PettingZooWrapper(
-            rounds, return_state=run.question == "4b", group_map=MarlGroupMapType.ALL_IN_ONE_GROUP, seed=run.seed
-        )
+        made = PettingZooWrapper(rounds, return_state=central, group_map=MarlGroupMapType.ALL_IN_ONE_GROUP)
     return TransformedEnv(made, RewardScaling(0.0, SETTINGS["reward_scale"], in_keys=[("agents", "reward")]))
 
 
@@ -151,7 +150,7 @@ class Networks:
             seen = torch.from_numpy(observation).expand(2, -1)
             means = self.means(seen if self.group else seen.reshape(-1))
         # The waterer is the first in the joint agent, and in the roster.
-        return ((torch.tanh(means.reshape(2)) + 1) / 2).numpy()
+        return np.asarray((torch.tanh(means.reshape(2)) + 1) / 2, np.float32)
 
 
 # -- learning -------------------------------------------------------------------------------------

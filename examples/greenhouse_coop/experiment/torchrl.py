@@ -1,4 +1,4 @@
-"""Question 4, answered by IPPO and MAPPO of TorchRL; and question 3, to compare the libraries.
+"""Question 4, answered by IPPO and MAPPO of TorchRL.
 
 ``python -m examples.greenhouse_coop.experiment.torchrl``
 
@@ -7,7 +7,11 @@ own, which sees what its agent sees (IPPO). In 4b there is one critic, which see
 simulation's ``state()``, which a subclass defines here, outside of the model. As both agents observe the same in a
 round, what they observe taken together would be no more than what each of them knows.
 
-Learning is the same for all of it, and as far as the libraries allow, the same as in ``sb3``:
+Networks, advantages and losses are TorchRL's. It also has a wrapper for PettingZoo environments, and a collector;
+as the greenhouse is quick, most of the time would pass in these. Here sixteen environments stand side by side instead,
+and one call of the networks decides for all of them.
+
+Learning is, as far as the libraries allow, the same as in ``sb3``:
 
 - Actions are normal variables squashed by the hyperbolic tangent (``TanhNormal``); their deviation begins with 0.37.
 - Rewards are divided by 20, about the deviation of returns.
@@ -15,7 +19,6 @@ Learning is the same for all of it, and as far as the libraries allow, the same 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -27,24 +30,25 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
-from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, GymWrapper, MarlGroupMapType, PettingZooWrapper, RewardScaling, TransformedEnv
 from torchrl.modules import MLP, MultiAgentMLP, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
-from simenv_marl import parallel_env
+from simenv_marl import SimulationParallelEnv, parallel_env
 
-from ..env import DAYS, OBSERVED, GreenhouseSim, joint_env
+from ..env import DAYS, OBSERVED, GreenhouseSim
 from ..model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, POT_CAPACITY
 from ..train import Team
-from .questions import Verdict, team_of
+from .questions import BOTH, Verdict, team_of
 from .runs import Log, Run, carry_out, parser
 
 LIBRARY: Final = "torchrl"
 
+GREENHOUSES: Final = 16
+"""How many are kept side by side, to learn from."""
+
 SETTINGS: Final[dict[str, Any]] = {
     "learning_rate": 3e-4,
-    "days_a_batch": 1024,
+    "days": 64,
     "minibatch": 128,
     "epochs": 10,
     "gamma": 0.99,
@@ -78,17 +82,68 @@ class WholeGreenhouse(GreenhouseSim):
         return np.concatenate([weather, np.quantile(np.minimum(plants, 2.0), LEVELS, axis=0).ravel()])
 
 
-def environment(run: Run) -> EnvBase:
-    """The environment in which a question is answered."""
-    if run.question == "3":
-        made = GymWrapper(joint_env(flatten=True))
-        return TransformedEnv(made, RewardScaling(0.0, SETTINGS["reward_scale"]))
-    central = run.question == "4b"
-    rounds = parallel_env(WholeGreenhouse, state_space=STATE) if central else parallel_env(GreenhouseSim)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "PettingZoo in TorchRL is tested", UserWarning)
-        made = PettingZooWrapper(rounds, return_state=central, group_map=MarlGroupMapType.ALL_IN_ONE_GROUP)
-    return TransformedEnv(made, RewardScaling(0.0, SETTINGS["reward_scale"], in_keys=[("agents", "reward")]))
+class Greenhouses:
+    """Sixteen parallel environments, kept side by side."""
+
+    def __init__(self, question: str, seed: int) -> None:
+        """Furnish them.
+
+        Args:
+            question: What is asked: only a centralised critic sees the state.
+            seed: Determines what they are like.
+        """
+        self._central = question == "4b"
+        self._environments = [self._furnished() for _ in range(GREENHOUSES)]
+        seeds = np.random.SeedSequence(seed).generate_state(GREENHOUSES) % 2**31
+        self._seen = [self._reset(each, int(own)) for each, own in zip(self._environments, seeds, strict=True)]
+
+    def _furnished(self) -> SimulationParallelEnv:
+        return parallel_env(WholeGreenhouse, state_space=STATE) if self._central else parallel_env(GreenhouseSim)
+
+    def collect(self, actor: ProbabilisticActor) -> TensorDict:
+        """Let an actor keep them for some days, as it explores.
+
+        Returns:
+            A batch of shape ``(greenhouses, days)``, with keys as TorchRL's losses and estimators of value want them.
+        """
+        days = []
+        for _ in range(SETTINGS["days"]):
+            day = self._stacked(self._seen)
+            with torch.no_grad():
+                actor(day)
+            actions = day["agents", "action"].numpy()
+            played = [self._play(each, own) for each, own in zip(self._environments, actions, strict=True)]
+            day["next"] = self._stacked([seen for seen, *_ in played])
+            for number, name in enumerate(("reward", "terminated", "done"), 1):
+                values = np.array([row[number] for row in played])
+                day["next", "agents", name] = torch.from_numpy(values)[..., None]
+            days.append(day)
+            self._seen = [
+                self._reset(each) if row[3].any() else row[0]
+                for each, row in zip(self._environments, played, strict=True)
+            ]
+        return torch.stack(days, dim=1)
+
+    def _play(self, environment: SimulationParallelEnv, actions: NDArray[np.float32]) -> tuple[Any, ...]:
+        observations, rewards, terminations, truncations, _ = environment.step(dict(zip(BOTH, actions, strict=True)))
+        terminated = np.array([terminations[agent] for agent in BOTH])
+        truncated = np.array([truncations[agent] for agent in BOTH])
+        scaled = np.array([rewards[agent] for agent in BOTH], np.float32) * SETTINGS["reward_scale"]
+        return self._look(environment, observations), scaled, terminated, terminated | truncated
+
+    def _reset(self, environment: SimulationParallelEnv, seed: int | None = None) -> Any:
+        observations, _ = environment.reset(seed=seed)
+        return self._look(environment, observations)
+
+    def _look(self, environment: SimulationParallelEnv, observations: dict[str, Any]) -> Any:
+        """What agents observe, ``(2, 6)``, and the state, ``(36,)``, or nothing of it."""
+        state = environment.state() if self._central else np.zeros(0, np.float32)
+        return np.stack([observations[agent] for agent in BOTH]), state
+
+    def _stacked(self, seen: Sequence[Any]) -> TensorDict:
+        observations, states = (torch.from_numpy(np.stack(parts)) for parts in zip(*seen, strict=True))
+        agents = TensorDict({"observation": observations}, [len(seen), 2])
+        return TensorDict({"agents": agents, "state": states}, [len(seen)])
 
 
 # -- networks -------------------------------------------------------------------------------------
@@ -99,40 +154,31 @@ class Networks:
     """What learns.
 
     Attributes:
-        means: From observations, ``(2, 6)`` or of the joint agent ``(12,)``, to what becomes an action by squashing:
-            ``(2, 1)`` or ``(2,)``.
-        actor: The same as a distribution of actions, in TorchRL's terms.
-        critic: What it is going to be worth.
-        group: The keys of TorchRL's under which observations, actions and rewards stand begin with these.
+        means: From observations, ``(..., 2, 6)``, to what becomes actions by squashing, ``(..., 2, 1)``.
+        actor: The same as distributions of actions, in TorchRL's terms.
+        critic: What it is going to be worth, ``(..., 2, 1)``.
     """
 
     means: nn.Module
     actor: ProbabilisticActor
     critic: TensorDictModule
-    group: tuple[str, ...]
 
     @classmethod
     def of(cls, question: str) -> Networks:
         """Make the networks that answer a question."""
         cells: dict[str, Any] = {"num_cells": SETTINGS["cells"], "activation_class": nn.Tanh}
-        sizes = {"n_agents": 2, "share_params": False, **cells}
-        seen = len(OBSERVED)
-        group = () if question == "3" else ("agents",)
-        observation: Any = (*group, "observation")
-        judged = observation
-        means: nn.Module
-        critic: nn.Module
-        if question == "3":
-            means, critic = MLP(2 * seen, 2, **cells), MLP(2 * seen, 1, **cells)
-        else:
-            means = MultiAgentMLP(seen, 1, centralized=False, **sizes)
-            critic = MultiAgentMLP(seen, 1, centralized=False, **sizes)
+        own: dict[str, Any] = {"n_agents": 2, "centralized": False, "share_params": False, **cells}
+        observation, loc, scale, action, log_prob, value = (
+            ("agents", name) for name in ("observation", "loc", "scale", "action", "log_prob", "state_value")
+        )
+        means = MultiAgentMLP(len(OBSERVED), 1, **own)
         if question == "4b":
-            judged = "state"
-            critic = nn.Sequential(MLP(STATE.shape[0], 2, **cells), nn.Unflatten(-1, (2, 1)))
-        deviation = AddStateIndependentNormalScale((2,) if question == "3" else (2, 1))
+            whole = nn.Sequential(MLP(STATE.shape[0], 2, **cells), nn.Unflatten(-1, (2, 1)))
+            critic = TensorDictModule(whole, ["state"], [value])
+        else:
+            critic = TensorDictModule(MultiAgentMLP(len(OBSERVED), 1, **own), [observation], [value])
+        deviation = AddStateIndependentNormalScale((2, 1))
         nn.init.constant_(deviation.state_independent_scale, SETTINGS["log_std"])
-        loc, scale, action, value = ((*group, name) for name in ("loc", "scale", "action", "state_value"))
         actor = ProbabilisticActor(
             TensorDictModule(nn.Sequential(means, deviation), [observation], [loc, scale]),
             in_keys={"loc": loc, "scale": scale},
@@ -140,17 +186,15 @@ class Networks:
             distribution_class=TanhNormal,
             distribution_kwargs={"low": 0.0, "high": 1.0},
             return_log_prob=True,
-            log_prob_key=(*group, "log_prob"),
+            log_prob_key=log_prob,
         )
-        return cls(means, actor, TensorDictModule(critic, [judged], [value]), group)
+        return cls(means, actor, critic)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """What the agents do, without exploring: both are asked when the day begins, and observe the same."""
         with torch.no_grad():
-            seen = torch.from_numpy(observation).expand(2, -1)
-            means = self.means(seen if self.group else seen.reshape(-1))
-        # The waterer is the first in the joint agent, and in the roster.
-        return np.asarray((torch.tanh(means.reshape(2)) + 1) / 2, np.float32)
+            means = self.means(torch.from_numpy(observation).expand(2, -1)).reshape(2)
+        return np.asarray((torch.tanh(means) + 1) / 2, np.float32)
 
 
 # -- learning -------------------------------------------------------------------------------------
@@ -161,28 +205,19 @@ def learn(run: Run) -> Verdict:
     torch.set_num_threads(1)
     torch.manual_seed(run.seed)
     networks = Networks.of(run.question)
-    greenhouse = environment(run)
-    greenhouse.set_seed(run.seed)
-    team = team_of(run.asked, networks.act)
-    log = Log(run, SETTINGS)
-    log.judge(0, team)
-    size = SETTINGS["days_a_batch"]
-    batches = -(-run.budget // size)  # whole ones: the last may go beyond the budget
-    collector = Collector(
-        greenhouse,
-        networks.actor,
-        frames_per_batch=size,
-        total_frames=batches * size,
-        auto_register_policy_transforms=False,  # networks without a memory need none
-    )
+    greenhouses = Greenhouses(run.question, run.seed)
     teach = Teacher(networks)
-    for number, batch in enumerate(collector, 1):
-        teach(batch)
+    team = team_of(run.asked, networks.act)
+    log = Log(run, {"greenhouses": GREENHOUSES, **SETTINGS})
+    log.judge(0, team)
+    days = GREENHOUSES * SETTINGS["days"]
+    batches = -(-run.budget // days)  # whole ones: the last may go beyond the budget
+    for number in range(1, batches + 1):
+        teach(greenhouses.collect(networks.actor))
         if number % BATCHES_A_POINT == 0 or number == batches:
-            log.judge(number * size, team)
-    collector.shutdown()
+            log.judge(number * days, team)
     torch.save(networks.means.state_dict(), run.stem.with_suffix(".pt"))
-    return log.close(batches * size, team)
+    return log.close(batches * days, team)
 
 
 class Teacher:
@@ -190,8 +225,6 @@ class Teacher:
 
     def __init__(self, networks: Networks) -> None:
         """Make the loss and its optimiser."""
-        group = networks.group
-        self._group = group
         self._loss = ClipPPOLoss(
             networks.actor,
             networks.critic,
@@ -200,25 +233,26 @@ class Teacher:
             critic_coeff=0.5,
             loss_critic_type="l2",
             normalize_advantage=True,
-            normalize_advantage_exclude_dims=(-2,) if group else (),  # by itself for each agent
+            normalize_advantage_exclude_dims=(-2,),  # by itself for each agent
         )
         names = ("reward", "action", "value", "done", "terminated", "advantage", "value_target", "sample_log_prob")
         own = {"value": "state_value", "sample_log_prob": "log_prob"}
-        self._loss.set_keys(**{name: (*group, own.get(name, name)) for name in names})
+        self._loss.set_keys(**{name: ("agents", own.get(name, name)) for name in names})
         self._loss.make_value_estimator(ValueEstimators.GAE, gamma=SETTINGS["gamma"], lmbda=SETTINGS["lmbda"])
         self._optimiser = torch.optim.Adam(self._loss.parameters(), SETTINGS["learning_rate"], eps=1e-5)
 
     def __call__(self, batch: TensorDict) -> None:
-        """Learn from a batch of days that follow each other."""
+        """Learn from a batch, ``(greenhouses, days)``."""
         with torch.no_grad():
             self._loss.value_estimator(
                 batch,
                 params=self._loss.critic_network_params,
                 target_params=self._loss.target_critic_network_params,
             )
+        rows = batch.reshape(-1)
         for _ in range(SETTINGS["epochs"]):
-            for rows in torch.randperm(len(batch)).split(SETTINGS["minibatch"]):
-                losses = self._loss(batch[rows])
+            for chosen in torch.randperm(len(rows)).split(SETTINGS["minibatch"]):
+                losses = self._loss(rows[chosen])
                 self._optimiser.zero_grad()
                 (losses["loss_objective"] + losses["loss_critic"]).backward()
                 nn.utils.clip_grad_norm_(self._loss.parameters(), SETTINGS["most_gradient"])
@@ -237,7 +271,7 @@ def load(run: Run) -> Team:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Carry out what has not been carried out before."""
-    options = parser(__doc__ or "", budget=60_000, questions=("4a", "4b", "3")).parse_args(arguments)
+    options = parser(__doc__ or "", budget=60_000, questions=("4a", "4b")).parse_args(arguments)
     carry_out(LIBRARY, learn, options)
 
 

@@ -44,6 +44,9 @@ from ray.tune.registry import register_env
 
 LIBRARY: Final = "rllib"
 
+GREENHOUSES: Final = 16
+"""How many are kept side by side, to learn from."""
+
 SETTINGS: Final[dict[str, Any]] = {
     "lr": 3e-4,
     "train_batch_size_per_learner": 1024,
@@ -103,7 +106,7 @@ def configuration(seed: int) -> PPOConfig:
     return (
         PPOConfig()
         .environment("greenhouse_coop")
-        .env_runners(num_env_runners=0)
+        .env_runners(num_env_runners=0, num_envs_per_env_runner=GREENHOUSES)
         .learners(num_learners=0)
         .multi_agent(policies=set(BOTH), policy_mapping_fn=lambda agent, episode, **_: agent)
         .rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs=modules))
@@ -119,7 +122,9 @@ def learn(run: Run) -> Verdict:
     algorithm = configuration(run.seed).build_algo()
     modules = [algorithm.get_module(agent) for agent in BOTH]
     team = team_of(run.asked, partial(act, modules))
-    log = Log(run, {**SETTINGS, "cells": CELLS, "reward_scale": REWARD_SCALE, "log_std": LOG_STD})
+    log = Log(
+        run, {"greenhouses": GREENHOUSES, **SETTINGS, "cells": CELLS, "reward_scale": REWARD_SCALE, "log_std": LOG_STD}
+    )
     log.judge(0, team)
     size = SETTINGS["train_batch_size_per_learner"]
     batches = -(-run.budget // size)  # whole ones: the last may go beyond the budget

@@ -13,7 +13,7 @@ and one call of the networks decides for all of them.
 
 Learning is, as far as the libraries allow, the same as in ``sb3``:
 
-- Actions are normal variables squashed by the hyperbolic tangent (``TanhNormal``); their deviation begins with 0.37.
+- Actions are normal variables, clipped to [-1, 1] and rescaled; their deviation begins with 0.37.
 - Rewards are divided by 20, about the deviation of returns.
 """
 
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
-from torchrl.modules import MLP, MultiAgentMLP, ProbabilisticActor, TanhNormal
+from torchrl.modules import MLP, IndependentNormal, MultiAgentMLP, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
 from simenv_marl import SimulationParallelEnv, parallel_env
@@ -111,7 +111,7 @@ class Greenhouses:
             day = self._stacked(self._seen)
             with torch.no_grad():
                 actor(day)
-            actions = day["agents", "action"].numpy()
+            actions = rescaled(day["agents", "action"])
             played = [self._play(each, own) for each, own in zip(self._environments, actions, strict=True)]
             day["next"] = self._stacked([seen for seen, *_ in played])
             for number, name in enumerate(("reward", "terminated", "done"), 1):
@@ -154,7 +154,7 @@ class Networks:
     """What learns.
 
     Attributes:
-        means: From observations, ``(..., 2, 6)``, to what becomes actions by squashing, ``(..., 2, 1)``.
+        means: From observations, ``(..., 2, 6)``, to what becomes actions by rescaling, ``(..., 2, 1)``.
         actor: The same as distributions of actions, in TorchRL's terms.
         critic: What it is going to be worth, ``(..., 2, 1)``.
     """
@@ -183,8 +183,7 @@ class Networks:
             TensorDictModule(nn.Sequential(means, deviation), [observation], [loc, scale]),
             in_keys={"loc": loc, "scale": scale},
             out_keys=[action],
-            distribution_class=TanhNormal,
-            distribution_kwargs={"low": 0.0, "high": 1.0},
+            distribution_class=IndependentNormal,
             return_log_prob=True,
             log_prob_key=log_prob,
         )
@@ -194,7 +193,12 @@ class Networks:
         """What the agents do, without exploring: both are asked when the day begins, and observe the same."""
         with torch.no_grad():
             means = self.means(torch.from_numpy(observation).expand(2, -1)).reshape(2)
-        return np.asarray((torch.tanh(means) + 1) / 2, np.float32)
+        return rescaled(means)
+
+
+def rescaled(actions: torch.Tensor) -> NDArray[np.float32]:
+    """Clip actions to [-1, 1], and rescale them to [0, 1]."""
+    return np.asarray((actions.clamp(-1, 1) + 1) / 2, np.float32)
 
 
 # -- learning -------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 import importlib
 import json
+import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from simenv_marl import simulate
 pytestmark = pytest.mark.filterwarnings("default")  # learners warn of much that is theirs
 
 NEEDS = {"sb3": "stable_baselines3", "torchrl": "torchrl", "rllib": "ray"}
-QUESTIONS = {"sb3": ["1", "2", "3", "5a", "5b", "5c"], "torchrl": ["4a", "4b", "3"], "rllib": ["4a"]}
+QUESTIONS = {"sb3": ["1", "2", "3", "5a", "5b", "5c"], "torchrl": ["4a", "4b"], "rllib": ["4a"]}
 
 
 def script(library):
@@ -34,22 +36,34 @@ def carry_out(library, out, *, questions, seed=3, budget=1024):
     ])  # fmt: skip
 
 
+def policy(out, library, question):
+    """The path of what can be loaded."""
+    return next(path for path in out.glob(f"{library}-{question}-3*") if path.suffix != ".json")
+
+
 def found(out, name):
     run = json.loads((out / f"{name}.json").read_text())
     del run["seconds"]
     return run
 
 
-@pytest.fixture(params=NEEDS)
+@pytest.fixture(scope="module", params=NEEDS)
 def library(request):
     script(request.param)
     return request.param
 
 
+@pytest.fixture(scope="module")
+def runs(library, tmp_path_factory):
+    out = tmp_path_factory.mktemp(library)
+    carry_out(library, out, questions=QUESTIONS[library])
+    return out
+
+
 @pytest.fixture
-def made(library, tmp_path):
-    carry_out(library, tmp_path, questions=QUESTIONS[library])
-    return tmp_path
+def made(runs, tmp_path):
+    """All runs of a library, for a test to do with as it likes."""
+    return shutil.copytree(runs, tmp_path / "runs")
 
 
 def act(observation):
@@ -148,7 +162,7 @@ def test_runs_are_the_same_in_several_processes(tmp_path):
 
 def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library, made):
     question = QUESTIONS[library][-1]
-    _, team = back_in_the_model.load(next(made.glob(f"{library}-{question}-3*[!n]")))
+    _, team = back_in_the_model.load(policy(made, library, question))
     greenhouse = simulate(back_in_the_model.GreenhouseSim, team, seed=11).greenhouse
     played = play(raw_env(), team, 11)
     assert greenhouse.water_use == pytest.approx(sum(played.poured))
@@ -157,11 +171,11 @@ def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library
 
 def test_it_is_told_beside_what_the_rules_do(library, made, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
-    policy = next(path for path in made.glob(f"{library}-{QUESTIONS[library][0]}-3*") if path.suffix != ".json")
-    back_in_the_model.main([str(policy), "--greenhouses", "2"])
+    path = policy(made, library, QUESTIONS[library][0])
+    back_in_the_model.main([str(path), "--greenhouses", "2"])
     told = capsys.readouterr().out
     assert told.count("the rules") == 2
-    assert told.count(policy.stem) == 2
+    assert told.count(path.stem) == 2
 
 
 def test_policies_that_cannot_be_loaded_say_why(tmp_path, monkeypatch):
@@ -170,7 +184,7 @@ def test_policies_that_cannot_be_loaded_say_why(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"experiment\.sb3 learns it"):
         back_in_the_model.load(tmp_path / "sb3-1-0.zip")
     (tmp_path / "sb3-1-0.zip").touch()
-    monkeypatch.setitem(importlib.import_module("sys").modules, "examples.greenhouse_coop.experiment.sb3", None)
+    monkeypatch.setitem(sys.modules, "examples.greenhouse_coop.experiment.sb3", None)
     with pytest.raises(SystemExit, match="needs stable-baselines3, which this Python has not"):
         back_in_the_model.load(tmp_path / "sb3-1-0.zip")
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
+from torchrl.envs import ExplorationType
 from torchrl.modules import MLP, IndependentNormal, MultiAgentMLP, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
@@ -184,6 +185,7 @@ class Networks:
             in_keys={"loc": loc, "scale": scale},
             out_keys=[action],
             distribution_class=IndependentNormal,
+            default_interaction_type=ExplorationType.RANDOM,  # outside of TorchRL's collectors it would be the mean
             return_log_prob=True,
             log_prob_key=log_prob,
         )

@@ -139,7 +139,7 @@ def table(finals: pd.DataFrame) -> str:
                 (
                     title(library, question),
                     name(library, question),
-                    f"{days:,}" if days else "",
+                    "" if not days else f"at most {days:,}" if library == "baselines" else f"{days:,}",
                     str(len(runs)),
                     f"{median:.1f}",
                     f"{low:.1f} to {high:.1f}",
@@ -184,7 +184,8 @@ def draw_curves(curves: pd.DataFrame, finals: pd.DataFrame, path: Path) -> None:
         axes.set_xlabel("days simulated", fontsize=9)
         axes.xaxis.set_major_formatter(lambda days, _: f"{days:,.0f}")
         axes.set_xlim(0, None)
-        axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(0, 0.64))
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=8, frameon=False, loc="center right", bbox_to_anchor=(1, 0.36))
         _tidy(axes, "y")
     left.set_ylabel("return of the team: median and quartiles over seeds", fontsize=9)
     _save(figure, path)
@@ -197,29 +198,44 @@ def _draw_lines(axes: Axes, finals: pd.DataFrame) -> None:
         if not runs.empty:
             median = runs.value.median()
             axes.axhline(median, color=colour, linewidth=1.1, linestyle=(0, (4, 3)))
-            axes.annotate(label, (1, median), (-3, 2), "axes fraction", ha="right", fontsize=7.5, color=colour)
+            place: Any = ("axes fraction", "data")
+            axes.annotate(
+                label, (1, median), (0, 2), place, textcoords="offset points", ha="right", fontsize=7.5, color=colour
+            )
 
 
 def draw_finals(finals: pd.DataFrame, path: Path) -> None:
     """Draw what came out: a dot for each seed, a stroke for the median, and a bar between quartiles."""
     groups = list(finals.groupby(["library", "question"], sort=False))
     groups.sort(key=lambda group: _place(group[0][0], group[0][1], group[1].value.median()), reverse=True)
-    figure = Figure(figsize=(10, 0.8 + 0.34 * len(groups)), layout="constrained")
+    figure = Figure(figsize=(12, 0.8 + 0.34 * len(groups)), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    for row, ((library, _), runs) in enumerate(groups):
-        colour = "#8c8c8c" if library == "baselines" else "#1b6f5f"
-        low, median, high = runs.value.quantile([0.25, 0.5, 0.75])
-        axes.barh(row, high - low, left=low, height=0.56, color=colour, alpha=0.3)
-        axes.plot([median, median], [row - 0.33, row + 0.33], color=colour, linewidth=2)
-        axes.scatter(runs.value, [row] * len(runs), s=13, color=INK, alpha=0.6, linewidths=0, zorder=3)
-        axes.annotate(
-            f"{median:.1f}", (1, row), (4, 0), ("axes fraction", "data"), textcoords="offset points", va="center"
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.6))
+    for axes in (left, right):
+        for row, ((library, _), runs) in enumerate(groups):
+            colour = "#8c8c8c" if library == "baselines" else "#1b6f5f"
+            low, median, high = runs.value.quantile([0.25, 0.5, 0.75])
+            axes.barh(row, high - low, left=low, height=0.56, color=colour, alpha=0.3)
+            axes.plot([median, median], [row - 0.33, row + 0.33], color=colour, linewidth=2)
+            axes.scatter(runs.value, [row] * len(runs), s=13, color=INK, alpha=0.6, linewidths=0, zorder=3)
+        axes.set_xlabel("return of the team", fontsize=9)
+        _tidy(axes, "x")
+    most = finals.value.max()
+    left.set_xlim(min(0.0, finals.value.min()) - 1, most + 3)
+    right.set_xlim(0.75 * most, 1.01 * most)
+    for row, (_, runs) in enumerate(groups):
+        right.annotate(
+            f"{runs.value.median():.1f}",
+            (1, row),
+            (4, 0),
+            ("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            color=INK,
         )
-    labels = [f"{title(*key)}  {name(*key)}".rstrip() for key, _ in groups]
-    axes.set_yticks(range(len(groups)), labels)
-    axes.set_xlabel("return of the team on 32 greenhouses that nobody was trained on", fontsize=9)
-    _tidy(axes, "x")
+    left.set_yticks(range(len(groups)), [f"{title(*key)}  {name(*key)}".rstrip() for key, _ in groups])
+    left.set_title("Greenhouses nobody was trained on", loc="left", fontsize=11)
+    right.set_title("The same, from three quarters of the best return on", loc="left", fontsize=11)
     _save(figure, path)
 
 

@@ -52,7 +52,7 @@ def played(env, policies, seed):
         if action is None:
             last[agent] = observation
             if rows[agent]:
-                rows[agent][-1] |= {"terminated": terminated, "truncated": truncated}
+                rows[agent][-1] |= {"terminated": terminated, "truncated": truncated, "turn of the end": turn}
             continue
         rows[agent].append(
             {
@@ -83,6 +83,8 @@ def check(found, episodes):
             assert found.starts[trajectory] == row
             assert found.lengths[trajectory] == len(rows)
             assert np.array_equal(found.last_observations[trajectory], last[agent])
+            assert found.last_turns[trajectory] == rows[-1]["turn of the end"]
+            assert found.returns[trajectory] == pytest.approx(sum(row["reward"] for row in rows))
             for step, expected in enumerate(rows):
                 assert found.names[found.agents[row]] == agent
                 assert found.episodes[row] == number
@@ -239,6 +241,8 @@ def test_shapes_and_dtypes():
         "by_rule": ((6,), np.bool_),
         "starts": ((3,), np.int64),
         "lengths": ((3,), np.int64),
+        "last_turns": ((3,), np.int64),
+        "returns": ((3,), np.float64),
     }
     for name, (shape, dtype) in shapes.items():
         array = getattr(found, name)

@@ -44,6 +44,8 @@ class Trajectories:
         truncations: ``(N,)`` bool: whether it was the agent's last one, and its episode then was truncated.
         last_observations: ``(M, *shape)``: what each trajectory has come to, to value what is still to come where it
             was truncated.
+        last_turns: ``(M,)`` int64: how many decisions the episode had seen when the trajectory ended, in the numbers of
+            ``turns``.
         starts: ``(M,)`` int64: in which row each trajectory begins.
         episodes: ``(N,)`` int64: the number of the episode, which is the place of its seed among the seeds.
         seeds: The seeds of all episodes: row i is of ``seeds[episodes[i]]``.
@@ -66,6 +68,7 @@ class Trajectories:
     terminations: NDArray[np.bool_]
     truncations: NDArray[np.bool_]
     last_observations: Any
+    last_turns: NDArray[np.int64]
     starts: NDArray[np.int64]
     episodes: NDArray[np.int64]
     seeds: tuple[int, ...]
@@ -95,6 +98,11 @@ class Trajectories:
         return np.diff(self.starts, append=len(self))
 
     @cached_property
+    def returns(self) -> NDArray[np.float64]:
+        """``(M,)`` float64: the sum of the rewards of each trajectory, none of them discounted."""
+        return np.add.reduceat(self.rewards, self.starts) if len(self) else np.zeros(0)
+
+    @cached_property
     def next_observations(self) -> Any:
         """``(N, *shape)``: what the agent observed next, at its next decision or its end."""
         if not len(self):
@@ -122,8 +130,8 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
 
     _check_extras([part.extras for _, part in filled])
     same = (
-        "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "steps", "turns",
-        "by_rule", "action_masks", "times", "elapsed",
+        "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "last_turns", "steps",
+        "turns", "by_rule", "action_masks", "times", "elapsed",
     )  # fmt: skip
     return Trajectories(
         **{name: together(name) for name in same},
@@ -169,6 +177,7 @@ class _Page:
         self.names: list[str] = []
         self.last_rows: list[int] = []
         self.last_observations: list[Any] = []
+        self.last_turns: list[int] = []
         self.terminated: list[bool] = []
         self.truncated: list[bool] = []
 
@@ -180,6 +189,7 @@ class _Page:
         self.names.append(record.agent)
         self.last_rows.append(-1)
         self.last_observations.append(None)
+        self.last_turns.append(-1)
         self.terminated.append(False)
         self.truncated.append(False)
         return len(self.names) - 1
@@ -244,13 +254,13 @@ class Ledger:
                 page.elapsed[record.row] = record.info["elapsed"]
         if episode.parting:
             for record in episode.parting:
-                self._close(record, terminated=True, truncated=False)
+                self._close(record, episode.turns, terminated=True, truncated=False)
             episode.parting = []
         if episode.over:
             for record in episode.agents.values():
-                self._close(record, terminated=episode.terminated, truncated=episode.truncated)
+                self._close(record, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
-    def _close(self, record: Any, *, terminated: bool, truncated: bool) -> None:
+    def _close(self, record: Any, turns: int, *, terminated: bool, truncated: bool) -> None:
         if record.row < 0:  # it has never decided
             return
         page, trajectory = record.group.book, record.trajectory
@@ -258,6 +268,7 @@ class Ledger:
         page.elapsed[record.row] = record.info.get("elapsed", nan)
         page.last_rows[trajectory] = record.row
         page.last_observations[trajectory] = record.observation
+        page.last_turns[trajectory] = turns
         page.terminated[trajectory], page.truncated[trajectory] = terminated, truncated
 
     # -- afterwards -------------------------------------------------------------------------------
@@ -332,6 +343,7 @@ class _Sorted:
             observations=taken(self.observations, rows),
             actions=taken(self.actions, rows),
             last_observations=page.stack([page.last_observations[trajectory] for trajectory in trajectories]),
+            last_turns=np.array(page.last_turns, np.int64)[trajectories],
             starts=np.flatnonzero(steps == 0),
             episodes=self.episodes[self.trajectory[rows]],
             seeds=seeds,
@@ -366,6 +378,7 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
         terminations=np.zeros(0, np.bool_),
         truncations=np.zeros(0, np.bool_),
         last_observations=observations,
+        last_turns=none,
         starts=none,
         episodes=none,
         seeds=seeds,

@@ -34,6 +34,7 @@ The layers, each importing only from those above it::
     _ledger       what learners want to know of many episodes
     _spread       work that is spread over processes by joblib
     many          the public functions for many simulations at once
+    plots         pictures of what they have found
     envs          views: an episode read as a PettingZoo or Gymnasium environment
     branching     exact continuations of an episode that is going on
     registration  into the registries of Gymnasium and PettingZoo
@@ -61,6 +62,7 @@ from .envs import (
 )
 from .errors import *  # noqa: F403 - the whole tree is public
 from .many import Trajectories, collect_episodes, simulate_many
+from .plots import plot_returns, plot_timeline
 from .plugins import (
     attach_handler,
     attached_handlers,
@@ -108,6 +110,8 @@ __all__ = [
     "joint_env",
     "make_step",
     "parallel_env",
+    "plot_returns",
+    "plot_timeline",
     "provenance",
     "register_simulation",
     "remove_handler",

@@ -216,11 +216,10 @@ def _rows(parts: Mapping[Any, Trajectories], arrays: Mapping[Any, Sequence[NDArr
                 at, end = times[own], float(times[own.stop - 1] + elapsed[own.stop - 1])
             actions = [array[own] for array in arrays[key]]
             rows.append(_Row(key, found.names[found.agents[start]], found, own, actions, at, end))
-    # Of whom the model has let go before the last reward was known, nobody knows when that was.
-    latest = max(max(float(row.at[-1]), row.end if row.end == row.end else 0.0) for row in rows)
+    # Of whom the model has let go before the last reward was known, nobody knows when that was: as usual, then.
     gaps = np.concatenate([np.diff(row.at) for row in rows])
     gap = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
-    return [row if row.end == row.end else replace(row, end=min(float(row.at[-1]) + gap, latest)) for row in rows]
+    return [row if row.end == row.end else replace(row, end=float(row.at[-1]) + gap) for row in rows]
 
 
 def _clock(found: Trajectories) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -581,6 +580,7 @@ def _along(timed: bool) -> str:
 
 def _legend(axes: Axes, rows: Sequence[_Row], *, charts: bool) -> None:
     """Say what marks mean, above the first axes, as far as there are such."""
+    from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
     ruled = any(row.found.by_rule[row.rows].any() for row in rows)
@@ -596,19 +596,21 @@ def _legend(axes: Axes, rows: Sequence[_Row], *, charts: bool) -> None:
         if any(_ends(row)[place][1] for row in rows):
             marks.append(Line2D([], [], marker=marker, color=INK, linewidth=0, markersize=6, label=text))
     if marks:
-        axes.add_artist(
-            axes.legend(
-                handles=marks,
-                loc="lower right",
-                bbox_to_anchor=(1.0, 1.0),
-                ncols=len(marks),
-                fontsize=8.5,
-                frameon=False,
-                handletextpad=0.1,
-                columnspacing=1.2,
-                borderaxespad=0.2,
-            )
+        legend = Legend(  # beside one that the axes may have
+            axes,
+            marks,
+            [str(mark.get_label()) for mark in marks],
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            bbox_transform=axes.transAxes,
+            ncols=len(marks),
+            fontsize=8.5,
+            frameon=False,
+            handletextpad=0.1,
+            columnspacing=1.2,
+            borderaxespad=0.2,
         )
+        axes.add_artist(legend)
 
 
 def _tidy(axes: Any) -> None:

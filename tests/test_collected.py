@@ -253,6 +253,38 @@ def test_shapes_and_dtypes():
     assert "6 decisions" in repr(found)
 
 
+def test_policies_can_tell_decisions_apart():
+    ant = decision(agent="ant_0")
+    bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 1)
+
+    def policy(observations, infos, identities):
+        assert len(observations) == len(infos) == len(identities)
+        return [RULE] * len(identities), {
+            "seeds": [seed for seed, _ in identities],
+            "turns": [t for _, t in identities],
+        }
+
+    def optional(observations, infos, identities=None):
+        assert identities is None
+        return [RULE] * len(observations)
+
+    for size in (1, 3):
+        found = collect_episodes(calling(ant, bee, ant), {ant: policy, bee: optional}, seeds=[7, 5, 9], batch_size=size)
+        own = found[ant]
+        assert own.extras["seeds"].tolist() == [own.seeds[episode] for episode in own.episodes] == [7, 7, 5, 5, 9, 9]
+        assert own.extras["turns"].tolist() == own.turns.tolist() == [0, 2] * 3
+
+
+def test_spaces_are_those_of_the_decision_point():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", action_space=spaces.Discrete(3))
+    found = collect_episodes(calling(ant), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
+    assert found[ant].action_space == spaces.Discrete(10)
+    assert found[bee].action_space == spaces.Discrete(3)  # which has never decided
+    assert found[ant].observation_space.shape == (2,)
+    unborn = collect_episodes(script(lambda s: None), {"being_3": ones}, points=beings(), seeds=[1])
+    assert unborn["being_3"].action_space is None
+
+
 def test_composite_spaces():
     ant = decision(
         agent="ant_0",

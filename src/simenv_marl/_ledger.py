@@ -13,6 +13,7 @@ from math import nan
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ._batches import Asking, Entry, Group, Waiting
@@ -59,6 +60,8 @@ class Trajectories:
         elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
             its end; nan where the model has let go of the agent before. None where there is no clock.
         extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
+        observation_space, action_space: Of the decision point. None where nobody has decided, and it is not known at
+            which point they would have.
     """
 
     _: KW_ONLY
@@ -81,6 +84,8 @@ class Trajectories:
     times: NDArray[np.float64] | None = None
     elapsed: NDArray[np.float64] | None = None
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    observation_space: spaces.Space[Any] | None = None
+    action_space: spaces.Space[Any] | None = None
 
     def __len__(self) -> int:
         """N, the number of decisions."""
@@ -141,6 +146,8 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
         agents=np.concatenate([np.array([codes[name] for name in part.names])[part.agents] for _, part in filled]),
         names=tuple(codes),
         extras={name: joined([part.extras[name] for _, part in filled]) for name in filled[0][1].extras},
+        observation_space=filled[0][1].observation_space,
+        action_space=filled[0][1].action_space,
     )
 
 
@@ -352,6 +359,8 @@ class _Sorted:
             steps=steps,
             action_masks=None if self.masks is None else taken(self.masks, rows),
             extras=taken(self.extras, rows),
+            observation_space=page.binding.definition.observation_space,
+            action_space=page.binding.definition.action_space,
             **{name: array[rows] for name, array in self.numbers.items()},
         )
 
@@ -387,6 +396,8 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
         steps=none,
         turns=none,
         by_rule=np.zeros(0, np.bool_),
+        observation_space=None if definition is None else definition.observation_space,
+        action_space=None if definition is None else definition.action_space,
     )
 
 

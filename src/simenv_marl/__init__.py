@@ -34,6 +34,7 @@ The layers, each importing only from those above it::
     _ledger       what learners want to know of many episodes
     _spread       work that is spread over processes by joblib
     many          the public functions for many simulations at once
+    demonstrations data sets of who has decided what; comparisons with the rule
     plots         pictures of what they have found
     envs          views: an episode read as a PettingZoo or Gymnasium environment
     branching     exact continuations of an episode that is going on
@@ -47,6 +48,7 @@ from ._handlers import Call, ChangedArgs, ChangedResult
 from ._provenance import provenance
 from .branching import branch
 from .decision import Definition, difference, make_step
+from .demonstrations import Comparison, Mixture, compare_with_rule, record_dataset, save_dataset
 from .envs import (
     SimulationAECEnv,
     SimulationEnv,
@@ -86,7 +88,9 @@ __all__ = [
     "Call",
     "ChangedArgs",
     "ChangedResult",
+    "Comparison",
     "Definition",
+    "Mixture",
     "SimulationAECEnv",
     "SimulationEnv",
     "SimulationInterface",
@@ -100,6 +104,7 @@ __all__ = [
     "attached_handlers",
     "branch",
     "collect_episodes",
+    "compare_with_rule",
     "decision_points",
     "difference",
     "errors",
@@ -113,8 +118,10 @@ __all__ = [
     "plot_returns",
     "plot_timeline",
     "provenance",
+    "record_dataset",
     "register_simulation",
     "remove_handler",
+    "save_dataset",
     "simulate",
     "simulate_many",
     "single_env",

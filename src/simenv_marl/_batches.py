@@ -54,6 +54,12 @@ class Asked:
     def __repr__(self) -> str:
         return f"the policy of {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
 
+    def answers(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
+        """What the policy returns, given as much as it takes."""
+        if self.identifying:
+            return self.policy(observations, infos, identities)
+        return self.policy(observations, infos)
+
     def group(self, binding: Binding) -> Group:
         """The group of the decisions at a point."""
         group = next((group for group in self.groups if group.takes(binding)), None)
@@ -166,12 +172,9 @@ class Group:
                 record: Any = episode.pending
                 infos.append(record.info)
                 record.info = {}  # what a policy does to its own is not to be seen at the next decision
-        policy = asked.policy
         try:
-            if asked.identifying:
-                answers = policy(observations, infos, [(episode.seed, episode.turns) for episode in waiting])
-            else:
-                answers = policy(observations, infos)
+            identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
+            answers = asked.answers(observations, infos, identities)
             extras: Mapping[str, Any] = {}
             if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
                 answers, extras = answers

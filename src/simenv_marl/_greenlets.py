@@ -101,6 +101,8 @@ class GreenletDriver(Watchful):
         if get_loop is not None and (loop is not None or get_loop() is not None):
             self._enter_loop(loop)
         if reply is RULE:
+            if binding.by_rule is not None:
+                return binding.by_rule(point, args, kwargs)
             return point.rule(*args, **kwargs) if kwargs else point.rule(*args)
         deliver = binding.deliver
         return reply if deliver is None else deliver(reply, *args, **kwargs)

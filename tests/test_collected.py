@@ -169,7 +169,9 @@ def test_agents_under_their_own_keys():
     points = beings(observation_space_mapping=lambda being: [being.number, 0], removed_by=())
     policies = {Being.act: ones, "being_1": lambda observations: [2] * len(observations), "being_2": RULE}
     found = collect_episodes(script(main), policies, points=points, seeds=[3, 4])
-    assert list(found) == [Being.act, "being_1"]
+    assert list(found) == [Being.act, "being_1", "being_2"]
+    assert found["being_2"].by_rule.tolist() == [True] * 2
+    assert found["being_2"].observations.tolist() == [[2, 0]] * 2
     assert found["being_1"].names == ("being_1",)
     assert found["being_1"].actions.tolist() == [2] * 4
     assert found["being_1"].seeds == (3, 4)

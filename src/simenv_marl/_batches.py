@@ -256,7 +256,7 @@ class Unrewarded(Asking):
             return super()._consult(record, args, kwargs)
         record.observe(args, kwargs)
         binding = record.binding
-        if self.clock is None and binding.legal is None and binding.point.alone:
+        if self.clock is None and binding.legal is None and binding.point.alone and not binding.tells:
             record.swift = binding.agent is not None
             self._swift[binding] = record if record.swift else NAMED_AT_CALL
         self.pending = record

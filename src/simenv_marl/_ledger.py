@@ -38,8 +38,9 @@ class Trajectories:
 
     Attributes:
         observations: ``(N, *shape)``, in the dtype of the observation space: what was decided on.
-        actions: ``(N, *shape)``, in the dtype of the action space: what was decided; zero where it was left to
-            the rule.
+        actions: ``(N, *shape)``, in the dtype of the action space: what was decided. Where it was left to the rule, the
+            action that the rule's decision corresponds to, by ``rule_action_mapping`` or, without one, by ``choices``
+            or a dict ``action_space_mapping``; zero where that is not known.
         rewards: ``(N,)`` float64: of that action, as an AEC environment has it.
         terminations: ``(N,)`` bool: whether it was the agent's last one, and its episode then ended.
         truncations: ``(N,)`` bool: whether it was the agent's last one, and its episode then was truncated.
@@ -55,6 +56,7 @@ class Trajectories:
         steps: ``(N,)`` int64: the number of the decision in its trajectory, from 0.
         turns: ``(N,)`` int64: its number among those of all agents of all policies in the episode, from 0.
         by_rule: ``(N,)`` bool: whether the policy has left it to the model's rule.
+        known: ``(N,)`` bool: whether ``actions`` has what was decided.
         action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such: the legal actions. None where all are.
         times: ``(N,)`` float64: the simulation's time at the decision. None where it has no clock.
         elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
@@ -80,6 +82,7 @@ class Trajectories:
     steps: NDArray[np.int64]
     turns: NDArray[np.int64]
     by_rule: NDArray[np.bool_]
+    known: NDArray[np.bool_]
     action_masks: Any = None
     times: NDArray[np.float64] | None = None
     elapsed: NDArray[np.float64] | None = None
@@ -136,7 +139,7 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
     _check_extras([part.extras for _, part in filled])
     same = (
         "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "last_turns", "steps",
-        "turns", "by_rule", "action_masks", "times", "elapsed",
+        "turns", "by_rule", "known", "action_masks", "times", "elapsed",
     )  # fmt: skip
     return Trajectories(
         **{name: together(name) for name in same},
@@ -174,6 +177,7 @@ class _Page:
         self.steps: list[int] = []
         self.turns: list[int] = []
         self.by_rule: list[bool] = []
+        self.rule_actions: dict[int, Any] = {}  # by row, as far as they are known
         self.times: list[float] = []
         self.rewards: list[float] = []
         self.elapsed: list[float] = []
@@ -200,6 +204,20 @@ class _Page:
         self.terminated.append(False)
         self.truncated.append(False)
         return len(self.names) - 1
+
+    def learn(self, record: Waiting) -> None:
+        """Note which action the rule's decision has corresponded to."""
+        self.rule_actions[record.row], record.rule_action = record.rule_action, None
+
+    def all_actions(self) -> Any:
+        """What was decided, in all rows."""
+        actions = joined(self.actions)
+        if not self.rule_actions:
+            return actions
+        rows = np.arange(len(self.rewards))
+        places = list(self.rule_actions)
+        rows[places] = len(rows) + np.arange(len(places))
+        return taken(joined([actions, self.stack_actions(list(self.rule_actions.values()))]), rows)
 
 
 class Ledger:
@@ -257,6 +275,8 @@ class Ledger:
         if record is not None and record.row >= 0:
             page = record.group.book
             page.rewards[record.row] = record.reward
+            if record.rule_action is not None:
+                page.learn(record)
             if "elapsed" in record.info:
                 page.elapsed[record.row] = record.info["elapsed"]
         if episode.parting:
@@ -272,6 +292,8 @@ class Ledger:
             return
         page, trajectory = record.group.book, record.trajectory
         page.rewards[record.row] = record.reward
+        if record.rule_action is not None:
+            page.learn(record)
         page.elapsed[record.row] = record.info.get("elapsed", nan)
         page.last_rows[trajectory] = record.row
         page.last_observations[trajectory] = record.observation
@@ -321,14 +343,16 @@ class _Sorted:
         self.ranks[order] = np.arange(len(order))
         self.rows = np.lexsort((self.steps, self.ranks[self.trajectory]))
         self.trajectories = order
-        self.observations, self.actions = joined(page.observations), joined(page.actions)
+        self.observations, self.actions = joined(page.observations), page.all_actions()
         self.masks = joined(page.masks) if page.masks else None
         self.extras = {name: joined([extras[name] for extras in page.extras]) for name in page.extras[0]}
         self.numbers = {
             "rewards": np.array(page.rewards, np.float64),
             "turns": np.array(page.turns, np.int64),
             "by_rule": np.array(page.by_rule, np.bool_),
+            "known": ~np.array(page.by_rule, np.bool_),
         }
+        self.numbers["known"][np.array(list(page.rule_actions), np.int64)] = True
         if page.times:
             self.numbers["times"] = np.array(page.times, np.float64)
             self.numbers["elapsed"] = np.array(page.elapsed, np.float64)
@@ -376,7 +400,7 @@ def _check_extras(extras: Sequence[Mapping[str, Any]]) -> None:
 
 def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
     """What there is to know of a policy that was never asked."""
-    binding = next((b for b in plan.bindings.values() if isinstance(b, Binding) and _answers(plan, b, place)), None)
+    binding = next((b for b in plan.bindings.values() if isinstance(b, Binding) and answers(plan, b, place)), None)
     definition = None if binding is None else binding.definition
     none = np.zeros(0, np.int64)
     observations = np.zeros(0) if definition is None else empty(definition.observation_space)
@@ -396,11 +420,13 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
         steps=none,
         turns=none,
         by_rule=np.zeros(0, np.bool_),
+        known=np.zeros(0, np.bool_),
         observation_space=None if definition is None else definition.observation_space,
         action_space=None if definition is None else definition.action_space,
     )
 
 
-def _answers(plan: Plan, binding: Binding, place: int) -> bool:
+def answers(plan: Plan, binding: Binding, place: int) -> bool:
+    """Whether it is known beforehand that a policy, by its place, answers at a decision point."""
     policy = binding.policy if binding.agent is None else plan.policies.get(binding.agent, binding.policy)
     return isinstance(policy, Entry) and policy.place == place

@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._batches import Asked
-from ._ledger import Trajectories
+from ._bindings import Binding
+from ._ledger import Trajectories, answers
 from ._provenance import provenance
 from ._stacks import joined, rows, stacker, taken
 from .errors import DefinitionError, InvalidActionError, MissingExtraError, OptionValueError
-from .many import collect_episodes
+from .many import collect_episodes, learners_plan
 from .simulation import RULE
 
 __all__ = ["Comparison", "Mixture", "compare_with_rule", "record_dataset", "save_dataset"]
@@ -85,10 +86,10 @@ class Mixture:
             if asked is None or not len(own):
                 continue
             where = own.tolist()
-            answers = asked.answers(
+            returned = asked.answers(
                 taken(observations, own), [infos[row] for row in where], [identities[row] for row in where]
             )
-            for row, action in zip(where, _rows(answers, len(where), self.policies[number]), strict=True):
+            for row, action in zip(where, _rows(returned, len(where), self.policies[number]), strict=True):
                 actions[row] = action
         return actions, {"component": component}
 
@@ -108,14 +109,14 @@ def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return state ^ (state >> np.uint64(31))
 
 
-def _rows(answers: Any, number: int, policy: Any) -> list[Any]:
-    """What a policy has answered to so many decisions, without its extras."""
-    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
-        answers = answers[0]
-    actions = [RULE] * number if answers is RULE else rows(answers, integers=False)
+def _rows(returned: Any, number: int, policy: Any) -> list[Any]:
+    """What a policy has decided of so many decisions, without its extras."""
+    if type(returned) is tuple and len(returned) == 2 and isinstance(returned[1], Mapping):
+        returned = returned[0]
+    actions = [RULE] * number if returned is RULE else rows(returned, integers=False)
     if actions is None or len(actions) != number:
-        returned = repr(answers) if actions is None else f"{len(actions)} actions"
-        raise InvalidActionError(f"{policy!r} was asked for {number} decisions at once and has returned {returned}")
+        what = repr(returned) if actions is None else f"{len(actions)} actions"
+        raise InvalidActionError(f"{policy!r} was asked for {number} decisions at once and has returned {what}")
     return actions
 
 
@@ -401,7 +402,8 @@ def compare_with_rule(
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
         raise OptionValueError(f"tolerance must be a number that is not negative, not {tolerance!r}")
     by_rule = dict.fromkeys(policies, RULE)
-    _check_knowable(simulation, by_rule, by_rule, points, {})
+    checked = {name: value for name, value in options.items() if name not in ("batch_size", "workers", "progress")}
+    _check_knowable(simulation, by_rule, by_rule, points, checked)
     asked = {id(policy): _Onlooker(policy) for policy in policies.values()}
     onlookers = {key: asked[id(policy)] for key, policy in policies.items()}
     collected = collect_episodes(simulation, onlookers, seeds=seeds, points=points, **options)
@@ -416,10 +418,10 @@ class _Onlooker:
         self.asked = Asked(policy)
 
     def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
-        answers = _rows(self.asked.answers(observations, infos, identities), len(identities), self.policy)
-        noted = np.empty(len(answers), object)
-        for place, answer in enumerate(answers):
-            noted[place] = answer
+        noted = np.empty(len(identities), object)
+        returned = self.asked.answers(observations, infos, identities)
+        for place, action in enumerate(_rows(returned, len(identities), self.policy)):
+            noted[place] = action
         return RULE, {"noted": noted}
 
 
@@ -432,8 +434,8 @@ def _compared(found: Trajectories, tolerance: float) -> Comparison:
         return Comparison(found, found.actions, np.zeros(0, np.bool_))
     _check_known(found)
     assert found.action_space is not None
-    answers = [_row(found.actions, row) if answer is RULE else answer for row, answer in enumerate(noted)]
-    policy_actions = stacker(found.action_space)(answers)
+    actions = [_row(found.actions, row) if action is RULE else action for row, action in enumerate(noted)]
+    policy_actions = stacker(found.action_space)(actions)
     return Comparison(found, policy_actions, _agreeing(found.actions, policy_actions, tolerance))
 
 
@@ -468,12 +470,35 @@ def _everywhere(parts: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 
 def _check_knowable(
-    simulation: Any, policies: Mapping[Any, Any], keys: Iterable[Any], points: Any, options: Any
+    simulation: Any, policies: Mapping[Any, Any], keys: Iterable[Any], points: Any, options: Mapping[str, Any]
 ) -> None:
-    """Before anything runs: where the rule decides, it must be known which actions its decisions are."""
+    """Before anything runs: where the rule is going to decide, it must be known which actions its decisions are."""
+    plan, places = learners_plan(simulation, policies, points, options)
+    for key in keys:
+        if not _defers(policies[key]):
+            continue
+        for binding in plan.bindings.values():
+            if isinstance(binding, Binding) and binding.ruled is None and answers(plan, binding, places[key]):
+                raise DefinitionError(
+                    f"which action the rule of {binding.point.name} takes is not known; give its make_step a"
+                    " rule_action_mapping, from the rule's decision to the action that it corresponds to"
+                )
+
+
+def _defers(policy: Any) -> bool:
+    """Whether a policy is sure to leave decisions to the rule."""
+    if isinstance(policy, Mixture):
+        return any(_defers(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
+    return policy is RULE
 
 
 def _check_known(found: Trajectories) -> None:
-    """Afterwards the same, where policies have left decisions to the rule."""
-    if found.by_rule.any():
-        raise DefinitionError("unknown")
+    """Afterwards the same, for each decision that was left to the rule."""
+    unknown = np.flatnonzero(~found.known)
+    if len(unknown):
+        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
+        raise DefinitionError(
+            f"in {len(unknown)} of {len(found)} decisions it is not known which action the rule has taken, first in"
+            f" that of {agent!r} at turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point"
+            " needs a rule_action_mapping that returns an action for every decision of the rule"
+        )

@@ -13,6 +13,7 @@ from ._plan import Plan
 from ._session import checked_seed
 from ._spread import progress_bar, spread
 from .errors import OptionValueError
+from .simulation import RULE
 
 __all__ = ["Trajectories", "collect_episodes", "simulate_many"]
 
@@ -138,8 +139,9 @@ def collect_episodes(
 
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
-        policies: Who decides, as in ``simulate_many``. A policy may return a tuple of the actions and a dict of arrays
-            of shape ``(batch, ...)`` (log-probabilities, values), which become ``extras``; always of the same names.
+        policies: Who decides, as in ``simulate_many``; ``RULE`` is a policy like any other. A policy may return
+            a tuple of the actions and a dict of arrays of shape ``(batch, ...)`` (log-probabilities, values), which
+            become ``extras``; always of the same names.
         seeds: What the simulations are reset with, non-negative integers.
         points: The decision points, as ``generate_env`` takes them.
         batch_size: How many simulations may be suspended together; in each worker. No more than 256 of them are
@@ -150,8 +152,7 @@ def collect_episodes(
             ``possible_agents`` says.
 
     Returns:
-        By the keys of ``policies``, what those have lived through for whom each policy has answered; nothing for keys
-        whose policy is ``RULE``.
+        By the keys of ``policies``, what those have lived through for whom each policy has answered.
 
     Raises:
         OptionValueError: An argument cannot have its value, or the extras do not fit the decisions.
@@ -164,7 +165,7 @@ def collect_episodes(
     checked = _checked_seeds(seeds)
     _check_numbers(batch_size, workers)
     given = dict(_checked_policies(policies))
-    plan, keys = _learners_plan(simulation, given, points, options)
+    plan, keys = learners_plan(simulation, given, points, options)
     bar = progress_bar(len(checked)) if progress else None
     try:
         if not workers or not checked:
@@ -183,13 +184,17 @@ def collect_episodes(
     return {key: found[place] for key, place in keys.items()}
 
 
-def _learners_plan(
+def learners_plan(
     simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
 ) -> tuple[Plan, dict[Any, int]]:
     """The plan of the episodes, and the places of the policies by their keys."""
-    found = entries(policies)
+    found = entries({key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()})
     keys = {key: entry.place for key, entry in found.items() if isinstance(entry, Entry)}
     return Plan.draw_up(simulation, points, {**options, "policies": found}, unanswered=True, asked=Entry), keys
+
+
+def _left_to_the_rule(observations: Any) -> Any:
+    return RULE
 
 
 def _collect_part(
@@ -201,7 +206,7 @@ def _collect_part(
     seeds: list[int],
 ) -> dict[int, Trajectories]:
     """In a worker: play a part of the episodes."""
-    plan, keys = _learners_plan(simulation, policies, points, options)
+    plan, keys = learners_plan(simulation, policies, points, options)
     return _collect(plan, keys, batch_size, seeds, None)
 
 

@@ -185,7 +185,7 @@ def _panels(parts: Mapping[Any, Trajectories], episode: int, agents: Any, action
     leaves, arrays = {}, {}
     for key, found in parts.items():
         if (found.episodes == episode).any():
-            taken_apart = _taken_apart(found.actions, _decided(found), _namer(key, action_names))
+            taken_apart = _taken_apart(found.actions, found.known, _namer(key, action_names))
             leaves[key] = [leaf for leaf, _ in taken_apart]
             arrays[key] = [array for _, array in taken_apart]
     if not leaves:
@@ -289,13 +289,9 @@ def _title(key: Any) -> str:
     return "" if key is None else ".".join(str(getattr(key, "__qualname__", key)).split(".")[-2:])
 
 
-def _decided(found: Trajectories) -> NDArray[np.bool_]:
-    """Of which decisions it is known what they were."""
-    return ~found.by_rule
-
-
 def _known(row: _Row) -> NDArray[np.bool_]:
-    return _decided(row.found)[row.rows]
+    """Of which of its decisions it is known what they were."""
+    return row.found.known[row.rows]
 
 
 # -- few agents: charts ---------------------------------------------------------------------------

@@ -291,6 +291,19 @@ def test_comparisons_of_several_policies_and_of_nobody():
     assert np.isnan(found[bee].agreement)
 
 
+def test_others_may_decide_beside_the_rule():
+    ant, bee = decision(agent="ant_0", rule_action_mapping=lambda decided: 1), decision(agent="bee_0")
+    logs = []
+
+    def main(simulation):
+        logs.append([ant(), bee()])
+
+    found = compare_with_rule(script(main), {ant: twos}, others={bee: twos}, points=[ant, bee], seeds=[1])
+    assert logs == [["rule", 2]]
+    assert list(found) == [ant]
+    assert found[ant].policy_actions.tolist() == [2]
+
+
 def test_decisions_that_correspond_to_no_action():
     points = beings(rule_action_mapping=lambda decided, being: None if being.number == 2 else 1)
     with pytest.raises(DefinitionError, match=r"in 3 of 9 decisions .*'being_2' at turn 2 of the episode of seed 8"):
@@ -298,10 +311,18 @@ def test_decisions_that_correspond_to_no_action():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"policies": ones}, {"policies": {"ant_0": RULE}}, {"tolerance": -1}, {"tolerance": "1"}], ids=str
+    "wrong",
+    [
+        {"policies": ones},
+        {"policies": {"ant_0": RULE}},
+        {"tolerance": -1},
+        {"others": 3},
+        {"tolerance": "1"},
+    ],
+    ids=str,
 )
 def test_comparisons_that_cannot_be(wrong):
     ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 1)
     given = {"policies": {ant: ones}, "seeds": [1], **wrong}
-    with pytest.raises(OptionValueError, match=r"policies|tolerance"):
+    with pytest.raises(OptionValueError, match=r"policies|tolerance|others"):
         compare_with_rule(calling(ant), given.pop("policies"), **given)

@@ -371,13 +371,14 @@ def compare_with_rule(
     *,
     seeds: Iterable[int],
     points: Any = None,
+    others: Mapping[Any, Any] | None = None,
     tolerance: float = 0.0,
     **options: Any,
 ) -> dict[Any, Comparison]:
     """Let the model's own rule decide, and ask policies what they would have done instead.
 
     At each decision the policy sees what it would see if it decided; then the rule decides. So the episodes are those
-    of the plain model.
+    of the plain model, unless there are others.
 
     Args:
         simulation: As ``collect_episodes`` takes it.
@@ -385,6 +386,7 @@ def compare_with_rule(
             checks.
         seeds: What the simulations are reset with.
         points: The decision points, as ``generate_env`` takes them.
+        others: Who decides where no rule does, as ``collect_episodes`` takes policies. They are not compared.
         tolerance: By how much numbers in actions may differ for the two to agree; those of ``Box`` spaces of floats.
         **options: As ``collect_episodes`` takes them.
 
@@ -401,13 +403,15 @@ def compare_with_rule(
         raise OptionValueError(f"policies must be a dict from agents or points to callables, not {policies!r}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
         raise OptionValueError(f"tolerance must be a number that is not negative, not {tolerance!r}")
+    if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
+        raise OptionValueError(f"others must be a dict of policies for those who are not compared, not {others!r}")
     by_rule = dict.fromkeys(policies, RULE)
     checked = {name: value for name, value in options.items() if name not in ("batch_size", "workers", "progress")}
-    _check_knowable(simulation, by_rule, by_rule, points, checked)
+    _check_knowable(simulation, {**by_rule, **(others or {})}, by_rule, points, checked)
     asked = {id(policy): _Onlooker(policy) for policy in policies.values()}
     onlookers = {key: asked[id(policy)] for key, policy in policies.items()}
-    collected = collect_episodes(simulation, onlookers, seeds=seeds, points=points, **options)
-    return {key: _compared(found, float(tolerance)) for key, found in collected.items()}
+    collected = collect_episodes(simulation, {**onlookers, **(others or {})}, seeds=seeds, points=points, **options)
+    return {key: _compared(collected[key], float(tolerance)) for key in policies}
 
 
 class _Onlooker:

@@ -119,6 +119,16 @@ class Binding:
                 value = {**value, _spaces.MASK: mask}
         return self.cast(value)
 
+    def blank(self) -> Any:
+        """Make the observation of an agent of which nothing is known yet: zero, and with all actions legal."""
+        observation = _spaces.blank(self.definition.observation_space)
+        if self.legal is None or not self._masked_parts:
+            return observation
+        for part in self._masked_parts:
+            whole = observation[part] if part else observation
+            whole[_spaces.MASK] = _spaces.open_mask(self.definition.action_space)
+        return self.cast(observation)
+
     def reply(self, action: Any, agent: str, mask: Any, choices: Any) -> Any:
         """Check an action, and turn it into the reply that the simulation gets.
 

@@ -176,6 +176,13 @@ class Record:
         if DIFFERENCES:
             EVALUATING.pop(get_ident(), None)
 
+    def unseen(self) -> dict[str, Any]:
+        """Make the info of an agent that cannot be observed: that of any other of its point, with all actions legal."""
+        info: dict[str, Any] = {}
+        if self.binding.legal is not None:
+            info[_spaces.MASK] = _spaces.open_mask(self.binding.definition.action_space)
+        return info if self.clock is None else info | self._passed(self.clock())
+
     def arise(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Find out what must be known of a decision in mid-round. The arguments are those of ``settle``."""
         self.restrict(args, kwargs)

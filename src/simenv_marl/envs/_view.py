@@ -22,7 +22,7 @@ from .._episode import Episode
 from .._plan import Plan
 from .._provenance import describe
 from .._session import AnyEpisode, Session, checked_seed, seed_space
-from .._spaces import blank, duplicate, observation_cast
+from .._spaces import duplicate, observation_cast
 from ..errors import CopyError, ReentrancyError, UnknownAgentError, UnknownOptionError
 from ..plugins import Entry
 
@@ -324,7 +324,7 @@ class AgentsView(View):
         """The latest observation of an agent, as a copy of the caller's own."""
         record = episode.record(agent)
         if record is None or record.observation is None:
-            return blank(self._binding(agent).definition.observation_space)
+            return self._binding(agent).blank()
         return duplicate(record.observation)
 
 

@@ -30,7 +30,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         terminations, truncations: By agent, python bools.
         infos: By agent, the info of its latest decision. ``infos[agent]["action_mask"]``, np.int8, is there
             where the decision point restricts its actions; ``"time"`` and ``"elapsed"`` where the simulation
-            has a clock.
+            has a clock. The keys are there from the reset on, and stay; of an agent that has not been seen
+            yet, all actions are legal.
     """
 
     def __init__(self, plan: Plan) -> None:

@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from .._plan import Plan
 from .._rounds import Rounds
-from .._spaces import blank, duplicate
+from .._spaces import duplicate
 from ..errors import InvalidActionError, ViewError
 from ..simulation import RULE
 from ._view import OneAgentView
@@ -135,7 +135,7 @@ class SimulationJointEnv(OneAgentView):
         for agent in self._agents:
             record = episode.record(agent)
             if record is None or record.observation is None:
-                observations[agent] = blank(self._plan.roster[agent].definition.observation_space)
+                observations[agent] = self._plan.roster[agent].blank()
             else:
                 observations[agent] = duplicate(record.observation)
         if self._flatten:

@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 from .._plan import Plan
 from .._record import Record
 from .._rounds import Rounds
-from .._spaces import blank, duplicate
+from .._spaces import duplicate
 from ..simulation import Sentinel
 from ._view import AgentsView
 
@@ -134,7 +134,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         """The observation of an agent, which nobody else gets to see: each return makes its own."""
         observation = record.observation
         if observation is None:
-            return blank(record.binding.definition.observation_space)
+            return record.binding.blank()
         if record.handed_out is observation:  # it could not be observed anew
             return duplicate(observation)
         record.handed_out = observation

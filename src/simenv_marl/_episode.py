@@ -433,7 +433,7 @@ class Episode:
                 record.hold(args, {})
                 record.observe(args, {})
                 record.choices = None  # which are asked for again when it decides
-        if self.clock is None and all(binding.legal is None for binding in self._plan.active):
+        if self.clock is None and not any(binding.legal or binding.padded for binding in self._plan.active):
             return
         for record in self.agents.values():
             if record.observation is None:  # there are learners to whom the infos of the reset tell all keys

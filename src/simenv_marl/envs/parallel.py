@@ -158,6 +158,10 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 infos[agent] = {**record.unseen(), "deciding": False, "acted": acted}
                 rewards.setdefault(agent, 0.0)
             terminations[agent], truncations[agent] = episode.terminated, episode.truncated
+            part: dict[str, Any]
+            for part in results:  # type: ignore[assignment]
+                if agent in part:  # to stand in the order of the roster
+                    part[agent] = part.pop(agent)
         if not episode.over:
             self.agents = list(self.possible_agents)
 

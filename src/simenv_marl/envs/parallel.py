@@ -158,8 +158,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 infos[agent] = {**record.unseen(), "deciding": False, "acted": acted}
                 rewards.setdefault(agent, 0.0)
             terminations[agent], truncations[agent] = episode.terminated, episode.truncated
-            part: dict[str, Any]
-            for part in results:  # type: ignore[assignment]
+            part: Any
+            for part in results:
                 if agent in part:  # to stand in the order of the roster
                     part[agent] = part.pop(agent)
         if not episode.over:

@@ -17,8 +17,10 @@ from simenv_marl import (
     TRUNCATED,
     DefinitionError,
     InvalidActionError,
+    NotResetError,
     ObservationError,
     OptionValueError,
+    ViewError,
     aec_env,
     generate_env,
     joint_env,
@@ -223,6 +225,55 @@ def test_with_rule_throughout_goals_change_nothing():
 
 
 # -- masks ----------------------------------------------------------------------------------------
+
+
+def test_masks_on_request():
+    """The method that sb3-contrib's MaskablePPO calls before each step, through whatever wrappers there are."""
+    legal = iter([[1, 0], [0, 1], [1, 1]])
+    ant = decision(agent="ant_0", action_space=spaces.Discrete(2), action_mask_mapping=lambda: next(legal))
+    env = gymnasium.wrappers.RecordEpisodeStatistics(single_env(calling(ant, ant), ant))
+    masks = env.get_wrapper_attr("action_masks")
+    with pytest.raises(NotResetError):
+        masks()
+    env.reset()
+    assert masks().dtype == np.bool_
+    assert masks().tolist() == [True, False]
+    env.step(0)
+    assert masks().tolist() == [False, True]
+    env.step(1)
+    assert masks().tolist() == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("space", "number"), [(spaces.Discrete(3, start=2), 3), (spaces.MultiDiscrete([2, 3]), 5)], ids=str
+)
+def test_masks_on_request_where_everything_is_legal(space, number):
+    ant = decision(agent="ant_0", action_space=space)
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True] * number
+
+
+def test_masks_on_request_of_choices_and_of_several_parts():
+    ant = decision(agent="ant_0", choices=lambda: "ab", action_space=spaces.Discrete(4))
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True, True, False, False]
+    ant = decision(
+        agent="ant_0",
+        action_space=spaces.MultiDiscrete([2, 3]),
+        action_mask_mapping=lambda: ([1, 0], [0, 1, 1]),
+    )
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True, False, False, True, True]
+
+
+def test_continuous_actions_have_no_masks():
+    env = single_env(Walk, goals())
+    env.reset()
+    with pytest.raises(ViewError):
+        env.action_masks()
 
 
 def masks(**changes):

@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
+from numpy.typing import NDArray
 
 from .._bindings import Binding
 from .._episode import Episode
@@ -23,7 +24,7 @@ from .._plan import Plan
 from .._provenance import describe
 from .._session import AnyEpisode, Session, checked_seed, seed_space
 from .._spaces import blank, duplicate, observation_cast
-from ..errors import CopyError, ReentrancyError, UnknownAgentError, UnknownOptionError
+from ..errors import CopyError, ReentrancyError, UnknownAgentError, UnknownOptionError, ViewError
 from ..plugins import Entry
 
 
@@ -232,6 +233,33 @@ class OneAgentView(View, gym.Env[Any, Any]):
     """A view with one agent, and so a Gymnasium environment."""
 
     _agent: str
+    action_space: spaces.Space[Any]
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which actions are legal now, in the shape in which sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns:
+            Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the masks of its parts, one behind the other.
+            True throughout where the decision point does not restrict its actions.
+
+        Raises:
+            ViewError: The action space is neither, and so there are no masks of it.
+            ResetNeededError: There is no episode.
+        """
+        if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+            raise ViewError(
+                f"there are masks of Discrete and MultiDiscrete action spaces, and not of {self.action_space}; joint"
+                " environments of discrete actions have a MultiDiscrete with flatten=True"
+            )
+        if self._episode is None:
+            raise self._session.not_running()
+        masks = self._legal(self._episode)
+        parts = [part for mask in masks for part in (mask if isinstance(mask, tuple) else (mask,))]
+        return np.concatenate(parts).astype(np.bool_)
+
+    def _legal(self, episode: Episode) -> list[Any]:
+        """The masks of all that is decided in a step."""
+        raise NotImplementedError
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None, kind: type[AnyEpisode]) -> AnyEpisode:
         """End the episode that runs, begin another, and seed the generator and the spaces."""
@@ -298,6 +326,24 @@ class AgentsView(View):
         """
         space = self._action_spaces.get(agent)
         return space if space is not None else self._make_spaces(agent)[1]
+
+    @property
+    def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """By possible agent, its observation space: for learners that ask for all at once.
+
+        Raises:
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+        """
+        return {agent: self.observation_space(agent) for agent in self.possible_agents}
+
+    @property
+    def action_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """By possible agent, its action space: for learners that ask for all at once.
+
+        Raises:
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+        """
+        return {agent: self.action_space(agent) for agent in self.possible_agents}
 
     def _binding(self, agent: str) -> Binding:
         binding = self._plan.roster.get(agent)

@@ -32,13 +32,13 @@ test-rllib: .venv-rllib/.rllib
 
 # The oldest versions of everything that this library builds on, with the tests of what happens when.
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,conformance definitions drivers ends environments episodes errors \
-	goals_and_time greenhouse identity joint many_agents registration rounds side_by_side simulate simulate_many vector))
+	goals_and_time identity joint many_agents rounds side_by_side simulate simulate_many vector workers))
 test-oldest: .venv-oldest/.oldest
 	.venv-oldest/bin/python -m pytest --driver greenlet $(OLDEST_TESTS)
 
 .venv-oldest/.oldest: pyproject.toml tests/oldest.txt
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
-	$(@D)/bin/pip install --quiet --disable-pip-version-check --constraint tests/oldest.txt --editable . hypothesis pytest simpy
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --constraint tests/oldest.txt --editable '.[many]' hypothesis pytest simpy
 	touch $@
 
 # Local clusters, on the loopback address alone. Each has an environment of its own, because of what it pins.

@@ -591,6 +591,54 @@ def test_states_that_cannot_be():
         env.state()
 
 
+def seeing(number):
+    """What is observed: a pair, or one of three."""
+    return {
+        "agent": ("ant_0", "bee_0")[number],
+        "observation_space": (spaces.Box(0, 9, (2,), np.float32), spaces.Discrete(3))[number],
+        "observation_space_mapping": (lambda: [1, 2], lambda: 2)[number],
+    }
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_the_state_may_be_what_all_observe(make):
+    ant, bee = decision(**seeing(0)), decision(**seeing(1))
+    env = make(calling(ant, bee), [ant, bee], state_space="observations")
+    assert (env.state_space.low.tolist(), env.state_space.high.tolist()) == ([0] * 5, [9, 9, 1, 1, 1])
+    assert env.state_space is env.state_space
+    with pytest.raises(NotResetError):
+        env.state()
+    env.reset()
+    assert env.state().tolist() == [1, 2, 1, 0, 0]  # the second has not been observed yet
+    env.step({"ant_0": 4} if make is parallel_env else 4)
+    state = env.state()
+    assert state.tolist() == [1, 2, 0, 0, 1]
+    assert state in env.state_space
+    while env.agents:
+        env.step(RULE)
+    assert env.state().tolist() == [1, 2, 0, 0, 1]
+
+
+@pytest.mark.parametrize("make", [single_env, joint_env])
+def test_the_state_may_be_what_one_observes(make):
+    ant = decision(**seeing(0))
+    env = make(calling(ant), ant, state_space="observations")
+    env.reset()
+    assert env.state().tolist() == [1, 2]
+    assert env.state() in env.state_space
+
+
+def test_states_of_observations_that_cannot_be():
+    for space in (spaces.Sequence(spaces.Discrete(3)), spaces.Graph(spaces.Discrete(3), None)):
+        ant = decision(agent="ant_0", observation_space=space)
+        with pytest.raises(ViewError, match="flattened"):
+            _ = aec_env(calling(ant), ant, state_space="observations").state_space
+    with pytest.raises(ViewError, match="possible_agents"):
+        parallel_env(announcing(one_after_the_other), beings(), state_space="observations")
+    with pytest.raises(OptionValueError):
+        aec_env(calling(ant), ant, state_space="rewards")
+
+
 # -- pictures -------------------------------------------------------------------------------------
 
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def run(section: str, monkeypatch: Any) -> dict[str, Any]:
-    """Run all python blocks of a section of ``docs/clients.md``, one after the other, as its reader would.
+def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
+    """Run the python blocks of a section of ``docs/clients.md``, one after the other, as its reader would.
 
     Args:
         section: The heading of the section.
         monkeypatch: Pytest's, which takes back what the run has changed about imports.
 
-    Returns:
-        The names that the code leaves behind.
+    Yields:
+        After each block, the names that the code has left behind.
     """
     text = (DOCS / "clients.md").read_text(encoding="utf-8")
     _, _, rest = text.partition(f"\n## {section}\n")
@@ -31,4 +32,4 @@ def run(section: str, monkeypatch: Any) -> dict[str, Any]:
     names: dict[str, Any] = {"__name__": "__main__"}
     for number, block in enumerate(blocks):
         exec(compile(block, f"docs/clients.md: {section}, block {number}", "exec"), names)
-    return names
+        yield names

@@ -38,6 +38,7 @@ class View:
 
     metadata: dict[str, Any]
     render_mode: str | None
+    _together: tuple[spaces.Tuple[Any], spaces.Space[Any]] | None = None
 
     def __init__(self, plan: Plan) -> None:
         """Make the view of a plan.
@@ -96,23 +97,53 @@ class View:
     @property
     def state_space(self) -> spaces.Space[Any] | None:
         """The space of ``state()``, where the environment was made with one."""
-        return self._plan.options.state_space
+        space = self._plan.options.state_space
+        return self._seen_together()[1] if isinstance(space, str) else space
 
     def state(self) -> Any:
         """The state of the simulation, for centralised critics: what its own ``state()`` returns.
 
         Returns:
-            A new array; in the dtype of ``state_space``, where the environment was made with one.
+            A new array; in the dtype of ``state_space``, where the environment was made with one. With
+            ``state_space="observations"`` what all possible agents observe, flattened, one behind the other.
 
         Raises:
             NotImplementedError: The simulation has no ``state``, as PettingZoo has it.
+            ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
+        if isinstance(self._plan.options.state_space, str):
+            if self._episode is None:
+                raise self._session.not_running()
+            parts, space = self._seen_together()
+            return np.asarray(spaces.flatten(parts, self._seen(self._episode))).astype(space.dtype)
         tell = getattr(self.simulation, "state", None)
         if not callable(tell):
             raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
         with self._session.at_work():
             value = tell()
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
+
+    def _seen_together(self) -> tuple[spaces.Tuple[Any], spaces.Space[Any]]:
+        """The spaces of all that is observed, and the one of them all.
+
+        Raises:
+            ViewError: There is no vector of them.
+        """
+        if self._together is None:
+            parts = spaces.Tuple(self._seen_spaces())
+            together = spaces.flatten_space(parts)
+            if not isinstance(together, spaces.Box):
+                raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
+            self._together = parts, together
+        return self._together
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        """The spaces of all that is observed."""
+        raise NotImplementedError
+
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        """All that is observed."""
+        raise NotImplementedError
 
     def render(self) -> Any:
         """Render the simulation in ``render_mode``; without one, None and a warning.
@@ -234,6 +265,10 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     _agent: str
     action_space: spaces.Space[Any]
+    observation_space: spaces.Space[Any]
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        return [self.observation_space]
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Which actions are legal now, in the shape in which sb3-contrib's ``MaskablePPO`` asks for it.
@@ -308,6 +343,25 @@ class AgentsView(View):
             for agent in self._action_spaces:
                 self._seed_spaces(agent, seed)
         return episode
+
+    @staticmethod
+    def check(plan: Plan) -> None:
+        """Make sure that a plan allows this view.
+
+        Raises:
+            ViewError: It does not.
+        """
+        View.check(plan)
+        if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
+            raise ViewError(
+                'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='
+            )
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        return [self.observation_space(agent) for agent in self.possible_agents]
+
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        return tuple(self._observation(episode, agent) for agent in self.possible_agents)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The observation space of an agent: of this environment alone, and always the same object.

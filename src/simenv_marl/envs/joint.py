@@ -115,6 +115,9 @@ class SimulationJointEnv(OneAgentView):
             self.render()
         return self._observe(), reward, episode.terminated, episode.truncated, self._info()
 
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        return (self._observe(),)
+
     def _legal(self, episode: Episode) -> list[Any]:
         masks = []
         for agent in self._agents:

@@ -109,6 +109,9 @@ class SimulationEnv(OneAgentView):
         mask = self._record.mask
         return [open_mask(self.action_space) if mask is None else mask]
 
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        return (self._record.observation,)
+
     def _go_on(self, episode: Any) -> None:
         super()._go_on(episode)
         self._record = episode.agents[self._agent]

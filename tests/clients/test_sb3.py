@@ -1,8 +1,8 @@
 """Stable-Baselines3 and sb3-contrib: single views, joint views, goals, masks."""
 
 import gymnasium
-import numpy as np
 import pytest
+from examples.greenhouse_coop import env as greenhouse
 from sb3_contrib import MaskablePPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3 import PPO, SAC, HerReplayBuffer
@@ -10,8 +10,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from examples.greenhouse_coop import env as greenhouse
-from simenv_marl import joint_env, single_env
+from simenv_marl import joint_env, single_env, vector_env
 
 from . import page
 from .returns import single_return
@@ -59,11 +58,15 @@ def test_check_env(make):
     env.close()
 
 
-def test_joint_actions_by_agent_are_not_supported():
+def test_joint_actions_by_agent_are_refused():
     """Observations may be dicts; actions may not, and are flattened."""
-    with pytest.warns(UserWarning, match="action space is not based off a numpy array"), pytest.raises(Exception):  # noqa: B017
-        check_env(joint_env(ShopSim))
+    with pytest.raises(AssertionError, match="only supports"):
         PPO("MultiInputPolicy", joint_env(ShopSim))
+
+
+def test_it_takes_no_vector_environments_of_gymnasium():
+    with pytest.raises(Exception, match="Environment"):
+        PPO("MlpPolicy", vector_env(ReservoirSim, num_envs=2))
 
 
 # -- training -------------------------------------------------------------------------------------
@@ -170,6 +173,16 @@ def test_masked_decisions_of_a_joint_view():
 
 
 def test_the_page(monkeypatch):
-    names = page.run("Stable-Baselines3 and sb3-contrib", monkeypatch)
-    assert names
-    assert np.isfinite(names["gained"])
+    steps = page.steps("Stable-Baselines3 and sb3-contrib", monkeypatch)
+    names = next(steps)
+    env = single_env(names["FourWeeks"], names["points"])
+
+    def act(observation, info):
+        return names["model"].predict(observation)[0]
+
+    before = single_return(env, act)
+    names = next(steps)
+    assert single_return(env, act) > before + 100
+    together, masked = [dict(names) for names in steps]
+    assert together["env"].action_space == gymnasium.spaces.MultiDiscrete([5, 3])
+    assert masked["env"].action_masks()[masked["action"]]

@@ -63,6 +63,16 @@ class ReservoirSim(SimulationInterface):
 # -- two decisions that belong together -----------------------------------------------------------
 
 
+NUMBER: dict[str, Any] = {
+    "observation_space": spaces.Box(0, 1, (4,), np.float32),
+    "observation_space_mapping": lambda shop: shop.observed(),
+    "action_space": spaces.Discrete(4),
+    "action_space_mapping": int,
+    "reward_mapping": lambda shop: shop.profit,
+}
+"""What both decisions have in common: so many loaves, for the profit of the day."""
+
+
 class Shop:
     """Bread is baked in the morning, put on the shelf, and sold as long as there is some and somebody wants it."""
 
@@ -78,20 +88,12 @@ class Shop:
         """What both see."""
         return [float(number == self.wanted) for number in range(4)]
 
-    bake_or_shelve = {
-        "observation_space": spaces.Box(0, 1, (4,), np.float32),
-        "observation_space_mapping": observed,
-        "action_space": spaces.Discrete(4),
-        "action_space_mapping": int,
-        "reward_mapping": lambda shop: shop.profit,
-    }
-
-    @make_step(agent="baker_0", **bake_or_shelve)  # type: ignore[arg-type]
+    @make_step(agent="baker_0", **NUMBER)
     def choose_batch(self) -> int:
         """Decide how many loaves are baked."""
         return 2
 
-    @make_step(agent="seller_0", **bake_or_shelve)  # type: ignore[arg-type]
+    @make_step(agent="seller_0", **NUMBER)
     def choose_display(self) -> int:
         """Decide how many of them are put on the shelf."""
         return self.stock

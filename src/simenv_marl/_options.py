@@ -40,7 +40,8 @@ class Options:
             ``numpy.random``, which each reset seeds with the seed of the episode.
         flatten: Whether the joint view has one vector in place of dicts.
         state_space: The space to whose shape and dtype the environment's ``state()`` is cast; None: what the
-            simulation's own ``state()`` returns is taken as it is.
+            simulation's own ``state()`` returns is taken as it is. "observations": the state is what all possible
+            agents observe, in one vector, and the simulation needs no ``state()``.
         render_mode: What ``render`` returns; one of the simulation's ``render_modes``.
     """
 
@@ -53,7 +54,7 @@ class Options:
     plugins: Iterable[Any] = ()
     global_rng: bool = False
     flatten: bool = False
-    state_space: spaces.Space[Any] | None = None
+    state_space: spaces.Space[Any] | str | None = None
     render_mode: str | None = None
 
     def __post_init__(self) -> None:
@@ -68,8 +69,9 @@ class Options:
         for name in ("global_rng", "padded"):
             if not isinstance(getattr(self, name), bool):
                 raise OptionValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
-        if self.state_space is not None and not isinstance(self.state_space, spaces.Space):
-            raise OptionValueError(f"state_space must be a gymnasium space, not {self.state_space!r}")
+        state_space = self.state_space
+        if not (state_space is None or isinstance(state_space, spaces.Space) or state_space == "observations"):
+            raise OptionValueError(f'state_space must be a gymnasium space or "observations", not {state_space!r}')
         steps = self.max_steps
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
             raise OptionValueError(f"max_steps must be a positive integer or None, not {steps!r}")

@@ -13,6 +13,7 @@ from math import nan
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ._batches import Asking, Entry, Group, Waiting
@@ -45,6 +46,8 @@ class Trajectories:
         truncations: ``(N,)`` bool: whether it was the agent's last one, and its episode then was truncated.
         last_observations: ``(M, *shape)``: what each trajectory has come to, to value what is still to come where it
             was truncated.
+        last_turns: ``(M,)`` int64: how many decisions the episode had seen when the trajectory ended, in the numbers of
+            ``turns``.
         starts: ``(M,)`` int64: in which row each trajectory begins.
         episodes: ``(N,)`` int64: the number of the episode, which is the place of its seed among the seeds.
         seeds: The seeds of all episodes: row i is of ``seeds[episodes[i]]``.
@@ -59,6 +62,8 @@ class Trajectories:
         elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
             its end; nan where the model has let go of the agent before. None where there is no clock.
         extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
+        observation_space, action_space: Of the decision point. None where nobody has decided, and it is not known at
+            which point they would have.
     """
 
     _: KW_ONLY
@@ -68,6 +73,7 @@ class Trajectories:
     terminations: NDArray[np.bool_]
     truncations: NDArray[np.bool_]
     last_observations: Any
+    last_turns: NDArray[np.int64]
     starts: NDArray[np.int64]
     episodes: NDArray[np.int64]
     seeds: tuple[int, ...]
@@ -81,6 +87,8 @@ class Trajectories:
     times: NDArray[np.float64] | None = None
     elapsed: NDArray[np.float64] | None = None
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    observation_space: spaces.Space[Any] | None = None
+    action_space: spaces.Space[Any] | None = None
 
     def __len__(self) -> int:
         """N, the number of decisions."""
@@ -96,6 +104,11 @@ class Trajectories:
     def lengths(self) -> NDArray[np.int64]:
         """``(M,)`` int64: how many decisions each trajectory has."""
         return np.diff(self.starts, append=len(self))
+
+    @cached_property
+    def returns(self) -> NDArray[np.float64]:
+        """``(M,)`` float64: the sum of the rewards of each trajectory, none of them discounted."""
+        return np.add.reduceat(self.rewards, self.starts) if len(self) else np.zeros(0)
 
     @cached_property
     def next_observations(self) -> Any:
@@ -125,8 +138,8 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
 
     _check_extras([part.extras for _, part in filled])
     same = (
-        "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "steps", "turns",
-        "by_rule", "known", "action_masks", "times", "elapsed",
+        "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "last_turns", "steps",
+        "turns", "by_rule", "known", "action_masks", "times", "elapsed",
     )  # fmt: skip
     return Trajectories(
         **{name: together(name) for name in same},
@@ -136,6 +149,8 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
         agents=np.concatenate([np.array([codes[name] for name in part.names])[part.agents] for _, part in filled]),
         names=tuple(codes),
         extras={name: joined([part.extras[name] for _, part in filled]) for name in filled[0][1].extras},
+        observation_space=filled[0][1].observation_space,
+        action_space=filled[0][1].action_space,
     )
 
 
@@ -173,6 +188,7 @@ class _Page:
         self.names: list[str] = []
         self.last_rows: list[int] = []
         self.last_observations: list[Any] = []
+        self.last_turns: list[int] = []
         self.terminated: list[bool] = []
         self.truncated: list[bool] = []
 
@@ -184,6 +200,7 @@ class _Page:
         self.names.append(record.agent)
         self.last_rows.append(-1)
         self.last_observations.append(None)
+        self.last_turns.append(-1)
         self.terminated.append(False)
         self.truncated.append(False)
         return len(self.names) - 1
@@ -264,13 +281,13 @@ class Ledger:
                 page.elapsed[record.row] = record.info["elapsed"]
         if episode.parting:
             for record in episode.parting:
-                self._close(record, terminated=True, truncated=False)
+                self._close(record, episode.turns, terminated=True, truncated=False)
             episode.parting = []
         if episode.over:
             for record in episode.agents.values():
-                self._close(record, terminated=episode.terminated, truncated=episode.truncated)
+                self._close(record, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
-    def _close(self, record: Any, *, terminated: bool, truncated: bool) -> None:
+    def _close(self, record: Any, turns: int, *, terminated: bool, truncated: bool) -> None:
         if record.row < 0:  # it has never decided
             return
         page, trajectory = record.group.book, record.trajectory
@@ -280,6 +297,7 @@ class Ledger:
         page.elapsed[record.row] = record.info.get("elapsed", nan)
         page.last_rows[trajectory] = record.row
         page.last_observations[trajectory] = record.observation
+        page.last_turns[trajectory] = turns
         page.terminated[trajectory], page.truncated[trajectory] = terminated, truncated
 
     # -- afterwards -------------------------------------------------------------------------------
@@ -356,6 +374,7 @@ class _Sorted:
             observations=taken(self.observations, rows),
             actions=taken(self.actions, rows),
             last_observations=page.stack([page.last_observations[trajectory] for trajectory in trajectories]),
+            last_turns=np.array(page.last_turns, np.int64)[trajectories],
             starts=np.flatnonzero(steps == 0),
             episodes=self.episodes[self.trajectory[rows]],
             seeds=seeds,
@@ -364,6 +383,8 @@ class _Sorted:
             steps=steps,
             action_masks=None if self.masks is None else taken(self.masks, rows),
             extras=taken(self.extras, rows),
+            observation_space=page.binding.definition.observation_space,
+            action_space=page.binding.definition.action_space,
             **{name: array[rows] for name, array in self.numbers.items()},
         )
 
@@ -390,6 +411,7 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
         terminations=np.zeros(0, np.bool_),
         truncations=np.zeros(0, np.bool_),
         last_observations=observations,
+        last_turns=none,
         starts=none,
         episodes=none,
         seeds=seeds,
@@ -399,6 +421,8 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
         turns=none,
         by_rule=np.zeros(0, np.bool_),
         known=np.zeros(0, np.bool_),
+        observation_space=None if definition is None else definition.observation_space,
+        action_space=None if definition is None else definition.action_space,
     )
 
 

@@ -39,8 +39,10 @@ def simulate_many(
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
         policies: Who decides: from agent or decision point to a callable of the observations, or of the observations
-            and the infos, of as many decisions as wait for it. The observations are stacked, ``(batch, *shape)``;
-            where the space is a ``Dict`` or a ``Tuple``, a dict or a tuple of stacks. The infos are a list of dicts.
+            and the infos, or of these and the identities, of as many decisions as wait for it. The observations are
+            stacked, ``(batch, *shape)``; where the space is a ``Dict`` or a ``Tuple``, a dict or a tuple of stacks. The
+            infos are a list of dicts, the identities one of pairs: the seed of the episode, and the number of the
+            decision among all in it.
             It returns as many actions, in the same order: an array, what becomes one (a tensor), a sequence, or a dict
             of these. ``RULE`` in place of an action, or of all of them, leaves it to the model. A tuple of the actions
             and a dict is taken for actions alone (see ``collect_episodes``). Policies that are the same object are

@@ -57,6 +57,8 @@ class Trajectories:
         elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
             its end; nan where the model has let go of the agent before. None where there is no clock.
         extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
+        collected: What ``collect`` has returned of each episode's simulation, in the order of the seeds. None where it
+            was not asked for.
     """
 
     _: KW_ONLY
@@ -78,6 +80,7 @@ class Trajectories:
     times: NDArray[np.float64] | None = None
     elapsed: NDArray[np.float64] | None = None
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    collected: tuple[Any, ...] | None = None
 
     def __len__(self) -> int:
         """N, the number of decisions."""
@@ -113,8 +116,9 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
     first_rows = np.cumsum([0, *(len(part) for part in parts)])
     codes = {name: code for code, name in enumerate(dict.fromkeys(name for part in parts for name in part.names))}
     filled = [(number, part) for number, part in enumerate(parts) if len(part)]
+    collected = None if parts[0].collected is None else tuple(one for part in parts for one in part.collected or ())
     if not filled:
-        return replace(parts[0], seeds=seeds)
+        return replace(parts[0], seeds=seeds, collected=collected)
 
     def together(name: str) -> Any:
         values = [getattr(part, name) for _, part in filled]
@@ -133,6 +137,7 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
         agents=np.concatenate([np.array([codes[name] for name in part.names])[part.agents] for _, part in filled]),
         names=tuple(codes),
         extras={name: joined([part.extras[name] for _, part in filled]) for name in filled[0][1].extras},
+        collected=collected,
     )
 
 

@@ -10,15 +10,16 @@ an agent, from its birth to its death. The wolves, and all else about the sheep,
 **What a sheep decides.** It has to go to one of the four cells beside its own, as by the model's rule. (By the rule it
 stays where it is if there are wolves on all four; a sheep that is sent cannot.)
 
-**What it sees.** Its energy, and of each cell up to ``sight`` steps away, its own included: whether the grass is grown,
-how many wolves stand there, and how many other sheep. The rule looks one step far. A wolf that is two steps away is next
-to it once it has moved, and wolves move after all sheep have: what decides whether it is eaten lies two steps away.
+**What it sees.** Its energy, and of each cell up to ``sight`` steps away, its own included: whether the grass is
+grown, how many wolves stand there, and how many other sheep. The rule looks one step far. But wolves move after all
+sheep have, to a cell beside theirs: whether a sheep is eaten depends on the wolves that are beside it once it has
+moved, and those may be two steps away before.
 
 **What it is rewarded for.** Each turn that it has lived to see is worth 1, the last included. That is all there is to
-its success in this model: in each tick that it survives it has the same chance of a lamb, so who lives longest has most
-offspring. Energy is not rewarded, being only a means: it would make a lamb, which takes half of it, a punishment. As the
-reward never varies, everything depends on how a trajectory ends. One that death has ended is worth nothing
-any more; one that the last tick cuts off would have gone on, and has to be valued by what the sheep then sees.
+its success in this model: in each tick that it survives it has the same chance of a lamb, so who lives longest has
+most offspring. Energy is not rewarded, being only a means: a lamb, which takes half of it, would be a punishment. As
+the reward never varies, everything depends on how a trajectory ends. One that death has ended is worth nothing any
+more; one that the last tick cuts off would have gone on, and has to be valued by what the sheep then sees.
 
 The reward is each sheep's own. Whether the herd fares well if each of them looks after itself is not said thereby: what
 one has eaten, the others lack.
@@ -68,7 +69,7 @@ def ways(sight: int) -> tuple[tuple[int, tuple[int, int]], ...]:
 
 @cache
 def cells(sight: int) -> tuple[tuple[int, int], ...]:
-    """Where the cells lie that are seen, in the order in which they are observed: the own cell first, then by distance."""
+    """Where the cells lie that are seen, in the order in which they are observed: the own cell, then by distance."""
     found = [(0, 0)]
     for number, direction in ways(sight):
         found.append((found[number][0] + direction[0], found[number][1] + direction[1]))
@@ -76,7 +77,7 @@ def cells(sight: int) -> tuple[tuple[int, int], ...]:
 
 
 def look(sheep: Any, sight: int = SIGHT) -> NDArray[np.float32]:
-    """Observe the sheep's energy; for each of its ``cells`` the grass, for each the wolves, for each the other sheep."""
+    """Observe its energy; for each of its ``cells`` the grass, for each the wolves, for each the other sheep."""
     around = [sheep.cell]
     for number, direction in ways(sight):
         around.append(around[number].connections[direction])

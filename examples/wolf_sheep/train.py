@@ -1,7 +1,7 @@
 """One policy for all sheep, trained by PPO with TorchRL's losses on what ``collect_episodes`` returns.
 
-``python -m examples.wolf_sheep.train`` trains it from several seeds, for sheep that see as far as by the model's rule and
-for sheep that see a step farther. Policies go to ``out/`` beside this file; how they came about goes to
+``python -m examples.wolf_sheep.train`` trains it from several seeds, for sheep that see as far as by the model's rule
+and for sheep that see a step farther. Policies go to ``out/`` beside this file; how they came about goes to
 ``docs/figures/shared-policy-training.csv``. It needs TorchRL (the extra ``clients``).
 
 Hundreds of sheep, most of them born in mid-episode, are no more trouble here than one: the policy is asked for all
@@ -286,14 +286,16 @@ def write(course: Iterable[Progress], path: Path = CURVES) -> None:
         writer.writeheader()
         for progress in course:
             row = asdict(progress)
-            writer.writerow({name: f"{value:.4g}" if isinstance(value, float) else value for name, value in row.items()})
+            writer.writerow(
+                {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in row.items()}
+            )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train all of them."""
     parser = argparse.ArgumentParser(description="Train one policy for all sheep.")
     parser.add_argument("--seeds", type=int, default=5, help="how often to train (default: %(default)s)")
-    parser.add_argument("--decisions", type=int, default=800_000, help="to learn from (default: %(default)s)")
+    parser.add_argument("--decisions", type=int, default=500_000, help="to learn from (default: %(default)s)")
     parser.add_argument("--sight", type=int, nargs="+", default=SIGHTS, help="how far sheep see (default: 1 2)")
     parser.add_argument("--out", type=Path, default=OUT, help="folder for the policies (default: beside this file)")
     parser.add_argument("--curves", type=Path, default=CURVES, help="file for the course (default: %(default)s)")

@@ -383,6 +383,27 @@ def test_episodes_in_which_nobody_decides():
     assert len(collect_episodes(script(main), {ant: ones}, seeds=[])[ant]) == 0
 
 
+def test_what_is_collected_of_each_simulation():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+
+    def main(simulation):
+        for _ in range(simulation.seed):  # the last seeds are the first to end
+            ant()
+
+    found = collect_episodes(
+        script(main),
+        {ant: ones, bee: ones},
+        points=[ant, bee],
+        seeds=[4, 0, 2],
+        collect=lambda simulation: simulation.seed,
+    )
+    assert found[ant].collected == (4, 0, 2)
+    assert found[bee].collected == (4, 0, 2)  # who has never decided
+    assert collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1])[ant].collected is None
+    with pytest.raises(OptionValueError, match="collect"):
+        collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1], collect=3)
+
+
 def test_one_name_at_points_whose_spaces_differ():
     definitions = beings() | others(
         agent=lambda other: f"being_{other.number}",

@@ -43,33 +43,27 @@ class Binding:
             where the reply is that.
         by_rule: In the simulation, has the rule decide a call and tells the user's side what it has decided; None
             where nobody wants to know.
-        tells: Whether the info tells which action the rule's decision corresponds to.
+        tells: Whether infos tell more than masks and times: which action the rule's decision corresponds to, or whether
+            the agent is present.
+        padded: Whether they tell whether it is present.
         check: Checks an action against its space.
         first, end: Which python integers are legal actions, whatever the call: from the first to before the end.
     """
 
     __slots__ = (
-        "_masked_parts",
-        "agent",
-        "by_rule",
-        "cast",
-        "check",
-        "convert",
-        "definition",
-        "deliver",
-        "end",
-        "first",
-        "legal",
-        "name_agent",
-        "observe",
-        "point",
-        "policy",
-        "reward",
-        "ruled",
-        "tells",
+        "_masked_parts", "agent", "by_rule", "cast", "check", "convert", "definition", "deliver", "end", "first",
+        "legal", "name_agent", "observe", "padded", "point", "policy", "reward", "ruled", "tells",
     )  # fmt: skip
 
-    def __init__(self, named: NamedPoint, agent: str | None, policy: Policy | None, *, recorded: bool = False) -> None:
+    def __init__(
+        self,
+        named: NamedPoint,
+        agent: str | None,
+        policy: Policy | None,
+        *,
+        recorded: bool = False,
+        padded: bool = False,
+    ) -> None:
         """Make a binding.
 
         Args:
@@ -77,6 +71,7 @@ class Binding:
             agent: The name of its agent; None where it has many.
             policy: Who answers all its decisions.
             recorded: Whether somebody keeps what is decided, and so wants to know what the rule decides.
+            padded: Whether agents are there that are not present.
         """
         definition = named.definition
         self.point: DecisionPoint = named.point
@@ -90,8 +85,13 @@ class Binding:
         self.check = _spaces.action_check(definition.action_space)
         self.convert = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
-        self.tells = definition.rule_action_mapping is not None
-        self.ruled = Ruled(self) if self.tells or (recorded and _can_be_read_backwards(definition)) else None
+        self.padded = padded
+        self.tells = padded or definition.rule_action_mapping is not None
+        self.ruled = (
+            Ruled(self)
+            if definition.rule_action_mapping is not None or (recorded and _can_be_read_backwards(definition))
+            else None
+        )
         self.by_rule = None if self.ruled is None else partial(_BY_RULE[named.point.kind], self.ruled)
         space = definition.observation_space
         actions: Any = definition.action_space
@@ -118,6 +118,16 @@ class Binding:
             elif not part and isinstance(value, Mapping):
                 value = {**value, _spaces.MASK: mask}
         return self.cast(value)
+
+    def blank(self) -> Any:
+        """Make the observation of an agent of which nothing is known yet: zero, and with all actions legal."""
+        observation = _spaces.blank(self.definition.observation_space)
+        if self.legal is None or not self._masked_parts:
+            return observation
+        for part in self._masked_parts:
+            whole = observation[part] if part else observation
+            whole[_spaces.MASK] = _spaces.open_mask(self.definition.action_space)
+        return self.cast(observation)
 
     def reply(self, action: Any, agent: str, mask: Any, choices: Any) -> Any:
         """Check an action, and turn it into the reply that the simulation gets.

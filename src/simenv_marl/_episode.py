@@ -433,6 +433,11 @@ class Episode:
                 record.hold(args, {})
                 record.observe(args, {})
                 record.choices = None  # which are asked for again when it decides
+        if self.clock is None and not any(binding.legal or binding.padded for binding in self._plan.active):
+            return
+        for record in self.agents.values():
+            if record.observation is None:  # there are learners to whom the infos of the reset tell all keys
+                record.info = record.unseen()
 
     def _announced(self) -> Iterable[tuple[Record, tuple[Any, ...]]]:
         """The live agents that the simulation says are going to decide, with the arguments of their calls."""
@@ -495,7 +500,7 @@ class Episode:
         self._latest = record
         arguments = record.arguments()
         if arguments is None:  # it was never seen, or the model has let it go
-            record.reward, record.info = 0.0, {}
+            record.reward, record.info = 0.0, record.unseen()
         else:
             record.settle(*arguments, last=True)
         record.forget()

@@ -64,6 +64,8 @@ class Trajectories:
         extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
         observation_space, action_space: Of the decision point. None where nobody has decided, and it is not known at
             which point they would have.
+        collected: What ``collect`` has returned of each episode's simulation, in the order of the seeds. None where it
+            was not asked for.
     """
 
     _: KW_ONLY
@@ -89,6 +91,7 @@ class Trajectories:
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     observation_space: spaces.Space[Any] | None = None
     action_space: spaces.Space[Any] | None = None
+    collected: tuple[Any, ...] | None = None
 
     def __len__(self) -> int:
         """N, the number of decisions."""
@@ -129,8 +132,9 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
     first_rows = np.cumsum([0, *(len(part) for part in parts)])
     codes = {name: code for code, name in enumerate(dict.fromkeys(name for part in parts for name in part.names))}
     filled = [(number, part) for number, part in enumerate(parts) if len(part)]
+    collected = None if parts[0].collected is None else tuple(one for part in parts for one in part.collected or ())
     if not filled:
-        return replace(parts[0], seeds=seeds)
+        return replace(parts[0], seeds=seeds, collected=collected)
 
     def together(name: str) -> Any:
         values = [getattr(part, name) for _, part in filled]
@@ -151,6 +155,7 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
         extras={name: joined([part.extras[name] for _, part in filled]) for name in filled[0][1].extras},
         observation_space=filled[0][1].observation_space,
         action_space=filled[0][1].action_space,
+        collected=collected,
     )
 
 

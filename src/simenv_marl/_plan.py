@@ -85,7 +85,9 @@ class Plan:
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
             if policy is RULE and not excepted:
                 continue  # nobody needs to be asked
-            binding = self.bindings[point.point] = Binding(point, agent, policy, recorded=asked is not None)
+            binding = self.bindings[point.point] = Binding(
+                point, agent, policy, recorded=asked is not None, padded=options.padded
+            )
             if self._is_asked(agent, policy) if asked is not None else policy is None and agent not in self.policies:
                 active.append(binding)
         self.active = active

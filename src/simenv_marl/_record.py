@@ -85,7 +85,7 @@ class Record:
         offered, self.offered = self.offered, None
         assert self.binding.ruled is not None
         self.rule_action = self.binding.ruled.action(decision, args, kwargs, offered)
-        self.news = self.binding.tells and self.rule_action is not None
+        self.news = self.binding.definition.rule_action_mapping is not None and self.rule_action is not None
 
     def arguments(self) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
         """The arguments of the latest decision; None where there are none any more."""
@@ -114,7 +114,7 @@ class Record:
 
     def forget(self) -> None:
         """Let go of the arguments; the agent has no more to observe."""
-        self._args = self._weakly = None
+        self._args = self._weakly = self._time = None
         self._kwargs = {}
 
     def settle(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
@@ -170,11 +170,20 @@ class Record:
                 info[_spaces.MASK] = _spaces.duplicate(self.mask)
             if self.clock is not None:
                 info |= self._passed(self.clock())
+            if binding.padded:
+                info["present"] = True
             if self.news:
                 info["rule_action"], self.news = _spaces.duplicate(self.rule_action), False
             self.observation = binding.observation(args, kwargs, self.mask)
         if DIFFERENCES:
             EVALUATING.pop(get_ident(), None)
+
+    def unseen(self) -> dict[str, Any]:
+        """Make the info of an agent that cannot be observed: that of any other of its point, with all actions legal."""
+        info: dict[str, Any] = {"present": False} if self.binding.padded else {}
+        if self.binding.legal is not None:
+            info[_spaces.MASK] = _spaces.open_mask(self.binding.definition.action_space)
+        return info if self.clock is None else info | self._passed(self.clock())
 
     def arise(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Find out what must be known of a decision in mid-round. The arguments are those of ``settle``."""

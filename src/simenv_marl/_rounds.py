@@ -250,7 +250,7 @@ class Rounds(Episode):
     def _settle(self, record: Record, pending: Record | None) -> None:
         arguments = record.arguments()
         if arguments is None:
-            record.reward, record.info = 0.0, {}
+            record.reward, record.info = 0.0, record.unseen()
             return
         self._latest = record
         record.settle(*arguments)

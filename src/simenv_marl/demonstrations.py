@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,10 @@ from .many import collect_episodes, learners_plan
 from .simulation import RULE
 
 __all__ = ["Comparison", "Mixture", "compare_with_rule", "record_dataset", "save_dataset"]
+
+
+PLAYING: Final = ("batch_size", "collect", "progress", "workers")
+"""Options of ``collect_episodes`` that are none of the environment."""
 
 
 # -- who demonstrates -----------------------------------------------------------------------------
@@ -406,7 +410,7 @@ def compare_with_rule(
     if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
         raise OptionValueError(f"others must be a dict of policies for those who are not compared, not {others!r}")
     by_rule = dict.fromkeys(policies, RULE)
-    checked = {name: value for name, value in options.items() if name not in ("batch_size", "workers", "progress")}
+    checked = {name: value for name, value in options.items() if name not in PLAYING}
     _check_knowable(simulation, {**by_rule, **(others or {})}, by_rule, points, checked)
     asked = {id(policy): _Onlooker(policy) for policy in policies.values()}
     onlookers = {key: asked[id(policy)] for key, policy in policies.items()}

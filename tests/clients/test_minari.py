@@ -1,5 +1,9 @@
 """Minari data sets of what was decided, read again by Minari and by a learner."""
 
+import sys
+from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, SKIP, DocTestParser, DocTestRunner
+from pathlib import Path
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -267,3 +271,15 @@ def test_a_learner_imitates_the_rule():
         script(herd), {Being.act: policy}, points=points, seeds=range(100, 140), tolerance=0.02
     )
     assert compared[Being.act].agreement == 1.0
+
+
+def test_the_page_on_demonstrations_does_what_it_says(monkeypatch):
+    """With the examples that need Minari, which are skipped where it is not there."""
+    page = Path(__file__).parents[2] / "docs" / "demonstrations.md"
+    monkeypatch.syspath_prepend(page.parent)
+    for model in ("bakery", "bakery_env"):
+        monkeypatch.delitem(sys.modules, model, raising=False)
+    examples = DocTestParser().get_doctest(page.read_text(encoding="utf-8"), {}, page.name, str(page), 0)
+    skipped = [example.options.pop(SKIP, False) for example in examples.examples]
+    assert sum(skipped) > 3
+    assert DocTestRunner(optionflags=ELLIPSIS | NORMALIZE_WHITESPACE).run(examples).failed == 0

@@ -178,7 +178,7 @@ class JointSeat(Seat, SimulationJointEnv):
         self._like = first = seating.first
         self._agents, self._flatten, self._time = first._agents, first._flatten, None
         if self._flatten:
-            self._cuts = first._cuts
+            self._places = first._places
 
     def _patterns(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         return self._like.observation_space, self._like.action_space

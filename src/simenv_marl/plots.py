@@ -44,7 +44,6 @@ COLOURS: Final = (
 """Of actions. The first ones are Okabe's and Ito's, which people of all kinds of sight can tell apart."""
 
 INK, PALE, ABSENT, UNKNOWN = "#333333", "#C9C9C9", "#E9E9E9", "#BDBDBD"
-POLICY, RULE_ = "#0072B2", "#D55E00"
 
 
 # -- one episode ----------------------------------------------------------------------------------
@@ -523,8 +522,6 @@ def _colour_actions(figure: Any, axes: Axes, rows: Sequence[_Row], which: int, l
         colours = {action: COLOURS[action if inside else rank] for rank, action in enumerate(leaf.names)}
         _coloured(axes, cells[known], facecolors=[colours[int(value)] for value in values[known]])
         legend = [Patch(color=colours[action], label=name) for action, name in leaf.names.items()]
-    if not known.all():
-        legend.append(Patch(color=UNKNOWN, label="rule, unknown"))
     if legend:
         axes.legend(
             handles=legend,
@@ -588,6 +585,10 @@ def _legend(axes: Axes, rows: Sequence[_Row], *, charts: bool) -> None:
         marks.append(
             Line2D([], [], marker="o", color=colour, markerfacecolor="white", linewidth=0, markersize=4, label="rule")
         )
+    if ruled and not charts:
+        marks.append(Line2D([], [], color=INK, linewidth=2, label="by rule"))
+        if not known:
+            marks.append(Line2D([], [], color=UNKNOWN, linewidth=2, label="by rule, unknown"))
     for place, (marker, text) in enumerate((("x", "terminated"), ("|", "truncated"))):
         if any(_ends(row)[place][1] for row in rows):
             marks.append(Line2D([], [], marker=marker, color=INK, linewidth=0, markersize=6, label=text))
@@ -602,7 +603,8 @@ def _legend(axes: Axes, rows: Sequence[_Row], *, charts: bool) -> None:
             ncols=len(marks),
             fontsize=8.5,
             frameon=False,
-            handletextpad=0.1,
+            handlelength=1.5,
+            handletextpad=0.4,
             columnspacing=1.2,
             borderaxespad=0.2,
         )

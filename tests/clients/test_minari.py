@@ -170,6 +170,23 @@ def test_metadata_say_where_it_is_from():
     assert "simulation" in metadata["provenance"]
 
 
+def test_the_environment_can_be_recovered():
+    greenhouse = pytest.importorskip("examples.greenhouse_coop.env")
+    policies, metadata = {"waterer_0": RULE}, {"env": "greenhouse_coop/Watering-v0"}
+    record_dataset(NAME, greenhouse.GreenhouseSim, policies, points=greenhouse.WATERING, seeds=[5], metadata=metadata)
+    dataset = minari.load_dataset(NAME)
+    env = dataset.recover_environment()
+    observation, _ = env.reset(seed=5)
+    assert np.array_equal(observation, dataset[0].observations[0])
+    for action, following, reward in zip(
+        dataset[0].actions, dataset[0].observations[1:], dataset[0].rewards, strict=True
+    ):
+        observation, obtained, *_ = env.step(action)
+        assert np.allclose(observation, following)
+        assert obtained == pytest.approx(reward)
+    env.close()
+
+
 def test_nothing_is_overwritten_and_nothing_is_run_in_vain():
     ant = decision(agent="ant_0")
     record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1])

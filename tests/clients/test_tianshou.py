@@ -98,9 +98,8 @@ def test_one_agent():
     """The single view is a Gymnasium environment like any other."""
     np.random.seed(0)
     algorithm = learner(spaces.Discrete(4), 4)
-    collected = Collector(algorithm, DummyVectorEnv([lambda: single_env(ShopSim, Shop.choose_display)] * 2)).collect(
-        n_episode=2, reset_before_collect=True
-    )
+    envs = DummyVectorEnv([lambda: single_env(ShopSim, Shop.choose_display)] * 2)
+    collected = Collector(algorithm, envs).collect(n_episode=2, reset_before_collect=True)
     assert collected.lens.tolist() == [10, 10]
 
 
@@ -129,4 +128,4 @@ def test_the_page(monkeypatch):
     names = next(steps)
     after = aec_return(env, greedy(names["algorithm"]))
     assert after > before + 3
-    assert names["baker"](Batch(obs=np.array([[0, 0.5]]), info=Batch())).act in spaces.Discrete(5)
+    assert names["baker"](Batch(obs=np.array([[0, 0.5]]), info=Batch())).act[0] in spaces.Discrete(5)

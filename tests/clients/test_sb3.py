@@ -65,7 +65,7 @@ def test_joint_actions_by_agent_are_refused():
 
 
 def test_it_takes_no_vector_environments_of_gymnasium():
-    with pytest.raises(ImportError, match="not a Gymnasium environment"):
+    with pytest.raises(ValueError, match="not a Gymnasium environment"):
         PPO("MlpPolicy", vector_env(ReservoirSim, num_envs=2))
 
 

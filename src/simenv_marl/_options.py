@@ -27,6 +27,8 @@ class Options:
         possible_agents: The roster, where agents are named by a callable: their names, or a dict from
             decision point to names. Declared agents are there from ``reset`` on.
         undeclared: What a decision of an agent outside the roster becomes: "error", or "rule".
+        padded: Whether everybody of the roster stands in ``agents`` from the reset to the end of an episode: also those
+            who are yet to be born or whom the model has removed, as agents that do not decide.
         max_steps: After how many calls of ``step`` with an action an episode is truncated; None: never.
         policies: Who decides without being an agent of the environment: from the name of an agent, or from a
             decision point (dotted name or decision function), to a callable of the observation, or of the
@@ -46,6 +48,7 @@ class Options:
     driver: str = "greenlet"
     possible_agents: Any = None
     undeclared: str = "error"
+    padded: bool = False
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
     plugins: Iterable[Any] = ()
@@ -63,8 +66,9 @@ class Options:
             )
         if self.undeclared not in ("error", "rule"):
             raise OptionValueError(f'undeclared must be "error" or "rule", not {self.undeclared!r}')
-        if not isinstance(self.global_rng, bool):
-            raise OptionValueError(f"global_rng must be True or False, not {self.global_rng!r}")
+        for name in ("global_rng", "padded"):
+            if not isinstance(getattr(self, name), bool):
+                raise OptionValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
         state_space = self.state_space
         if not (state_space is None or isinstance(state_space, spaces.Space) or state_space == "observations"):
             raise OptionValueError(f'state_space must be a gymnasium space or "observations", not {state_space!r}')

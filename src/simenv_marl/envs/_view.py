@@ -23,8 +23,8 @@ from .._episode import Episode
 from .._plan import Plan
 from .._provenance import describe
 from .._session import AnyEpisode, Session, checked_seed, seed_space
-from .._spaces import blank, duplicate, observation_cast
-from ..errors import CopyError, ReentrancyError, UnknownAgentError, UnknownOptionError, ViewError
+from .._spaces import duplicate, observation_cast
+from ..errors import CopyError, OptionValueError, ReentrancyError, UnknownAgentError, UnknownOptionError, ViewError
 from ..plugins import Entry
 
 
@@ -323,9 +323,12 @@ class AgentsView(View):
         Raises:
             SimEnvError: Something in the plan cannot work.
         """
+        if plan.options.padded and not plan.complete:
+            raise OptionValueError("padded=True needs a roster: say in possible_agents= who there may be")
         super().__init__(plan)
         if plan.possible_agents is not None:
             self.possible_agents = plan.possible_agents
+        self._padded = plan.options.padded
         self._generator: np.random.Generator | None = None
         self._observation_spaces: dict[str, spaces.Space[Any]] = {}
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
@@ -423,8 +426,8 @@ class AgentsView(View):
     def _observation(self, episode: Episode, agent: str) -> Any:
         """The latest observation of an agent, as a copy of the caller's own."""
         record = episode.record(agent)
-        if record is None or record.observation is None:
-            return blank(self._binding(agent).definition.observation_space)
+        if record is None or record.observation is None or (self._padded and agent in episode.gone):
+            return self._binding(agent).blank()
         return duplicate(record.observation)
 
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from .._episode import Episode
 from .._plan import Plan
 from .._rounds import Rounds
-from .._spaces import blank, duplicate, open_mask
+from .._spaces import duplicate, open_mask
 from ..errors import InvalidActionError, ViewError
 from ..simulation import RULE
 from ._view import OneAgentView
@@ -148,7 +148,7 @@ class SimulationJointEnv(OneAgentView):
         for agent in self._agents:
             record = episode.record(agent)
             if record is None or record.observation is None:
-                observations[agent] = blank(self._plan.roster[agent].definition.observation_space)
+                observations[agent] = self._plan.roster[agent].blank()
             else:
                 observations[agent] = duplicate(record.observation)
         if self._flatten:

@@ -158,13 +158,11 @@ def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
     algorithm.stop()
     assert live == after
     assert after > before + 5
-    # The model's own loop runs just as the environment's.
-    env = parallel_greenhouse()
-    observations, _ = env.reset(seed=1)
-    while env.agents:
-        observations, *_ = env.step(
-            {agent: policies[agent](observation) for agent, observation in observations.items()}
-        )
+    # The model's own loop runs just as the environment's in which one decides after the other.
+    env = aec_greenhouse()
+    env.reset(seed=1)
+    while not any(env.terminations.values()) and not any(env.truncations.values()):
+        env.step(policies[env.agent_selection](env.observe(env.agent_selection)))
     assert names["greenhouse"].day == env.simulation.greenhouse.day
     assert names["greenhouse"].water_use == env.simulation.greenhouse.water_use > 0
 

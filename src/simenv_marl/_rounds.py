@@ -35,7 +35,10 @@ class Rounds(Episode):
             self._quick = {
                 binding: binding.name_agent
                 for binding in plan.active
-                if binding.name_agent is not None and binding.legal is None and binding.point.alone
+                if binding.name_agent is not None
+                and binding.legal is None
+                and binding.point.alone
+                and not binding.tells
             }
         super().__init__(plan, simulation, *others)
         self._announces = getattr(simulation, "expected_calls", None) is not None

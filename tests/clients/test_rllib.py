@@ -134,7 +134,7 @@ def in_the_hive(policy, seeds=range(10_000, 10_040)):
         env = parallel_env(HiveSim, points(DEFINITION), possible_agents=BEES)
         observations, _ = env.reset(seed=seed)
         while env.agents:
-            observations, rewards, _, _, _ = env.step({agent: int(policy(observations[agent])) for agent in env.agents})
+            observations, rewards, _, _, _ = env.step({agent: policy(observations[agent]) for agent in env.agents})
             brought += sum(rewards.values())
     return brought / len(seeds)
 
@@ -228,8 +228,9 @@ def test_one_policy_for_all_who_are_born(view, policy_of):
     algorithm.stop()
     assert after > before + 3
     # All bees of a hive, born whenever, in the model's own loop.
-    hives = [simulate(HiveSim, {Bee.choose_meadow: lambda seen: int(policy(seen))}, seed=seed) for seed in range(20)]
-    assert np.mean([simulation.hive.day for simulation in hives]) > 10
+    policies = {Bee.choose_meadow: policy}
+    hives = [simulate(HiveSim, policies, points=points(DEFINITION), seed=seed).hive for seed in range(20)]
+    assert np.mean([hive.day for hive in hives]) > 10
 
 
 def test_masks_are_read_from_observations():

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from examples.greenhouse_coop import env as greenhouse
 from gymnasium import spaces
 from torchrl.envs import ExplorationType, GymWrapper, PettingZooWrapper, check_env_specs, set_exploration_type
 
-from examples.greenhouse_coop import env as greenhouse
 from simenv_marl import RULE, aec_env, parallel_env, simulate
 
 from .fragments import blocks
@@ -37,7 +37,8 @@ def test_the_greenhouse(make, grouped):
     check_env_specs(env)
     env.set_seed(1)
     days = env.rollout(300)
-    assert days["next", "done"][-1].all() and not days["next", "done"][:-1].any()
+    assert days["next", "done"][-1].all()
+    assert not days["next", "done"][:-1].any()
 
 
 def test_one_agent():
@@ -60,7 +61,8 @@ def test_births_and_deaths(view, definition, grouped, done_on_any):
     for seed in range(60):
         env.set_seed(seed)
         ended = env.rollout(200)["next"]
-        assert ended["done"][-1].all() and not ended["done"][:-1].any()
+        assert ended["done"][-1].all()
+        assert not ended["done"][:-1].any()
         ends.add(bool(ended["truncated"][-1]))
         if len(ends) == 2:
             break

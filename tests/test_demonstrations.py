@@ -8,11 +8,13 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
+    DefinitionError,
     InvalidActionError,
     MissingExtraError,
     Mixture,
     OptionValueError,
     collect_episodes,
+    compare_with_rule,
     record_dataset,
     save_dataset,
     simulate_many,
@@ -187,3 +189,140 @@ def test_what_cannot_be_saved():
         save_dataset("ants-v0", collect_episodes(calling(ant), {ant: ones}, seeds=[1]))
     with pytest.raises(OptionValueError, match="policies"):
         record_dataset("ants-v0", calling(ant), ones, seeds=[1])
+
+
+def test_what_the_rule_decides_must_be_known_before_anything_runs(monkeypatch):
+    monkeypatch.setattr("simenv_marl.demonstrations._check_free", lambda names: [])
+
+    def never(simulation):
+        raise AssertionError
+
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", rule_action_mapping=lambda decided: 3)
+    for policy in (RULE, Mixture({ones: 1, RULE: 1}), Mixture({Mixture({RULE: 1}): 1})):
+        with pytest.raises(DefinitionError, match=r"choose.*rule_action_mapping"):
+            record_dataset("ants-v0", script(never), {ant: policy}, points=[ant, bee], seeds=[1])
+        with pytest.raises(AssertionError):
+            record_dataset("bees-v0", script(never), {bee: policy}, points=[ant, bee], seeds=[1])
+    with pytest.raises(AssertionError):
+        record_dataset("ants-v0", script(never), {ant: Mixture({ones: 1, RULE: 0})}, points=[ant], seeds=[1])
+    with pytest.raises(DefinitionError, match="rule_action_mapping"):
+        compare_with_rule(script(never), {ant: ones}, points=[ant], seeds=[1])
+
+
+# -- comparisons ----------------------------------------------------------------------------------
+
+
+def told(**changes):
+    return beings(rule_action_mapping=lambda decided, being: being.health, **changes)
+
+
+def crowd(simulation):
+    """Beings whose rule corresponds to 0, 1, 2, one after the other."""
+    simulation.crowd = [Being(number) for number in range(3)]
+    simulation.log = []
+    for step in range(3):
+        for being in simulation.crowd:
+            being.health = step
+            simulation.log.append(being.act())
+
+
+def test_policies_are_asked_while_the_rule_decides():
+    logs = []
+
+    def main(simulation):
+        crowd(simulation)
+        logs.append(simulation.log)
+
+    found = compare_with_rule(script(main), {Being.act: ones}, points=told(), seeds=[1, 2])[Being.act]
+    assert logs == [["rule"] * 9] * 2
+    assert found.trajectories.by_rule.all()
+    assert found.trajectories.actions.tolist() == [0, 1, 2] * 6
+    assert found.policy_actions.tolist() == [1] * 18
+    assert found.agreements.tolist() == [False, True, False] * 6
+    assert found.agreement == pytest.approx(1 / 3)
+    assert found.trajectories.extras == {}
+    assert "0.333" in repr(found)
+
+
+def test_the_rule_is_what_it_was_collected_as():
+    compared = compare_with_rule(script(crowd), {Being.act: ones}, points=told(), seeds=[1, 2], batch_size=1)
+    alone = collect_episodes(script(crowd), {Being.act: RULE}, points=told(), seeds=[1, 2])
+    one, other = compared[Being.act].trajectories, alone[Being.act]
+    for name in ("observations", "actions", "rewards", "terminations", "starts", "episodes", "by_rule", "turns"):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_who_would_leave_it_to_the_rule_agrees_with_it():
+    policy = Mixture({RULE: 1, (lambda seen: [7] * len(seen)): 1})
+    found = compare_with_rule(script(crowd), {Being.act: policy}, points=told(), seeds=range(4))[Being.act]
+    assert set(np.unique(found.policy_actions)) == {0, 1, 2, 7}
+    assert found.agreements.tolist() == (found.policy_actions != 7).tolist()
+
+
+def test_numbers_may_differ_by_a_tolerance():
+    space = spaces.Dict(how=spaces.Box(-9, 9, (2,), np.float32), what=spaces.Discrete(3))
+    ant = decision(
+        agent="ant_0",
+        action_space=space,
+        rule_action_mapping=lambda decided: {"how": np.array([1, 2], np.float32), "what": 1},
+    )
+    answers = [([1, 2], 1), ([1.5, 2], 1), ([1, 2.75], 1), ([1, 2], 2)]
+
+    def agreements(tolerance):
+        simulation = calling(ant, ant, ant, ant)
+        queue = iter(answers)
+
+        def policy(seen):
+            how, what = next(queue)
+            return [{"how": np.array(how, np.float32), "what": what}]
+
+        return compare_with_rule(simulation, {ant: policy}, seeds=[1], tolerance=tolerance)[ant].agreements.tolist()
+
+    assert agreements(0.0) == [True, False, False, False]
+    assert agreements(0.5) == [True, True, False, False]
+    assert agreements(1) == [True, True, True, False]
+
+
+def test_comparisons_of_several_policies_and_of_nobody():
+    ant, bee = (decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0"))
+    found = compare_with_rule(calling(ant, ant), {"ant_0": ones, bee: ones}, points=[ant, bee], seeds=[1])
+    assert list(found) == ["ant_0", bee]
+    assert found["ant_0"].agreement == 1.0
+    assert np.isnan(found[bee].agreement)
+
+
+def test_others_may_decide_beside_the_rule():
+    ant, bee = decision(agent="ant_0", rule_action_mapping=lambda decided: 1), decision(agent="bee_0")
+    logs = []
+
+    def main(simulation):
+        logs.append([ant(), bee()])
+
+    found = compare_with_rule(script(main), {ant: twos}, others={bee: twos}, points=[ant, bee], seeds=[1])
+    assert logs == [["rule", 2]]
+    assert list(found) == [ant]
+    assert found[ant].policy_actions.tolist() == [2]
+
+
+def test_decisions_that_correspond_to_no_action():
+    points = beings(rule_action_mapping=lambda decided, being: None if being.number == 2 else 1)
+    with pytest.raises(DefinitionError, match=r"in 3 of 9 decisions .*'being_2' at turn 2 of the episode of seed 8"):
+        compare_with_rule(script(crowd), {Being.act: ones}, points=points, seeds=[8])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"policies": ones},
+        {"policies": {"ant_0": RULE}},
+        {"tolerance": -1},
+        {"others": 3},
+        {"tolerance": "1"},
+    ],
+    ids=str,
+)
+def test_comparisons_that_cannot_be(wrong):
+    ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 1)
+    given = {"policies": {ant: ones}, "seeds": [1], **wrong}
+    with pytest.raises(OptionValueError, match=r"policies|tolerance|others"):
+        compare_with_rule(calling(ant), given.pop("policies"), **given)

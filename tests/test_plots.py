@@ -255,7 +255,7 @@ def test_what_only_the_rule_knows_is_grey():
         if len(cells.get_facecolor())
     ]
     assert any(greys)
-    assert any("rule" in text for axes in of_each for text in texts(axes))
+    assert any("by rule, unknown" in texts(axes.figure.axes[1]) for axes in of_each)
 
 
 def test_nobody_but_the_rule_can_be_drawn():
@@ -460,3 +460,18 @@ def test_hundreds_of_agents_are_too_many_rows():
     plot_returns(many)
     with pytest.raises(OptionValueError, match="per"):
         plot_returns(many, per="wolf")
+
+
+def test_what_the_rule_has_decided_is_shown_where_it_is_known():
+    ant = decision(agent="ant_0", action_space_mapping={**dict(enumerate("abcdefghi")), 9: "rule"})
+    answers = iter([[1], RULE, [3]])
+    found = collect_episodes(calling(ant, ant, ant), {ant: lambda seen: next(answers)}, seeds=[1])
+    assert dots(plot_timeline(found).axes[0]) == [([[0, 1], [2, 3]], True), ([[1, 9]], False)]
+    points = beings(action_space_mapping={**dict(enumerate("abcdefghi")), 9: "rule"})
+    policy = lambda seen: [RULE if number == 3 else 4 for number in seen[:, 0]]  # noqa: E731
+    actions = plot_timeline(collect_episodes(herd(8, 2), {Being.act: policy}, points=points, seeds=[5])).axes[0]
+    cells = of(actions, PolyCollection)[-1]
+    assert texts(actions) == ["4", "9"]
+    heights = [round(path.get_extents().height, 3) for path in cells.get_paths()]
+    assert [height for height in heights if height != heights[0]] == [heights[6]] * 2
+    assert heights[6] < heights[0] / 2

@@ -405,7 +405,7 @@ def _check_extras(extras: Sequence[Mapping[str, Any]]) -> None:
 
 def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
     """What there is to know of a policy that was never asked."""
-    binding = next((b for b in plan.bindings.values() if isinstance(b, Binding) and _answers(plan, b, place)), None)
+    binding = next((b for b in plan.bindings.values() if isinstance(b, Binding) and answers(plan, b, place)), None)
     definition = None if binding is None else binding.definition
     none = np.zeros(0, np.int64)
     observations = np.zeros(0) if definition is None else empty(definition.observation_space)
@@ -431,6 +431,7 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
     )
 
 
-def _answers(plan: Plan, binding: Binding, place: int) -> bool:
+def answers(plan: Plan, binding: Binding, place: int) -> bool:
+    """Whether it is known beforehand that a policy, by its place, answers at a decision point."""
     policy = binding.policy if binding.agent is None else plan.policies.get(binding.agent, binding.policy)
     return isinstance(policy, Entry) and policy.place == place

@@ -11,20 +11,25 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ._batches import Asked
-from ._ledger import Trajectories
+from ._bindings import Binding
+from ._ledger import Trajectories, answers
 from ._provenance import provenance
 from ._stacks import joined, rows, stacker, taken
 from .errors import DefinitionError, InvalidActionError, MissingExtraError, OptionValueError
-from .many import collect_episodes
+from .many import collect_episodes, learners_plan
 from .simulation import RULE
 
 __all__ = ["Comparison", "Mixture", "compare_with_rule", "record_dataset", "save_dataset"]
+
+
+PLAYING: Final = ("batch_size", "collect", "progress", "workers")
+"""Options of ``collect_episodes`` that are none of the environment."""
 
 
 # -- who demonstrates -----------------------------------------------------------------------------
@@ -85,10 +90,10 @@ class Mixture:
             if asked is None or not len(own):
                 continue
             where = own.tolist()
-            answers = asked.answers(
+            returned = asked.answers(
                 taken(observations, own), [infos[row] for row in where], [identities[row] for row in where]
             )
-            for row, action in zip(where, _rows(answers, len(where), self.policies[number]), strict=True):
+            for row, action in zip(where, _rows(returned, len(where), self.policies[number]), strict=True):
                 actions[row] = action
         return actions, {"component": component}
 
@@ -108,14 +113,14 @@ def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return state ^ (state >> np.uint64(31))
 
 
-def _rows(answers: Any, number: int, policy: Any) -> list[Any]:
-    """What a policy has answered to so many decisions, without its extras."""
-    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
-        answers = answers[0]
-    actions = [RULE] * number if answers is RULE else rows(answers, integers=False)
+def _rows(returned: Any, number: int, policy: Any) -> list[Any]:
+    """What a policy has decided of so many decisions, without its extras."""
+    if type(returned) is tuple and len(returned) == 2 and isinstance(returned[1], Mapping):
+        returned = returned[0]
+    actions = [RULE] * number if returned is RULE else rows(returned, integers=False)
     if actions is None or len(actions) != number:
-        returned = repr(answers) if actions is None else f"{len(actions)} actions"
-        raise InvalidActionError(f"{policy!r} was asked for {number} decisions at once and has returned {returned}")
+        what = repr(returned) if actions is None else f"{len(actions)} actions"
+        raise InvalidActionError(f"{policy!r} was asked for {number} decisions at once and has returned {what}")
     return actions
 
 
@@ -370,13 +375,14 @@ def compare_with_rule(
     *,
     seeds: Iterable[int],
     points: Any = None,
+    others: Mapping[Any, Any] | None = None,
     tolerance: float = 0.0,
     **options: Any,
 ) -> dict[Any, Comparison]:
     """Let the model's own rule decide, and ask policies what they would have done instead.
 
     At each decision the policy sees what it would see if it decided; then the rule decides. So the episodes are those
-    of the plain model.
+    of the plain model, unless there are others.
 
     Args:
         simulation: As ``collect_episodes`` takes it.
@@ -384,6 +390,7 @@ def compare_with_rule(
             checks.
         seeds: What the simulations are reset with.
         points: The decision points, as ``generate_env`` takes them.
+        others: Who decides where no rule does, as ``collect_episodes`` takes policies. They are not compared.
         tolerance: By how much numbers in actions may differ for the two to agree; those of ``Box`` spaces of floats.
         **options: As ``collect_episodes`` takes them.
 
@@ -400,12 +407,15 @@ def compare_with_rule(
         raise OptionValueError(f"policies must be a dict from agents or points to callables, not {policies!r}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
         raise OptionValueError(f"tolerance must be a number that is not negative, not {tolerance!r}")
+    if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
+        raise OptionValueError(f"others must be a dict of policies for those who are not compared, not {others!r}")
     by_rule = dict.fromkeys(policies, RULE)
-    _check_knowable(simulation, by_rule, by_rule, points, {})
+    checked = {name: value for name, value in options.items() if name not in PLAYING}
+    _check_knowable(simulation, {**by_rule, **(others or {})}, by_rule, points, checked)
     asked = {id(policy): _Onlooker(policy) for policy in policies.values()}
     onlookers = {key: asked[id(policy)] for key, policy in policies.items()}
-    collected = collect_episodes(simulation, onlookers, seeds=seeds, points=points, **options)
-    return {key: _compared(found, float(tolerance)) for key, found in collected.items()}
+    collected = collect_episodes(simulation, {**onlookers, **(others or {})}, seeds=seeds, points=points, **options)
+    return {key: _compared(collected[key], float(tolerance)) for key in policies}
 
 
 class _Onlooker:
@@ -416,10 +426,10 @@ class _Onlooker:
         self.asked = Asked(policy)
 
     def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
-        answers = _rows(self.asked.answers(observations, infos, identities), len(identities), self.policy)
-        noted = np.empty(len(answers), object)
-        for place, answer in enumerate(answers):
-            noted[place] = answer
+        noted = np.empty(len(identities), object)
+        returned = self.asked.answers(observations, infos, identities)
+        for place, action in enumerate(_rows(returned, len(identities), self.policy)):
+            noted[place] = action
         return RULE, {"noted": noted}
 
 
@@ -432,8 +442,8 @@ def _compared(found: Trajectories, tolerance: float) -> Comparison:
         return Comparison(found, found.actions, np.zeros(0, np.bool_))
     _check_known(found)
     assert found.action_space is not None
-    answers = [_row(found.actions, row) if answer is RULE else answer for row, answer in enumerate(noted)]
-    policy_actions = stacker(found.action_space)(answers)
+    actions = [_row(found.actions, row) if action is RULE else action for row, action in enumerate(noted)]
+    policy_actions = stacker(found.action_space)(actions)
     return Comparison(found, policy_actions, _agreeing(found.actions, policy_actions, tolerance))
 
 
@@ -468,12 +478,35 @@ def _everywhere(parts: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
 
 
 def _check_knowable(
-    simulation: Any, policies: Mapping[Any, Any], keys: Iterable[Any], points: Any, options: Any
+    simulation: Any, policies: Mapping[Any, Any], keys: Iterable[Any], points: Any, options: Mapping[str, Any]
 ) -> None:
-    """Before anything runs: where the rule decides, it must be known which actions its decisions are."""
+    """Before anything runs: where the rule is going to decide, it must be known which actions its decisions are."""
+    plan, places = learners_plan(simulation, policies, points, options)
+    for key in keys:
+        if not _defers(policies[key]):
+            continue
+        for binding in plan.bindings.values():
+            if isinstance(binding, Binding) and binding.ruled is None and answers(plan, binding, places[key]):
+                raise DefinitionError(
+                    f"which action the rule of {binding.point.name} takes is not known; give its make_step a"
+                    " rule_action_mapping, from the rule's decision to the action that it corresponds to"
+                )
+
+
+def _defers(policy: Any) -> bool:
+    """Whether a policy is sure to leave decisions to the rule."""
+    if isinstance(policy, Mixture):
+        return any(_defers(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
+    return policy is RULE
 
 
 def _check_known(found: Trajectories) -> None:
-    """Afterwards the same, where policies have left decisions to the rule."""
-    if found.by_rule.any():
-        raise DefinitionError("unknown")
+    """Afterwards the same, for each decision that was left to the rule."""
+    unknown = np.flatnonzero(~found.known)
+    if len(unknown):
+        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
+        raise DefinitionError(
+            f"in {len(unknown)} of {len(found)} decisions it is not known which action the rule has taken, first in"
+            f" that of {agent!r} at turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point"
+            " needs a rule_action_mapping that returns an action for every decision of the rule"
+        )

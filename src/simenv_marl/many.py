@@ -168,7 +168,7 @@ def collect_episodes(
     _check_numbers(batch_size, workers)
     _check_collect(collect)
     given = dict(_checked_policies(policies))
-    plan, keys = _learners_plan(simulation, given, points, options)
+    plan, keys = learners_plan(simulation, given, points, options)
     bar = progress_bar(len(checked)) if progress else None
     try:
         if not workers or not checked:
@@ -187,7 +187,7 @@ def collect_episodes(
     return {key: found[place] for key, place in keys.items()}
 
 
-def _learners_plan(
+def learners_plan(
     simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
 ) -> tuple[Plan, dict[Any, int]]:
     """The plan of the episodes, and the places of the policies by their keys."""
@@ -210,7 +210,7 @@ def _collect_part(
     seeds: list[int],
 ) -> dict[int, Trajectories]:
     """In a worker: play a part of the episodes."""
-    plan, keys = _learners_plan(simulation, policies, points, options)
+    plan, keys = learners_plan(simulation, policies, points, options)
     return _collect(plan, keys, collect, batch_size, seeds, None)
 
 

@@ -44,7 +44,6 @@ COLOURS: Final = (
 """Of actions. The first ones are Okabe's and Ito's, which people of all kinds of sight can tell apart."""
 
 INK, PALE, ABSENT, UNKNOWN = "#333333", "#C9C9C9", "#E9E9E9", "#BDBDBD"
-POLICY, RULE_ = "#0072B2", "#D55E00"
 
 
 # -- one episode ----------------------------------------------------------------------------------
@@ -185,7 +184,7 @@ def _panels(parts: Mapping[Any, Trajectories], episode: int, agents: Any, action
     leaves, arrays = {}, {}
     for key, found in parts.items():
         if (found.episodes == episode).any():
-            taken_apart = _taken_apart(found.actions, _decided(found), _namer(key, action_names))
+            taken_apart = _taken_apart(found.actions, found.known, _namer(key, action_names))
             leaves[key] = [leaf for leaf, _ in taken_apart]
             arrays[key] = [array for _, array in taken_apart]
     if not leaves:
@@ -289,13 +288,9 @@ def _title(key: Any) -> str:
     return "" if key is None else ".".join(str(getattr(key, "__qualname__", key)).split(".")[-2:])
 
 
-def _decided(found: Trajectories) -> NDArray[np.bool_]:
-    """Of which decisions it is known what they were."""
-    return ~found.by_rule
-
-
 def _known(row: _Row) -> NDArray[np.bool_]:
-    return _decided(row.found)[row.rows]
+    """Of which of its decisions it is known what they were."""
+    return row.found.known[row.rows]
 
 
 # -- few agents: charts ---------------------------------------------------------------------------
@@ -527,8 +522,6 @@ def _colour_actions(figure: Any, axes: Axes, rows: Sequence[_Row], which: int, l
         colours = {action: COLOURS[action if inside else rank] for rank, action in enumerate(leaf.names)}
         _coloured(axes, cells[known], facecolors=[colours[int(value)] for value in values[known]])
         legend = [Patch(color=colours[action], label=name) for action, name in leaf.names.items()]
-    if not known.all():
-        legend.append(Patch(color=UNKNOWN, label="rule, unknown"))
     if legend:
         axes.legend(
             handles=legend,
@@ -592,6 +585,10 @@ def _legend(axes: Axes, rows: Sequence[_Row], *, charts: bool) -> None:
         marks.append(
             Line2D([], [], marker="o", color=colour, markerfacecolor="white", linewidth=0, markersize=4, label="rule")
         )
+    if ruled and not charts:
+        marks.append(Line2D([], [], color=INK, linewidth=2, label="by rule"))
+        if not known:
+            marks.append(Line2D([], [], color=UNKNOWN, linewidth=2, label="by rule, unknown"))
     for place, (marker, text) in enumerate((("x", "terminated"), ("|", "truncated"))):
         if any(_ends(row)[place][1] for row in rows):
             marks.append(Line2D([], [], marker=marker, color=INK, linewidth=0, markersize=6, label=text))
@@ -606,7 +603,8 @@ def _legend(axes: Axes, rows: Sequence[_Row], *, charts: bool) -> None:
             ncols=len(marks),
             fontsize=8.5,
             frameon=False,
-            handletextpad=0.1,
+            handlelength=1.5,
+            handletextpad=0.4,
             columnspacing=1.2,
             borderaxespad=0.2,
         )

@@ -1,13 +1,21 @@
 """Minari data sets of what was decided, read again by Minari and by a learner."""
 
+import sys
+from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, SKIP, DocTestParser, DocTestRunner
+from pathlib import Path
+
 import numpy as np
 import pytest
 from gymnasium import spaces
 
 from simenv_marl import (
+    RULE,
     TRUNCATED,
+    DefinitionError,
+    Mixture,
     OptionValueError,
     collect_episodes,
+    compare_with_rule,
     record_dataset,
     save_dataset,
 )
@@ -183,3 +191,95 @@ def test_half_a_data_set_is_none():
     with pytest.raises(TypeError):
         record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1], metadata={"no such argument": 1})
     record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1])
+
+
+def told(**changes):
+    """Beings whose rule takes their health as an action."""
+    return beings(rule_action_mapping=lambda decided, being: being.health % 10, **changes)
+
+
+def test_the_rule_demonstrates():
+    recorded = record_dataset(NAME, script(herd), {Being.act: RULE}, points=told(), seeds=[3, 1, 5])
+    found = collect_episodes(script(herd), {Being.act: RULE}, points=told(), seeds=[3, 1, 5])[Being.act]
+    check(found, recorded)
+    for episode in minari.load_dataset(NAME):
+        assert episode.actions.tolist() == episode.observations[:-1, 1].tolist()
+        assert episode.infos["by_rule"].tolist() == [True] * len(episode) + [False]
+    assert recorded.storage.metadata["algorithm_name"] == "rule"
+
+
+def test_mixtures_demonstrate_alike_however_they_are_run():
+    mixture = Mixture({RULE: 1, ones: 1})
+    recorded = [
+        record_dataset(
+            f"simenv/mixed-v{n}", script(herd), {Being.act: mixture}, points=told(), seeds=range(5), **options
+        )
+        for n, options in enumerate([{}, {"batch_size": 2}, {"workers": 2}])
+    ]
+    for others in zip(*recorded, strict=True):
+        assert len({str(episode.actions.tolist()) for episode in others}) == 1
+        assert len({str(episode.infos["component"].tolist()) for episode in others}) == 1
+    by_rule = [rule for episode in recorded[0] for rule in episode.infos["by_rule"][:-1]]
+    assert 0 < sum(by_rule) < len(by_rule)
+
+
+def test_what_the_rule_has_taken_must_be_known():
+    with pytest.raises(DefinitionError, match=r"act.*rule_action_mapping"):
+        record_dataset(NAME, script(herd), {Being.act: RULE}, points=beings(), seeds=[1])
+    points = beings(rule_action_mapping=lambda decided, being: None)
+    with pytest.raises(DefinitionError, match="not known"):
+        record_dataset(NAME, script(herd), {Being.act: lambda seen: RULE}, points=points, seeds=[1])
+    assert not minari.list_local_datasets()
+
+
+def test_a_learner_imitates_the_rule():
+    """TorchRL's loss, on what Minari reads: what a rule does in many states is learnt from what it did in some."""
+    torch = pytest.importorskip("torch")
+    tensordict_nn = pytest.importorskip("tensordict.nn")
+    from tensordict import TensorDict
+    from torchrl.objectives import BCLoss
+
+    space = spaces.Box(-1, 1, (1,), np.float32)
+    points = beings(
+        observation_space=spaces.Box(0, 1, (2,), np.float32),
+        observation_space_mapping=lambda being: [being.number / 4, being.health / 12],
+        action_space=space,
+        rule_action_mapping=lambda decided, being: [being.number / 4 - being.health / 12],
+    )
+    record_dataset(NAME, script(herd), {Being.act: RULE}, points=points, seeds=range(40))
+    episodes = list(minari.load_dataset(NAME))
+    data = TensorDict(
+        {
+            "observation": torch.as_tensor(np.concatenate([episode.observations[:-1] for episode in episodes])),
+            "action": torch.as_tensor(np.concatenate([episode.actions for episode in episodes])),
+        },
+        [sum(map(len, episodes))],
+    )
+    network = torch.nn.Linear(2, 1)
+    loss = BCLoss(tensordict_nn.TensorDictModule(network, ["observation"], ["action"]), loss_function="mse")
+    optimizer = torch.optim.Adam(loss.parameters(), 0.05)
+    for _ in range(400):
+        optimizer.zero_grad()
+        loss(data)["loss_bc"].backward()
+        optimizer.step()
+
+    def policy(observations):
+        with torch.no_grad():
+            return network(torch.as_tensor(observations)).clamp(-1, 1)
+
+    compared = compare_with_rule(
+        script(herd), {Being.act: policy}, points=points, seeds=range(100, 140), tolerance=0.02
+    )
+    assert compared[Being.act].agreement == 1.0
+
+
+def test_the_page_on_demonstrations_does_what_it_says(monkeypatch):
+    """With the examples that need Minari, which are skipped where it is not there."""
+    page = Path(__file__).parents[2] / "docs" / "demonstrations.md"
+    monkeypatch.syspath_prepend(page.parent)
+    for model in ("bakery", "bakery_env"):
+        monkeypatch.delitem(sys.modules, model, raising=False)
+    examples = DocTestParser().get_doctest(page.read_text(encoding="utf-8"), {}, page.name, str(page), 0)
+    skipped = [example.options.pop(SKIP, False) for example in examples.examples]
+    assert sum(skipped) > 3
+    assert DocTestRunner(optionflags=ELLIPSIS | NORMALIZE_WHITESPACE).run(examples).failed == 0

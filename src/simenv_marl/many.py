@@ -14,6 +14,7 @@ from ._plan import Plan
 from ._session import checked_seed
 from ._spread import progress_bar, spread
 from .errors import OptionValueError
+from .simulation import RULE
 
 __all__ = ["Trajectories", "collect_episodes", "simulate_many"]
 
@@ -39,8 +40,10 @@ def simulate_many(
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
         policies: Who decides: from agent or decision point to a callable of the observations, or of the observations
-            and the infos, of as many decisions as wait for it. The observations are stacked, ``(batch, *shape)``;
-            where the space is a ``Dict`` or a ``Tuple``, a dict or a tuple of stacks. The infos are a list of dicts.
+            and the infos, or of these and the identities, of as many decisions as wait for it. The observations are
+            stacked, ``(batch, *shape)``; where the space is a ``Dict`` or a ``Tuple``, a dict or a tuple of stacks. The
+            infos are a list of dicts, the identities one of pairs: the seed of the episode, and the number of the
+            decision among all in it.
             It returns as many actions, in the same order: an array, what becomes one (a tensor), a sequence, or a dict
             of these. ``RULE`` in place of an action, or of all of them, leaves it to the model. A tuple of the actions
             and a dict is taken for actions alone (see ``collect_episodes``). Policies that are the same object are
@@ -137,8 +140,9 @@ def collect_episodes(
 
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
-        policies: Who decides, as in ``simulate_many``. A policy may return a tuple of the actions and a dict of arrays
-            of shape ``(batch, ...)`` (log-probabilities, values), which become ``extras``; always of the same names.
+        policies: Who decides, as in ``simulate_many``; ``RULE`` is a policy like any other. A policy may return
+            a tuple of the actions and a dict of arrays of shape ``(batch, ...)`` (log-probabilities, values), which
+            become ``extras``; always of the same names.
         seeds: What the simulations are reset with, non-negative integers.
         points: The decision points, as ``generate_env`` takes them.
         collect: Called with each simulation as soon as it has ended; what it returns stands in ``collected``.
@@ -150,8 +154,7 @@ def collect_episodes(
             ``possible_agents`` says.
 
     Returns:
-        By the keys of ``policies``, what those have lived through for whom each policy has answered; nothing for keys
-        whose policy is ``RULE``.
+        By the keys of ``policies``, what those have lived through for whom each policy has answered.
 
     Raises:
         OptionValueError: An argument cannot have its value, or the extras do not fit the decisions.
@@ -188,9 +191,13 @@ def _learners_plan(
     simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
 ) -> tuple[Plan, dict[Any, int]]:
     """The plan of the episodes, and the places of the policies by their keys."""
-    found = entries(policies)
+    found = entries({key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()})
     keys = {key: entry.place for key, entry in found.items() if isinstance(entry, Entry)}
     return Plan.draw_up(simulation, points, {**options, "policies": found}, unanswered=True, asked=Entry), keys
+
+
+def _left_to_the_rule(observations: Any) -> Any:
+    return RULE
 
 
 def _collect_part(

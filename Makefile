@@ -73,3 +73,10 @@ benchmark: .venv/.test
 
 clean:
 	rm -rf .venv .venv-* docs/_build
+
+# One policy for all sheep of Mesa's model: trained, compared, and drawn into docs/figures.
+.PHONY: wolf-sheep
+wolf-sheep: .venv-clients/.clients
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.train
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.results
+	.venv-clients/bin/python -m examples.wolf_sheep.picture

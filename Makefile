@@ -73,3 +73,25 @@ benchmark: .venv/.test
 
 clean:
 	rm -rf .venv .venv-* docs/_build
+
+# One policy for all sheep of Mesa's model: trained, compared, and drawn into docs/figures.
+.PHONY: wolf-sheep
+wolf-sheep: .venv-clients/.clients
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.train
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.results
+	.venv-clients/bin/python -m examples.wolf_sheep.picture
+
+# The cooperative experiment, all of it: about an hour on two cores. What is done already is not done again.
+.PHONY: experiment
+EXPERIMENT := examples.greenhouse_coop.experiment
+EXPERIMENT_OUT ?= examples/greenhouse_coop/out/experiment
+EXPERIMENT_WORKERS ?= 2
+experiment: export OMP_NUM_THREADS = 1
+experiment: .venv-clients/.clients .venv-rllib/.rllib
+	for script in baselines sb3 torchrl; do \
+	    $(<D)/bin/python -m $(EXPERIMENT).$$script --out $(EXPERIMENT_OUT) --workers $(EXPERIMENT_WORKERS) || exit; \
+	done
+	.venv-rllib/bin/python -m $(EXPERIMENT).rllib --out $(EXPERIMENT_OUT) --workers $(EXPERIMENT_WORKERS)
+	$(<D)/bin/python -m $(EXPERIMENT).results --runs $(EXPERIMENT_OUT)
+	$(<D)/bin/python -m $(EXPERIMENT).back_in_the_model $(EXPERIMENT_OUT)/sb3-3-0.zip $(EXPERIMENT_OUT)/torchrl-4b-0.pt
+	.venv-rllib/bin/python -m $(EXPERIMENT).back_in_the_model $(EXPERIMENT_OUT)/rllib-4a-0

@@ -352,6 +352,28 @@ def test_extras_stand_row_by_row():
     assert found.extras["logits"].dtype == np.float32
 
 
+def test_extras_may_be_tensors_and_buffers_that_are_used_again():
+    class Tensor:
+        """Becomes an array as those of torch do, which know no copies."""
+
+        def __init__(self, array):
+            self.array = array
+
+        def __array__(self, dtype=None):
+            return self.array if dtype is None else self.array.astype(dtype)
+
+    buffer = np.zeros(1, np.float32)
+    ant = decision(agent="ant_0")
+
+    def policy(observations):
+        buffer[:] += 1
+        return ones(observations), {"tensors": Tensor(buffer), "arrays": buffer}
+
+    found = collect_episodes(calling(ant, ant, ant), {ant: policy}, seeds=[1])[ant]
+    assert found.extras["tensors"].tolist() == found.extras["arrays"].tolist() == [1, 2, 3]
+    assert found.extras["tensors"].dtype == np.float32
+
+
 @pytest.mark.parametrize("values", [[1.0], 1.0, [1.0, 2.0, 3.0]])
 def test_extras_that_do_not_fit(values):
     ant = decision(agent="ant_0")

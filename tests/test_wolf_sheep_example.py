@@ -231,3 +231,26 @@ def test_meadows_that_end_with_their_sheep():
     assert np.array_equal(lasting.observations, ended.observations)
     assert lasting.terminations.tolist() == ended.terminations.tolist()
     assert not ended.truncations.any()
+
+
+def test_only_wolves_two_steps_away_or_in_its_own_cell_catch_a_sheep():
+    """Wolves that are one step away are not beside it once it has moved, nor is any that comes later."""
+    generator = np.random.default_rng(0)
+    found = collect_episodes(
+        Pasture,
+        {MOVE: lambda observations: generator.integers(4, size=len(observations))},
+        points=sheep_points(2),
+        seeds=range(8),
+    )[MOVE]
+    last = found.starts + found.lengths - 1
+    died = found.terminations[last]
+    eaten = died & (found.last_observations[:, 0] >= 0)
+    seen = cells(2)
+    beside = np.zeros(len(found))
+    for action, (row, column) in enumerate(DIRECTIONS):
+        chosen = found.actions == action
+        for step in DIRECTIONS:
+            beside[chosen] += found.observations[chosen, 1 + 13 + seen.index((row + step[0], column + step[1]))]
+    assert eaten.sum() > 30
+    assert (beside[last[eaten]] > 0).all()
+    assert (beside == 0).sum() > 30  # it is not so everywhere

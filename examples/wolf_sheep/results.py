@@ -172,7 +172,7 @@ def write(results: Mapping[str, Any], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compare, and write down the results."""
     parser = argparse.ArgumentParser(description="Compare the policies that lead the sheep.")
-    parser.add_argument("--meadows", type=int, default=50, help="to compare on (default: %(default)s)")
+    parser.add_argument("--meadows", type=int, default=32, help="to compare on (default: %(default)s)")
     parser.add_argument("--trainings", type=int, default=5, help="as train's --seeds (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=OUT, help="where the policies are (default: beside this file)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="file to write (default: %(default)s)")

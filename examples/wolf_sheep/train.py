@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -203,7 +202,6 @@ class Progress:
         sheep: How many sheep there were, on average over all ticks.
         life: How many turns there are for each death: how long a sheep can expect to live.
         survived: The share of the episodes in which there were sheep at the end.
-        seconds: How long it took to collect the episodes, and to learn from them.
     """
 
     sight: int
@@ -213,7 +211,6 @@ class Progress:
     sheep: float
     life: float
     survived: float
-    seconds: float
 
 
 def train(
@@ -245,11 +242,9 @@ def train(
     course: list[Progress] = []
     number = 32
     while lived < decisions:
-        started = time.perf_counter()
         seeds = drawn.integers(HELD_OUT, size=number)
         found = collect_episodes(meadow, {MOVE: herd.explore}, points=sheep_points(sight), seeds=seeds)[MOVE]
         learner.learn(found)
-        seconds = time.perf_counter() - started
         survivors = np.unique(found.episodes[found.truncations])
         course.append(
             Progress(
@@ -260,7 +255,6 @@ def train(
                 sheep=len(found) / (number * ticks),
                 life=len(found) / max(1, int(found.terminations.sum())),
                 survived=len(survivors) / number,
-                seconds=round(seconds, 2),
             )
         )
         tell(course[-1])
@@ -295,25 +289,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Train all of them."""
     parser = argparse.ArgumentParser(description="Train one policy for all sheep.")
     parser.add_argument("--seeds", type=int, default=5, help="how often to train (default: %(default)s)")
-    parser.add_argument("--decisions", type=int, default=500_000, help="to learn from (default: %(default)s)")
+    parser.add_argument("--decisions", type=int, default=300_000, help="to learn from (default: %(default)s)")
+    parser.add_argument("--ticks", type=int, default=TICKS, help="of an episode (default: %(default)s)")
     parser.add_argument("--sight", type=int, nargs="+", default=SIGHTS, help="how far sheep see (default: 1 2)")
     parser.add_argument("--out", type=Path, default=OUT, help="folder for the policies (default: beside this file)")
     parser.add_argument("--curves", type=Path, default=CURVES, help="file for the course (default: %(default)s)")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     course: list[Progress] = []
-    for sight in options.sight:
-        for seed in range(options.seeds):
+    for seed in range(options.seeds):
+        for sight in options.sight:
             with tqdm(total=options.decisions, unit="decision", desc=f"sight {sight}, seed {seed}") as bar:
 
                 def tell(progress: Progress, bar: Any = bar) -> None:
                     bar.set_postfix(sheep=f"{progress.sheep:.1f}", life=f"{progress.life:.1f}")
                     bar.update(progress.decisions - bar.n)
 
-                herd, own = train(sight, seed, decisions=options.decisions, tell=tell)
+                herd, own = train(sight, seed, decisions=options.decisions, ticks=options.ticks, tell=tell)
             herd.save(path_of(sight, seed, options.out))
             course += own
-    write(course, options.curves)
+            write(course, options.curves)
 
 
 if __name__ == "__main__":

@@ -265,7 +265,8 @@ class Ledger:
             actions = [page.blank if action is RULE else action for action in actions]
         page.by_rule += by_rule
         page.actions.append(page.stack_actions(actions))
-        arrays = {str(name): np.array(values) for name, values in extras.items()}
+        # Copied, for policies may use their arrays again; in two steps, for tensors cannot be copied in one.
+        arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(

@@ -23,7 +23,7 @@ class Bee:
 
     def __init__(self, hive: Hive, number: int) -> None:
         self.hive, self.name = hive, f"bee_{number}"
-        self.strength = 3
+        self.strength = 2
         self.brought = 0.0
 
     def observed(self) -> list[float]:
@@ -37,7 +37,7 @@ class Bee:
     def fly(self) -> None:
         """Spend a day."""
         self.brought = self.hive.nectar[self.choose_meadow()]
-        self.strength = min(self.strength + (1 if self.brought > 0.4 else -1), 5)
+        self.strength = min(self.strength + (1 if self.brought > 0.5 else -1), 5)
         if self.strength == 0:
             self.hive.lose(self)
 

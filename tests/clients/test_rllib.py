@@ -134,7 +134,7 @@ def in_the_hive(policy, seeds=range(10_000, 10_040)):
         env = parallel_env(HiveSim, points(DEFINITION), possible_agents=BEES)
         observations, _ = env.reset(seed=seed)
         while env.agents:
-            observations, rewards, _, _, _ = env.step({agent: int(policy(observations[agent])) for agent in env.agents})
+            observations, rewards, _, _, _ = env.step({agent: policy(observations[agent]) for agent in env.agents})
             brought += sum(rewards.values())
     return brought / len(seeds)
 
@@ -158,13 +158,11 @@ def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
     algorithm.stop()
     assert live == after
     assert after > before + 5
-    # The model's own loop runs just as the environment's.
-    env = parallel_greenhouse()
-    observations, _ = env.reset(seed=1)
-    while env.agents:
-        observations, *_ = env.step(
-            {agent: policies[agent](observation) for agent, observation in observations.items()}
-        )
+    # The model's own loop runs just as the environment's in which one decides after the other.
+    env = aec_greenhouse()
+    env.reset(seed=1)
+    while not any(env.terminations.values()) and not any(env.truncations.values()):
+        env.step(policies[env.agent_selection](env.observe(env.agent_selection)))
     assert names["greenhouse"].day == env.simulation.greenhouse.day
     assert names["greenhouse"].water_use == env.simulation.greenhouse.water_use > 0
 
@@ -230,8 +228,9 @@ def test_one_policy_for_all_who_are_born(view, policy_of):
     algorithm.stop()
     assert after > before + 3
     # All bees of a hive, born whenever, in the model's own loop.
-    hives = [simulate(HiveSim, {Bee.choose_meadow: lambda seen: int(policy(seen))}, seed=seed) for seed in range(20)]
-    assert np.mean([simulation.hive.day for simulation in hives]) > 10
+    policies = {Bee.choose_meadow: policy}
+    hives = [simulate(HiveSim, policies, points=points(DEFINITION), seed=seed).hive for seed in range(20)]
+    assert np.mean([hive.day for hive in hives]) > 10
 
 
 def test_masks_are_read_from_observations():

@@ -16,7 +16,7 @@ from simenv_marl import generate_env, parallel_env, single_env, vector_env
 
 from . import page
 from .returns import parallel_return
-from .worlds import SHOP_STATE, ReservoirSim, ShopSim
+from .worlds import FORAGERS, SHOP_STATE, HerdSim, ReservoirSim, ShopSim
 
 QUIET = {"write_interval": 0, "checkpoint_interval": 0}
 
@@ -98,6 +98,20 @@ def test_two_agents_that_need_each_other(kind, sees, state_space):
     env.close()
     assert after > before + 5
     assert after > 22  # of 30
+
+
+def test_agents_that_are_born_and_die():
+    """All of them are there all the time, as it wants them."""
+    set_seed(0)
+    options = {"possible_agents": FORAGERS, "padded": True, "state_space": "observations"}
+    env = wrap_env(parallel_env(HerdSim, **options))
+    learner = learners(IPPO, env, "observations")
+    act, evaluation = greedy(learner), parallel_env(HerdSim, possible_agents=FORAGERS)
+    before = parallel_return(evaluation, act)
+    cfg = {"timesteps": 1500, "headless": True, "disable_progressbar": True, "close_environment_at_exit": False}
+    SequentialTrainer(env=env, agents=learner, cfg=cfg).train()
+    assert parallel_return(evaluation, act) > before + 5
+    env.close()
 
 
 def test_the_page(monkeypatch):

@@ -17,7 +17,7 @@ from simenv_marl import aec_env, make_step, single_env
 
 from . import page
 from .returns import aec_return
-from .worlds import Shop, ShopSim, Workbench, WorkbenchSim
+from .worlds import FORAGERS, HerdSim, Shop, ShopSim, Workbench, WorkbenchSim
 
 
 def learner(space, observed):
@@ -98,10 +98,39 @@ def test_one_agent():
     """The single view is a Gymnasium environment like any other."""
     np.random.seed(0)
     algorithm = learner(spaces.Discrete(4), 4)
-    collected = Collector(algorithm, DummyVectorEnv([lambda: single_env(ShopSim, Shop.choose_display)] * 2)).collect(
-        n_episode=2, reset_before_collect=True
-    )
+    envs = DummyVectorEnv([lambda: single_env(ShopSim, Shop.choose_display)] * 2)
+    collected = Collector(algorithm, envs).collect(n_episode=2, reset_before_collect=True)
     assert collected.lens.tolist() == [10, 10]
+
+
+def test_agents_that_are_born_and_die():
+    """Without padding an episode ends for it when the first of them dies."""
+    days = {}
+    for padded in (False, True):
+        env = PettingZooEnv(aec_env(HerdSim, possible_agents=FORAGERS, padded=padded))
+        days[padded] = []
+        for seed in range(5):
+            env.reset(seed=seed)
+            over = False
+            while not over:
+                _, _, terminated, truncated, _ = env.step(1)
+                over = terminated or truncated
+            days[padded].append(env.env.simulation.herd.day)
+        env.close()
+    assert days[True] == [15] * 5
+    assert min(days[False]) < 15
+
+
+def test_training_of_agents_that_are_born_and_die():
+    def make():
+        return PettingZooEnv(aec_env(HerdSim, possible_agents=FORAGERS, padded=True))
+
+    np.random.seed(0)
+    algorithms = [learner(spaces.Discrete(2), 2) for _ in FORAGERS]
+    algorithm = MultiAgentOffPolicyAlgorithm(algorithms=algorithms, env=make())
+    collector = collector_of(algorithm, make)
+    train(algorithm, collector, 160)
+    assert set(collector.buffer.obs.agent_id[: collector.buffer.maxsize]) >= set(FORAGERS[:2])
 
 
 def test_spaces_that_differ_are_refused():
@@ -129,4 +158,4 @@ def test_the_page(monkeypatch):
     names = next(steps)
     after = aec_return(env, greedy(names["algorithm"]))
     assert after > before + 3
-    assert names["baker"](Batch(obs=np.array([[0, 0.5]]), info=Batch())).act in spaces.Discrete(5)
+    assert names["baker"](Batch(obs=np.array([[0, 0.5]]), info=Batch())).act[0] in spaces.Discrete(5)

@@ -1,0 +1,80 @@
+"""What learning is compared with: the rule, random actions, the best constants, and the CMA-ES pair of ``make demo``.
+
+``python -m examples.greenhouse_coop.experiment.baselines``
+
+Searches and evolution are those of the module ``train``, once with as many episodes as ``make demo`` gives them, and
+once with as many as have a hundred days each out of the budget of all learners.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ..env import raw_env
+from ..train import EXCHANGES, VENTILATOR, Constant, Team, compare, draw_seeds
+from .questions import FINAL, Verdict, judge
+from .runs import RUNS, each, write
+
+LIBRARY: Final = "baselines"
+
+TEAMS: Final = ("rule", "random actions", "constant watering", "constant pair", "CMA-ES, watering", "CMA-ES, both")
+"""Whom ``compare`` compares, in its order."""
+
+SEARCHED_ON: Final = 8
+"""On how many greenhouses constant ventilation is tried."""
+
+
+def constant_ventilation(seed: int) -> Verdict:
+    """The best constant ventilation, where watering follows the rule: what question 2 has to beat."""
+    seeds = draw_seeds(np.random.default_rng(seed), SEARCHED_ON)
+    teams: list[Team] = [{VENTILATOR: Constant(fraction)} for fraction in EXCHANGES]
+    environment = raw_env()
+    best = max(teams, key=lambda team: judge(environment, team, seeds).value)
+    verdict = judge(environment, best, FINAL)
+    environment.close()
+    return verdict
+
+
+def search(out: Path, job: tuple[int, int]) -> str:
+    """Carry out a search, and write down what was found.
+
+    Args:
+        out: The folder of all runs.
+        job: How many episodes may be spent, and the seed.
+    """
+    episodes, seed = job
+    path = out / f"{LIBRARY}-{episodes}-{seed}.json"
+    if path.exists():
+        return f"{path.name} is there already"
+    outcomes = compare(argparse.Namespace(budget=episodes, seeds=len(FINAL), seed=seed, workers=1))
+    found = {team: asdict(Verdict.of(played)) for team, played in zip(TEAMS, outcomes.values(), strict=True)}
+    found["constant ventilation"] = asdict(constant_ventilation(seed))
+    titles = list(outcomes)
+    constants = {"constant watering": titles[2], "constant pair": titles[3]}
+    write(path, {"library": LIBRARY, "episodes": episodes, "seed": seed, "constants": constants, "teams": found})
+    return f"{path.name}: CMA-ES pair {found['CMA-ES, both']['value']:.1f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Carry out what has not been carried out before."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", nargs="+", type=int, default=[600, 3600], help="default: 600 and 3600")
+    parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)), metavar="SEED", help="default: 0 to 4")
+    parser.add_argument("--workers", type=int, default=1, help="searches at a time, in processes (default: 1)")
+    parser.add_argument("--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    jobs = [(episodes, seed) for episodes in options.episodes for seed in options.seeds]
+    for said in each(partial(search, options.out), jobs, options.workers):
+        print(said, flush=True)
+
+
+if __name__ == "__main__":
+    main()

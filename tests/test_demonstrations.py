@@ -283,6 +283,19 @@ def test_numbers_may_differ_by_a_tolerance():
     assert agreements(1) == [True, True, True, False]
 
 
+def test_actions_of_all_kinds_are_compared():
+    space = spaces.Tuple([spaces.MultiDiscrete([3, 3]), spaces.Text(5), spaces.Dict(a=spaces.MultiBinary(2))])
+
+    def action(numbers=(1, 2), word="hello", bits=(0, 1)):
+        return np.array(numbers), word, {"a": np.array(bits, np.int8)}
+
+    ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: action())
+    answers = iter([action(), action(numbers=(1, 1)), action(word="hell"), action(bits=(1, 1)), RULE])
+    found = compare_with_rule(calling(*[ant] * 5), {ant: lambda seen: [next(answers)]}, seeds=[1])[ant]
+    assert found.agreements.tolist() == [True, False, False, False, True]
+    assert found.policy_actions[1].tolist() == ["hello", "hello", "hell", "hello", "hello"]
+
+
 def test_comparisons_of_several_policies_and_of_nobody():
     ant, bee = (decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0"))
     found = compare_with_rule(calling(ant, ant), {"ant_0": ones, bee: ones}, points=[ant, bee], seeds=[1])

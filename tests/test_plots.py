@@ -157,6 +157,15 @@ def test_actions_of_several_parts_have_a_chart_for_each_part():
     assert {"how[0]", "how[1]"} <= set(texts(by_name["how"]))
 
 
+def test_parts_of_tuples_are_counted():
+    space = spaces.Tuple([spaces.Discrete(3), spaces.Dict(far=spaces.Box(0, 9, (1,), np.float32))])
+    ant = decision(agent="ant_0", action_space=space)
+    answer = (2, {"far": np.array([0.5], np.float32)})
+    figure = plot_timeline(collect_episodes(calling(ant), {ant: lambda seen: [answer]}, seeds=[1]))
+    assert [axes.get_ylabel() for axes in figure.axes] == ["[0]", "[1]['far']", "reward"]
+    assert [dots(axes) for axes in figure.axes[:2]] == [[([[0, 2]], True)], [([[0, 0.5]], True)]]
+
+
 def test_one_decision_alone_can_be_drawn():
     ant = decision(agent="ant_0", action_space=spaces.Box(0, 1, (1,)))
     figure = plot_timeline(collect_episodes(calling(ant), {ant: lambda seen: [[0.5]]}, seeds=[1]))

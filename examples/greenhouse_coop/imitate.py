@@ -16,6 +16,7 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from typing import Any, Final
+from unittest.mock import patch
 
 import minari
 import numpy as np
@@ -153,8 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     options = parser.parse_args(arguments)
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:  # leave this out to keep the data set
-        os.environ["MINARI_DATASETS_PATH"] = folder
+    # Leave this out to keep the data set.
+    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, MINARI_DATASETS_PATH=folder):
         record_dataset({VENTILATOR: DATASET}, WARM, {WATERER: sparing, VENTILATOR: RULE}, seeds=range(options.episodes))
         learned = clone(minari.load_dataset(DATASET), options.steps)
 

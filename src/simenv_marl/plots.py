@@ -67,7 +67,7 @@ def plot_timeline(
     are hollow where the decision was left to the model's rule. More agents have a row each, in the order of their
     births, once coloured by the action, once by its reward; a colour lasts until the agent's next decision, and is slim
     where the rule has decided, or grey where nobody knows what. A cross is where an agent terminated, an upright dash
-    where it was truncated. Where an agent does not live, nothing is drawn.
+    where it was truncated. Where an agent does not live, the ground is grey.
 
     Args:
         trajectories: What ``collect_episodes`` has returned, or what it has returned under one key.

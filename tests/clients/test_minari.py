@@ -300,3 +300,13 @@ def test_the_page_on_demonstrations_does_what_it_says(monkeypatch):
     skipped = [example.options.pop(SKIP, False) for example in examples.examples]
     assert sum(skipped) > 3
     assert DocTestRunner(optionflags=ELLIPSIS | NORMALIZE_WHITESPACE).run(examples).failed == 0
+
+
+def test_the_example_imitates_the_rule(capsys):
+    pytest.importorskip("torchrl")
+    from examples.greenhouse_coop import imitate
+
+    results = imitate.main(["--episodes", "10", "--steps", "1000", "--seeds", "4"])
+    assert results["agreement"] > 0.5
+    assert results["imitation"] == pytest.approx(results["rule"], abs=2)
+    assert "in the model itself" in capsys.readouterr().out

@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-clusters coverage soak lint docs benchmark clean
+.PHONY: demo test test-clients test-rllib test-oldest test-clusters coverage soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -17,6 +17,29 @@ coverage: .venv/.test
 soak: .venv/.test
 	$(BIN)/python -m benchmarks.soak --driver greenlet
 	$(BIN)/python -m benchmarks.soak --driver thread
+
+# Real learners. RLlib pins an older Gymnasium than the others want, and has an environment of its own.
+test-clients: .venv-clients/.clients
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest tests/clients --ignore tests/clients/test_rllib.py
+
+test-rllib: .venv-rllib/.rllib
+	OMP_NUM_THREADS=1 RAY_USAGE_STATS_ENABLED=0 .venv-rllib/bin/python -m pytest tests/clients/test_rllib.py
+
+.venv-clients/.clients .venv-rllib/.rllib: pyproject.toml
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
+	touch $@
+
+# The oldest versions of everything that this library builds on, with the tests of what happens when.
+OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,conformance definitions drivers ends environments episodes errors \
+	goals_and_time identity joint many_agents rounds side_by_side simulate simulate_many vector workers))
+test-oldest: .venv-oldest/.oldest
+	.venv-oldest/bin/python -m pytest --driver greenlet $(OLDEST_TESTS)
+
+.venv-oldest/.oldest: pyproject.toml tests/oldest.txt
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --constraint tests/oldest.txt --editable '.[many]' hypothesis pytest simpy
+	touch $@
 
 # Local clusters, on the loopback address alone. Each has an environment of its own, because of what it pins.
 test-clusters: .venv-dask/.many .venv-ray/.many
@@ -49,7 +72,14 @@ benchmark: .venv/.test
 	touch $@
 
 clean:
-	rm -rf .venv .venv-dask .venv-ray docs/_build
+	rm -rf .venv .venv-* docs/_build
+
+# One policy for all sheep of Mesa's model: trained, compared, and drawn into docs/figures.
+.PHONY: wolf-sheep
+wolf-sheep: .venv-clients/.clients
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.train
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.results
+	.venv-clients/bin/python -m examples.wolf_sheep.picture
 
 # The cooperative experiment, all of it: about an hour on two cores. What is done already is not done again.
 .PHONY: experiment
@@ -57,16 +87,11 @@ EXPERIMENT := examples.greenhouse_coop.experiment
 EXPERIMENT_OUT ?= examples/greenhouse_coop/out/experiment
 EXPERIMENT_WORKERS ?= 2
 experiment: export OMP_NUM_THREADS = 1
-experiment: .venv-experiment/.experiment .venv-experiment-rllib/.experiment-rllib
+experiment: .venv-clients/.clients .venv-rllib/.rllib
 	for script in baselines sb3 torchrl; do \
 	    $(<D)/bin/python -m $(EXPERIMENT).$$script --out $(EXPERIMENT_OUT) --workers $(EXPERIMENT_WORKERS) || exit; \
 	done
-	.venv-experiment-rllib/bin/python -m $(EXPERIMENT).rllib --out $(EXPERIMENT_OUT) --workers $(EXPERIMENT_WORKERS)
+	.venv-rllib/bin/python -m $(EXPERIMENT).rllib --out $(EXPERIMENT_OUT) --workers $(EXPERIMENT_WORKERS)
 	$(<D)/bin/python -m $(EXPERIMENT).results --runs $(EXPERIMENT_OUT)
 	$(<D)/bin/python -m $(EXPERIMENT).back_in_the_model $(EXPERIMENT_OUT)/sb3-3-0.zip $(EXPERIMENT_OUT)/torchrl-4b-0.pt
-	.venv-experiment-rllib/bin/python -m $(EXPERIMENT).back_in_the_model $(EXPERIMENT_OUT)/rllib-4a-0
-
-.venv-experiment/.experiment .venv-experiment-rllib/.experiment-rllib: pyproject.toml
-	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
-	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
-	touch $@
+	.venv-rllib/bin/python -m $(EXPERIMENT).back_in_the_model $(EXPERIMENT_OUT)/rllib-4a-0

@@ -8,7 +8,7 @@ project = "simenv_marl"
 release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build", "figures"]  # figures are parts of pages
+exclude_patterns = ["_build", "figures", "_clients_*"]  # figures and clients are parts of pages
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 3
 

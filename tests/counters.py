@@ -103,6 +103,28 @@ VARIETY: dict[str, tuple[Any, Any]] = {
             choices=lambda self: list(range(1, 2 + self.count % 4)),
         ),
     ),
+    "rows": (
+        Counter,
+        definition(
+            observation_space=spaces.Box(-100, 100, (2, 3), np.float64),
+            # Laid out column by column, and of nobody else.
+            observation_space_mapping=lambda self: np.full((2, 3), [self.count, self.goal, 7.0], order="F"),
+        ),
+    ),
+    "flags": (
+        Counter,
+        definition(
+            observation_space=spaces.Box(0, 1, (2,), np.bool_),
+            observation_space_mapping=lambda self: np.array([self.count > 3, True]),
+        ),
+    ),
+    "large": (
+        Counter,
+        definition(
+            observation_space=spaces.Box(-100, 100, (400,), np.float32),
+            observation_space_mapping=lambda self: np.arange(400) % 7 + self.count,
+        ),
+    ),
     "box": (
         Counter,
         definition(action_space=spaces.Box(0, 3, (2,), np.float32), action_space_mapping=lambda a: 1 + int(a.sum())),

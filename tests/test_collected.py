@@ -52,7 +52,7 @@ def played(env, policies, seed):
         if action is None:
             last[agent] = observation
             if rows[agent]:
-                rows[agent][-1] |= {"terminated": terminated, "truncated": truncated}
+                rows[agent][-1] |= {"terminated": terminated, "truncated": truncated, "turn of the end": turn}
             continue
         rows[agent].append(
             {
@@ -83,6 +83,8 @@ def check(found, episodes):
             assert found.starts[trajectory] == row
             assert found.lengths[trajectory] == len(rows)
             assert np.array_equal(found.last_observations[trajectory], last[agent])
+            assert found.last_turns[trajectory] == rows[-1]["turn of the end"]
+            assert found.returns[trajectory] == pytest.approx(sum(row["reward"] for row in rows))
             for step, expected in enumerate(rows):
                 assert found.names[found.agents[row]] == agent
                 assert found.episodes[row] == number
@@ -167,7 +169,9 @@ def test_agents_under_their_own_keys():
     points = beings(observation_space_mapping=lambda being: [being.number, 0], removed_by=())
     policies = {Being.act: ones, "being_1": lambda observations: [2] * len(observations), "being_2": RULE}
     found = collect_episodes(script(main), policies, points=points, seeds=[3, 4])
-    assert list(found) == [Being.act, "being_1"]
+    assert list(found) == [Being.act, "being_1", "being_2"]
+    assert found["being_2"].by_rule.tolist() == [True] * 2
+    assert found["being_2"].observations.tolist() == [[2, 0]] * 2
     assert found["being_1"].names == ("being_1",)
     assert found["being_1"].actions.tolist() == [2] * 4
     assert found["being_1"].seeds == (3, 4)
@@ -239,6 +243,8 @@ def test_shapes_and_dtypes():
         "by_rule": ((6,), np.bool_),
         "starts": ((3,), np.int64),
         "lengths": ((3,), np.int64),
+        "last_turns": ((3,), np.int64),
+        "returns": ((3,), np.float64),
     }
     for name, (shape, dtype) in shapes.items():
         array = getattr(found, name)
@@ -247,6 +253,38 @@ def test_shapes_and_dtypes():
     assert found.elapsed.tolist() == [2, 2] * 3
     assert len(found) == 6
     assert "6 decisions" in repr(found)
+
+
+def test_policies_can_tell_decisions_apart():
+    ant = decision(agent="ant_0")
+    bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 1)
+
+    def policy(observations, infos, identities):
+        assert len(observations) == len(infos) == len(identities)
+        return [RULE] * len(identities), {
+            "seeds": [seed for seed, _ in identities],
+            "turns": [t for _, t in identities],
+        }
+
+    def optional(observations, infos, identities=None):
+        assert identities is None
+        return [RULE] * len(observations)
+
+    for size in (1, 3):
+        found = collect_episodes(calling(ant, bee, ant), {ant: policy, bee: optional}, seeds=[7, 5, 9], batch_size=size)
+        own = found[ant]
+        assert own.extras["seeds"].tolist() == [own.seeds[episode] for episode in own.episodes] == [7, 7, 5, 5, 9, 9]
+        assert own.extras["turns"].tolist() == own.turns.tolist() == [0, 2] * 3
+
+
+def test_spaces_are_those_of_the_decision_point():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", action_space=spaces.Discrete(3))
+    found = collect_episodes(calling(ant), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
+    assert found[ant].action_space == spaces.Discrete(10)
+    assert found[bee].action_space == spaces.Discrete(3)  # which has never decided
+    assert found[ant].observation_space.shape == (2,)
+    unborn = collect_episodes(script(lambda s: None), {"being_3": ones}, points=beings(), seeds=[1])
+    assert unborn["being_3"].action_space is None
 
 
 def test_composite_spaces():
@@ -314,6 +352,28 @@ def test_extras_stand_row_by_row():
     assert found.extras["logits"].dtype == np.float32
 
 
+def test_extras_may_be_tensors_and_buffers_that_are_used_again():
+    class Tensor:
+        """Becomes an array as those of torch do, which know no copies."""
+
+        def __init__(self, array):
+            self.array = array
+
+        def __array__(self, dtype=None):
+            return self.array if dtype is None else self.array.astype(dtype)
+
+    buffer = np.zeros(1, np.float32)
+    ant = decision(agent="ant_0")
+
+    def policy(observations):
+        buffer[:] += 1
+        return ones(observations), {"tensors": Tensor(buffer), "arrays": buffer}
+
+    found = collect_episodes(calling(ant, ant, ant), {ant: policy}, seeds=[1])[ant]
+    assert found.extras["tensors"].tolist() == found.extras["arrays"].tolist() == [1, 2, 3]
+    assert found.extras["tensors"].dtype == np.float32
+
+
 @pytest.mark.parametrize("values", [[1.0], 1.0, [1.0, 2.0, 3.0]])
 def test_extras_that_do_not_fit(values):
     ant = decision(agent="ant_0")
@@ -343,6 +403,27 @@ def test_episodes_in_which_nobody_decides():
     assert nothing.actions.shape == (0, 2)
     assert nothing.seeds == (0, 1, 2, 3)
     assert len(collect_episodes(script(main), {ant: ones}, seeds=[])[ant]) == 0
+
+
+def test_what_is_collected_of_each_simulation():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+
+    def main(simulation):
+        for _ in range(simulation.seed):  # the last seeds are the first to end
+            ant()
+
+    found = collect_episodes(
+        script(main),
+        {ant: ones, bee: ones},
+        points=[ant, bee],
+        seeds=[4, 0, 2],
+        collect=lambda simulation: simulation.seed,
+    )
+    assert found[ant].collected == (4, 0, 2)
+    assert found[bee].collected == (4, 0, 2)  # who has never decided
+    assert collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1])[ant].collected is None
+    with pytest.raises(OptionValueError, match="collect"):
+        collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1], collect=3)
 
 
 def test_one_name_at_points_whose_spaces_differ():

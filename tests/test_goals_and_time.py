@@ -17,8 +17,10 @@ from simenv_marl import (
     TRUNCATED,
     DefinitionError,
     InvalidActionError,
+    NotResetError,
     ObservationError,
     OptionValueError,
+    ViewError,
     aec_env,
     generate_env,
     joint_env,
@@ -223,6 +225,55 @@ def test_with_rule_throughout_goals_change_nothing():
 
 
 # -- masks ----------------------------------------------------------------------------------------
+
+
+def test_masks_on_request():
+    """The method that sb3-contrib's MaskablePPO calls before each step, through whatever wrappers there are."""
+    legal = iter([[1, 0], [0, 1], [1, 1]])
+    ant = decision(agent="ant_0", action_space=spaces.Discrete(2), action_mask_mapping=lambda: next(legal))
+    env = gymnasium.wrappers.RecordEpisodeStatistics(single_env(calling(ant, ant), ant))
+    masks = env.get_wrapper_attr("action_masks")
+    with pytest.raises(NotResetError):
+        masks()
+    env.reset()
+    assert masks().dtype == np.bool_
+    assert masks().tolist() == [True, False]
+    env.step(0)
+    assert masks().tolist() == [False, True]
+    env.step(1)
+    assert masks().tolist() == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("space", "number"), [(spaces.Discrete(3, start=2), 3), (spaces.MultiDiscrete([2, 3]), 5)], ids=str
+)
+def test_masks_on_request_where_everything_is_legal(space, number):
+    ant = decision(agent="ant_0", action_space=space)
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True] * number
+
+
+def test_masks_on_request_of_choices_and_of_several_parts():
+    ant = decision(agent="ant_0", choices=lambda: "ab", action_space=spaces.Discrete(4))
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True, True, False, False]
+    ant = decision(
+        agent="ant_0",
+        action_space=spaces.MultiDiscrete([2, 3]),
+        action_mask_mapping=lambda: ([1, 0], [0, 1, 1]),
+    )
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True, False, False, True, True]
+
+
+def test_continuous_actions_have_no_masks():
+    env = single_env(Walk, goals())
+    env.reset()
+    with pytest.raises(ViewError):
+        env.action_masks()
 
 
 def masks(**changes):
@@ -538,6 +589,54 @@ def test_states_that_cannot_be():
     env.reset()
     with pytest.raises(NotImplementedError):
         env.state()
+
+
+def seeing(number):
+    """What is observed: a pair, or one of three."""
+    return {
+        "agent": ("ant_0", "bee_0")[number],
+        "observation_space": (spaces.Box(0, 9, (2,), np.float32), spaces.Discrete(3))[number],
+        "observation_space_mapping": (lambda: [1, 2], lambda: 2)[number],
+    }
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_the_state_may_be_what_all_observe(make):
+    ant, bee = decision(**seeing(0)), decision(**seeing(1))
+    env = make(calling(ant, bee), [ant, bee], state_space="observations")
+    assert (env.state_space.low.tolist(), env.state_space.high.tolist()) == ([0] * 5, [9, 9, 1, 1, 1])
+    assert env.state_space is env.state_space
+    with pytest.raises(NotResetError):
+        env.state()
+    env.reset()
+    assert env.state().tolist() == [1, 2, 1, 0, 0]  # the second has not been observed yet
+    env.step({"ant_0": 4} if make is parallel_env else 4)
+    state = env.state()
+    assert state.tolist() == [1, 2, 0, 0, 1]
+    assert state in env.state_space
+    while env.agents:
+        env.step(RULE)
+    assert env.state().tolist() == [1, 2, 0, 0, 1]
+
+
+@pytest.mark.parametrize("make", [single_env, joint_env])
+def test_the_state_may_be_what_one_observes(make):
+    ant = decision(**seeing(0))
+    env = make(calling(ant), ant, state_space="observations")
+    env.reset()
+    assert env.state().tolist() == [1, 2]
+    assert env.state() in env.state_space
+
+
+def test_states_of_observations_that_cannot_be():
+    for space in (spaces.Sequence(spaces.Discrete(3)), spaces.Graph(spaces.Discrete(3), None)):
+        ant = decision(agent="ant_0", observation_space=space)
+        with pytest.raises(ViewError, match="flattened"):
+            _ = aec_env(calling(ant), ant, state_space="observations").state_space
+    with pytest.raises(ViewError, match="possible_agents"):
+        parallel_env(announcing(one_after_the_other), beings(), state_space="observations")
+    with pytest.raises(OptionValueError):
+        aec_env(calling(ant), ant, state_space="rewards")
 
 
 # -- pictures -------------------------------------------------------------------------------------

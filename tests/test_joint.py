@@ -21,6 +21,7 @@ from simenv_marl import (
     generate_env,
     joint_env,
     parallel_env,
+    vector_env,
 )
 
 from .many_worlds import ROSTER, Announcing, Answered, Being, Colony, answer, beings, colony, designs, seeds
@@ -449,10 +450,76 @@ def test_a_flattened_action_is_not_kept():
     assert [part.tolist() for part in seen] == [[0.25], [0.5]]
 
 
+def discrete():
+    """Two decisions: one of two or three from 5 on, and one of two of which the first is not legal, with three."""
+    ant = decision(agent="ant_0", action_space=spaces.Discrete(2, start=5))
+    bee = decision(
+        agent="bee_0",
+        action_space=spaces.MultiDiscrete([2, 3]),
+        action_space_mapping=lambda action: action.tolist(),
+        action_mask_mapping=lambda: ([0, 1], [1, 1, 1]),
+    )
+    return ant, bee
+
+
+def test_flattened_actions_of_discrete_spaces():
+    ant, bee = discrete()
+    env = joint_env(calling(ant, bee, ant), [ant, bee], flatten=True)
+    assert env.action_space == spaces.MultiDiscrete([2, 2, 3], start=[5, 0, 0])
+    observation, _ = env.reset()
+    assert observation.tolist() == [1, 2, 0, 0]
+    *_, info = env.step(np.array([6, 1, 2]))
+    assert env.simulation.log == [6, [1, 2]]
+    assert info["acted"] == {"ant_0": True, "bee_0": True}
+
+
+@pytest.mark.parametrize("action", [[6, 1, 2], np.array([6.0, 1, 2]), np.array([4, 1, 2]), np.array([6, 1]), 6])
+def test_what_is_refused_of_flattened_actions_of_discrete_spaces(action):
+    ant, bee = discrete()
+    env = joint_env(calling(ant, bee), [ant, bee], flatten=True)
+    env.reset()
+    with pytest.raises(InvalidActionError):
+        env.step(action)
+    assert env.simulation.log == []
+
+
+def test_flattened_actions_of_discrete_spaces_side_by_side():
+    ant, bee = discrete()
+    envs = vector_env(calling(ant, bee, ant, bee), [ant, bee], num_envs=2, flatten=True)
+    envs.reset()
+    envs.step(np.array([[5, 1, 2], [6, 1, 0]]))
+    assert [simulation.log for simulation in envs.get_attr("simulation")] == [[5, [1, 2]], [6, [1, 0]]]
+    with pytest.raises(InvalidActionError, match="sub-environment 1"):
+        envs.step(np.array([[5, 1, 2], [7, 1, 0]]))
+    envs.close()
+
+
+def test_flattened_masks():
+    ant, bee = discrete()
+    env = joint_env(calling(ant, bee, ant, bee), [ant, bee], flatten=True)
+    with pytest.raises(NotResetError):
+        env.action_masks()
+    env.reset()
+    env.step(np.array([6, 1, 2]))
+    masks = env.action_masks()
+    assert masks.dtype == np.bool_
+    assert masks.tolist() == [True, True, False, True, True, True, True]
+    masks[:] = False
+    assert env.action_masks().any()
+
+
+def test_joint_actions_that_have_no_masks():
+    ant, bee = discrete()
+    env = joint_env(calling(ant, bee), [ant, bee])
+    env.reset()
+    with pytest.raises(ViewError, match="flatten"):
+        env.action_masks()
+
+
 @pytest.mark.parametrize(
     "changes",
     [
-        {},  # actions are discrete
+        {"action_space": spaces.MultiDiscrete([[2, 2]])},
         {**BOX, "observation_space": spaces.Box(0, 1, (2, 2), np.float32)},
         {**BOX, "observation_space": spaces.Discrete(3)},
         {"action_space": spaces.Box(0, 1, (), np.float32)},
@@ -461,6 +528,12 @@ def test_a_flattened_action_is_not_kept():
 def test_what_cannot_be_flattened(changes):
     ant, bee = points(**changes)
     with pytest.raises(ViewError):
+        joint_env(calling(ant, bee), [ant, bee], flatten=True)
+
+
+def test_what_is_partly_discrete_cannot_be_flattened():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **BOX)
+    with pytest.raises(ViewError, match="all continuous or all discrete"):
         joint_env(calling(ant, bee), [ant, bee], flatten=True)
 
 

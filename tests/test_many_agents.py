@@ -109,6 +109,19 @@ def test_without_a_roster_there_are_no_possible_agents():
         _ = env.max_num_agents
 
 
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_spaces_of_all_possible_agents(make):
+    """Some learners ask for all at once, as the attributes of PettingZoo's base classes have it."""
+    env = make(living(0, 1), beings(), possible_agents=["being_0", "being_1"])
+    assert list(env.observation_spaces) == list(env.action_spaces) == env.possible_agents
+    for agent in env.possible_agents:
+        assert env.observation_spaces[agent] is env.observation_space(agent)
+        assert env.action_spaces[agent] is env.action_space(agent)
+    without = make(living(0, 1), beings())
+    assert not hasattr(without, "observation_spaces")
+    assert not hasattr(without, "action_spaces")
+
+
 def test_nobody_is_named_and_the_rule_decides():
     env = aec_env(living(0, 1, 2), beings(agent=lambda being: None if being.number == 1 else being_of(being)))
     assert decisions(play(env, 7)) == ["being_0", "being_2"]

@@ -26,6 +26,7 @@ from simenv_marl import (
     NotResetError,
     OptionValueError,
     ReentrancyError,
+    ResetNeededError,
     UnknownOptionError,
     ViewError,
     WrongThreadError,
@@ -525,6 +526,23 @@ def test_sub_environments_can_be_asked_and_told():
     with pytest.raises(AttributeError):
         envs.get_attr("nothing")
     assert envs.unwrapped is envs
+    envs.close()
+
+
+def test_a_sub_environment_that_somebody_else_resets_is_stepped_where_it_then_stands():
+    envs = vector_env(Counter, POINT, num_envs=2)
+    envs.reset(seed=[5, 6])
+    for _ in range(2):
+        envs.step([1, 1])
+    other = envs.envs[1]
+    observation, _ = other.reset(seed=6)
+    assert observation[0] == 0
+    assert envs.step([1, 1])[0][:, 0].tolist() == [3, 1]
+    other.close()
+    with pytest.raises(ResetNeededError):
+        envs.step([1, 1])
+    envs.reset(seed=[5, 6])
+    assert envs.step([1, 1])[0][:, 0].tolist() == [1, 1]
     envs.close()
 
 

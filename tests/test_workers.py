@@ -60,9 +60,18 @@ def test_collected_episodes_are_the_same():
     policies["overseer_0"] = policies[Creature.act]
     policies["creature_99"] = ones  # who is never born
     alone, shared = (
-        collect_episodes(lambda: Colony(DESIGN), policies, points=POINTS, seeds=range(9), batch_size=2, workers=workers)
+        collect_episodes(
+            lambda: Colony(DESIGN),
+            policies,
+            points=POINTS,
+            seeds=range(9),
+            collect=lambda simulation: simulation.trace,
+            batch_size=2,
+            workers=workers,
+        )
         for workers in (0, 2)
     )
+    assert alone["creature_99"].collected == tuple(traces(seeds=range(9)))
     assert list(alone) == list(shared) == list(policies)
     for key, found in alone.items():
         for field in dataclasses.fields(found):

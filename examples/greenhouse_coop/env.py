@@ -137,6 +137,7 @@ WATERING: Final[dict[Any, Definition]] = {
         observation_space_mapping=observe,
         action_space=ACTION_SPACE,
         action_space_mapping=to_litres,
+        rule_action_mapping=lambda litres: [litres / MOST_WATER],
         reward_mapping=reward,
         agent="waterer_0",
     )
@@ -149,6 +150,7 @@ VENTILATION: Final[dict[Any, Definition]] = {
         observation_space_mapping=observe,
         action_space=ACTION_SPACE,
         apply=exchange_air,
+        rule_action_mapping=lambda nothing, greenhouse: [0.2],  # the fixed 20 %, which the model decides by doing
         reward_mapping=reward,
         agent="ventilator_0",
     )

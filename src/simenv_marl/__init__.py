@@ -34,6 +34,8 @@ The layers, each importing only from those above it::
     _ledger       what learners want to know of many episodes
     _spread       work that is spread over processes by joblib
     many          the public functions for many simulations at once
+    demonstrations data sets of who has decided what; comparisons with the rule
+    plots         pictures of what they have found
     envs          views: an episode read as a PettingZoo or Gymnasium environment
     branching     exact continuations of an episode that is going on
     registration  into the registries of Gymnasium and PettingZoo
@@ -46,6 +48,7 @@ from ._handlers import Call, ChangedArgs, ChangedResult
 from ._provenance import provenance
 from .branching import branch
 from .decision import Definition, difference, make_step
+from .demonstrations import Comparison, Mixture, compare_with_rule, record_dataset, save_dataset
 from .envs import (
     SimulationAECEnv,
     SimulationEnv,
@@ -61,6 +64,7 @@ from .envs import (
 )
 from .errors import *  # noqa: F403 - the whole tree is public
 from .many import Trajectories, collect_episodes, simulate_many
+from .plots import plot_returns, plot_timeline
 from .plugins import (
     attach_handler,
     attached_handlers,
@@ -84,7 +88,9 @@ __all__ = [
     "Call",
     "ChangedArgs",
     "ChangedResult",
+    "Comparison",
     "Definition",
+    "Mixture",
     "SimulationAECEnv",
     "SimulationEnv",
     "SimulationInterface",
@@ -98,6 +104,7 @@ __all__ = [
     "attached_handlers",
     "branch",
     "collect_episodes",
+    "compare_with_rule",
     "decision_points",
     "difference",
     "errors",
@@ -108,9 +115,13 @@ __all__ = [
     "joint_env",
     "make_step",
     "parallel_env",
+    "plot_returns",
+    "plot_timeline",
     "provenance",
+    "record_dataset",
     "register_simulation",
     "remove_handler",
+    "save_dataset",
     "simulate",
     "simulate_many",
     "single_env",

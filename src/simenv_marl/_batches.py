@@ -10,6 +10,7 @@ one ``Asked``, whose decisions are asked in ``Group`` s, each of the same spaces
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from threading import get_ident
 from time import perf_counter
@@ -39,6 +40,7 @@ class Asked:
         keys: Under which it was given.
         policy: The policy, to be called with observations and infos.
         informed: Whether it takes the infos.
+        identifying: Whether it takes what identifies each decision besides.
         groups: Of its decisions.
     """
 
@@ -46,10 +48,17 @@ class Asked:
         self.keys: list[Any] = []
         self.policy: Callable[..., Any] = two_arguments(policy)
         self.informed = self.policy is policy
+        self.identifying = self.informed and _takes_three(policy)
         self.groups: list[Group] = []
 
     def __repr__(self) -> str:
         return f"the policy of {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
+
+    def answers(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
+        """What the policy returns, given as much as it takes."""
+        if self.identifying:
+            return self.policy(observations, infos, identities)
+        return self.policy(observations, infos)
 
     def group(self, binding: Binding) -> Group:
         """The group of the decisions at a point."""
@@ -58,6 +67,18 @@ class Asked:
             group = Group(self, binding)
             self.groups.append(group)
         return group
+
+
+def _takes_three(policy: Callable[..., Any]) -> bool:
+    """Whether a policy has to be given a third argument."""
+    try:
+        parameters = list(inspect.signature(policy).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    required = [
+        p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty
+    ]
+    return len(required) > 2
 
 
 class Entry:
@@ -151,9 +172,9 @@ class Group:
                 record: Any = episode.pending
                 infos.append(record.info)
                 record.info = {}  # what a policy does to its own is not to be seen at the next decision
-        policy = asked.policy
         try:
-            answers = policy(observations, infos)
+            identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
+            answers = asked.answers(observations, infos, identities)
             extras: Mapping[str, Any] = {}
             if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
                 answers, extras = answers
@@ -235,7 +256,7 @@ class Unrewarded(Asking):
             return super()._consult(record, args, kwargs)
         record.observe(args, kwargs)
         binding = record.binding
-        if self.clock is None and binding.legal is None and binding.point.alone:
+        if self.clock is None and binding.legal is None and binding.point.alone and not binding.tells:
             record.swift = binding.agent is not None
             self._swift[binding] = record if record.swift else NAMED_AT_CALL
         self.pending = record

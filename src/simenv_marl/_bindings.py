@@ -5,15 +5,17 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
+from threading import get_ident
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from . import _spaces
+from ._driver import RUNNING
 from ._points import NamedPoint
 from ._spaces import ILLEGAL
-from .decision import DecisionPoint, Definition
+from .decision import DecisionPoint, Definition, inverse
 from .errors import (
     InvalidActionError,
     MaskError,
@@ -39,16 +41,38 @@ class Binding:
         convert: Turns a checked action into the reply to the simulation.
         deliver: In the simulation, turns the reply into what a call of the decision function returns; None
             where the reply is that.
+        by_rule: In the simulation, has the rule decide a call and tells the user's side what it has decided; None
+            where nobody wants to know.
+        tells: Whether infos tell more than masks and times: which action the rule's decision corresponds to, or whether
+            the agent is present.
+        padded: Whether they tell whether it is present.
         check: Checks an action against its space.
         first, end: Which python integers are legal actions, whatever the call: from the first to before the end.
     """
 
     __slots__ = (
-        "_masked_parts", "agent", "cast", "check", "convert", "definition", "deliver", "end", "first",
-        "legal", "name_agent", "observe", "point", "policy", "reward",
+        "_masked_parts", "agent", "by_rule", "cast", "check", "convert", "definition", "deliver", "end", "first",
+        "legal", "name_agent", "observe", "padded", "point", "policy", "reward", "ruled", "tells",
     )  # fmt: skip
 
-    def __init__(self, named: NamedPoint, agent: str | None, policy: Policy | None) -> None:
+    def __init__(
+        self,
+        named: NamedPoint,
+        agent: str | None,
+        policy: Policy | None,
+        *,
+        recorded: bool = False,
+        padded: bool = False,
+    ) -> None:
+        """Make a binding.
+
+        Args:
+            named: The decision point, and its definition.
+            agent: The name of its agent; None where it has many.
+            policy: Who answers all its decisions.
+            recorded: Whether somebody keeps what is decided, and so wants to know what the rule decides.
+            padded: Whether agents are there that are not present.
+        """
         definition = named.definition
         self.point: DecisionPoint = named.point
         self.definition: Definition = definition
@@ -61,6 +85,14 @@ class Binding:
         self.check = _spaces.action_check(definition.action_space)
         self.convert = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
+        self.padded = padded
+        self.tells = padded or definition.rule_action_mapping is not None
+        self.ruled = (
+            Ruled(self)
+            if definition.rule_action_mapping is not None or (recorded and _can_be_read_backwards(definition))
+            else None
+        )
+        self.by_rule = None if self.ruled is None else partial(_BY_RULE[named.point.kind], self.ruled)
         space = definition.observation_space
         actions: Any = definition.action_space
         self._masked_parts = [
@@ -86,6 +118,16 @@ class Binding:
             elif not part and isinstance(value, Mapping):
                 value = {**value, _spaces.MASK: mask}
         return self.cast(value)
+
+    def blank(self) -> Any:
+        """Make the observation of an agent of which nothing is known yet: zero, and with all actions legal."""
+        observation = _spaces.blank(self.definition.observation_space)
+        if self.legal is None or not self._masked_parts:
+            return observation
+        for part in self._masked_parts:
+            whole = observation[part] if part else observation
+            whole[_spaces.MASK] = _spaces.open_mask(self.definition.action_space)
+        return self.cast(observation)
 
     def reply(self, action: Any, agent: str, mask: Any, choices: Any) -> Any:
         """Check an action, and turn it into the reply that the simulation gets.
@@ -126,6 +168,86 @@ def _goal_parts(space: spaces.Space[Any]) -> list[tuple[str, spaces.Space[Any]]]
     )
 
 
+class Ruled:
+    """Stands for a decision point where its rule has just decided, for the user's side to find out the action.
+
+    Attributes:
+        binding: The decision point.
+        deliver, by_rule: None; the simulation just goes on.
+    """
+
+    __slots__ = ("_inverse", "binding")
+
+    deliver = by_rule = None
+
+    def __init__(self, binding: Binding) -> None:
+        self.binding = binding
+        self._inverse = inverse(binding.definition)
+
+    def rule(self, *told: Any) -> None:
+        """What drivers call where nobody is to be told: there is nothing to do."""
+
+    def action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any], offered: Any) -> Any:
+        """The action that a decision of the rule corresponds to; None if there is none.
+
+        Args:
+            decision: The decision.
+            args: The arguments of the call that was decided.
+            kwargs: Those passed by keyword.
+            offered: The choices there were, where the point has choices.
+
+        Raises:
+            InvalidActionError: The action that is said to correspond to it is not in the action space.
+        """
+        definition = self.binding.definition
+        if definition.rule_action_mapping is None:
+            return self._read_backwards(decision, offered)
+        action = definition.rule_action_mapping(decision, *args, **kwargs)
+        legal = None if action is None else self.binding.check(action)
+        if legal is ILLEGAL:
+            raise InvalidActionError(
+                f"rule_action_mapping of {self.binding.point.name} says that the rule's decision {decision!r} is the"
+                f" action {action!r}, which is not in its action space {definition.action_space}"
+            )
+        return legal
+
+    def _read_backwards(self, decision: Any, offered: Any) -> Any:
+        if offered is not None:
+            return next(
+                (place for place, choice in enumerate(offered) if choice is decision or choice == decision), None
+            )
+        try:
+            return None if self._inverse is None else self._inverse.get(decision)
+        except TypeError:  # which cannot be looked up
+            return None
+
+
+def _can_be_read_backwards(definition: Definition) -> bool:
+    return definition.choices is not None or inverse(definition) is not None
+
+
+def _tell(ruled: Ruled, decision: Any, args: Any, kwargs: Any) -> Any:
+    ask: Any = RUNNING.get(get_ident())
+    if ask is not None:  # else the simulation is being unwound
+        ask(ruled, (decision, args, kwargs), {})
+    return decision
+
+
+def _call(ruled: Ruled, point: Any, args: Any, kwargs: Any) -> Any:
+    return _tell(ruled, point.rule(*args, **kwargs), args, kwargs)
+
+
+def _generate(ruled: Ruled, point: Any, args: Any, kwargs: Any) -> Any:
+    return _tell(ruled, (yield from point.rule(*args, **kwargs)), args, kwargs)
+
+
+async def _await(ruled: Ruled, point: Any, args: Any, kwargs: Any) -> Any:
+    return _tell(ruled, await point.rule(*args, **kwargs), args, kwargs)
+
+
+_BY_RULE: Mapping[str, Callable[..., Any]] = {"function": _call, "generator": _generate, "coroutine": _await}
+
+
 class Removal:
     """A function of the model whose calls end the episode of agents.
 
@@ -133,12 +255,12 @@ class Removal:
         point: The function.
         of: The bindings whose agents it ends; for each a callable of the call's arguments that names the
             agent, or None; and then the class whose instances are such agents, if it is known.
-        deliver: None; the call always runs the function.
+        deliver, by_rule: None; the call always runs the function, and nobody wants to know what comes of it.
     """
 
     __slots__ = ("of", "point")
 
-    deliver = None
+    deliver = by_rule = None
 
     def __init__(self, point: DecisionPoint) -> None:
         self.point = point

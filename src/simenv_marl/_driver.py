@@ -82,11 +82,15 @@ class Bound(Protocol):
     def deliver(self) -> Callable[..., Any] | None:
         """Turns a reply and the call's arguments into what the call returns; None: the reply is that."""
 
+    @property
+    def by_rule(self) -> Callable[..., Any] | None:
+        """Has the rule of a point decide a call; None: nobody wants to know what comes of it."""
+
 
 class Refused:
     """Stands for the binding of every decision once one was refused; the event tells the user."""
 
-    deliver = None
+    deliver = by_rule = None
 
 
 FINISHED: Final = Sentinel("FINISHED")

@@ -32,7 +32,7 @@ from typing import Any, Final
 
 from greenlet import getcurrent
 
-from ._bindings import Binding, Removal
+from ._bindings import Binding, Removal, Ruled
 from ._driver import (
     EVALUATING,
     FAILED,
@@ -305,6 +305,8 @@ class Episode:
         if type(binding) is not Binding:
             if type(binding) is Removal:
                 return self._release(binding, args, kwargs)
+            if type(binding) is Ruled:
+                return self._learn_of(binding.binding, *args)
             if binding is REFUSED and self._driver is not None:
                 self._failed_in_model = True
                 raise self._driver.refusal()
@@ -334,7 +336,7 @@ class Episode:
             self._max_turns, self.taken = self._most_turns, LOST
         record.settle(args, kwargs)
         binding = record.binding
-        if self.clock is None and binding.legal is None and binding.point.alone:
+        if self.clock is None and binding.legal is None and binding.point.alone and not binding.tells:
             self._swift[binding] = NAMED_AT_CALL if binding.agent is None else record
         self.pending = record
 
@@ -389,6 +391,14 @@ class Episode:
         record.follow_up()
         return RULE if action is RULE else record.binding.reply(action, record.agent, record.mask, choices)
 
+    def _learn_of(self, binding: Binding, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """A rule has decided, and somebody wants to know what."""
+        agent: Any = binding.agent or binding.name_agent(*args, **kwargs)
+        record = (self.agents.get(agent) or self._answered.get(agent)) if type(agent) is str else None
+        if record is not None and record.binding is binding:
+            self._latest = record
+            record.decided_by_rule(decision, args, kwargs)
+
     def record(self, agent: str) -> Record | None:
         """What is known of an agent of the environment, whether it lives or is gone."""
         return self.agents.get(agent) or self.gone.get(agent)
@@ -423,6 +433,11 @@ class Episode:
                 record.hold(args, {})
                 record.observe(args, {})
                 record.choices = None  # which are asked for again when it decides
+        if self.clock is None and not any(binding.legal or binding.padded for binding in self._plan.active):
+            return
+        for record in self.agents.values():
+            if record.observation is None:  # there are learners to whom the infos of the reset tell all keys
+                record.info = record.unseen()
 
     def _announced(self) -> Iterable[tuple[Record, tuple[Any, ...]]]:
         """The live agents that the simulation says are going to decide, with the arguments of their calls."""
@@ -485,7 +500,7 @@ class Episode:
         self._latest = record
         arguments = record.arguments()
         if arguments is None:  # it was never seen, or the model has let it go
-            record.reward, record.info = 0.0, {}
+            record.reward, record.info = 0.0, record.unseen()
         else:
             record.settle(*arguments, last=True)
         record.forget()

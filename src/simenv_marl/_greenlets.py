@@ -80,8 +80,10 @@ class GreenletDriver(Watchful):
             return point.rule(*args, **kwargs)
         if getcurrent() is not self._inside:
             self._come_back_here()
-        switch_out, thread, deliver, loop = self._switch_out, self._thread, binding.deliver, None
+        switch_out = self._switch_out
+        thread = self._thread
         # What ``_go_out`` and ``_go_in`` do, without the calls.
+        loop = None
         get_loop = self._get_loop
         if get_loop is None and LOOPS in modules:
             get_loop = self._get_loop = modules[LOOPS]._get_running_loop
@@ -99,7 +101,10 @@ class GreenletDriver(Watchful):
         if get_loop is not None and (loop is not None or get_loop() is not None):
             self._enter_loop(loop)
         if reply is RULE:
+            if binding.by_rule is not None:
+                return binding.by_rule(point, args, kwargs)
             return point.rule(*args, **kwargs) if kwargs else point.rule(*args)
+        deliver = binding.deliver
         return reply if deliver is None else deliver(reply, *args, **kwargs)
 
     def _come_back_here(self) -> None:

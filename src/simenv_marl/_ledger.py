@@ -13,6 +13,7 @@ from math import nan
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ._batches import Asking, Entry, Group, Waiting
@@ -37,13 +38,16 @@ class Trajectories:
 
     Attributes:
         observations: ``(N, *shape)``, in the dtype of the observation space: what was decided on.
-        actions: ``(N, *shape)``, in the dtype of the action space: what was decided; zero where it was left to
-            the rule.
+        actions: ``(N, *shape)``, in the dtype of the action space: what was decided. Where it was left to the rule, the
+            action that the rule's decision corresponds to, by ``rule_action_mapping`` or, without one, by ``choices``
+            or a dict ``action_space_mapping``; zero where that is not known.
         rewards: ``(N,)`` float64: of that action, as an AEC environment has it.
         terminations: ``(N,)`` bool: whether it was the agent's last one, and its episode then ended.
         truncations: ``(N,)`` bool: whether it was the agent's last one, and its episode then was truncated.
         last_observations: ``(M, *shape)``: what each trajectory has come to, to value what is still to come where it
             was truncated.
+        last_turns: ``(M,)`` int64: how many decisions the episode had seen when the trajectory ended, in the numbers of
+            ``turns``.
         starts: ``(M,)`` int64: in which row each trajectory begins.
         episodes: ``(N,)`` int64: the number of the episode, which is the place of its seed among the seeds.
         seeds: The seeds of all episodes: row i is of ``seeds[episodes[i]]``.
@@ -52,11 +56,16 @@ class Trajectories:
         steps: ``(N,)`` int64: the number of the decision in its trajectory, from 0.
         turns: ``(N,)`` int64: its number among those of all agents of all policies in the episode, from 0.
         by_rule: ``(N,)`` bool: whether the policy has left it to the model's rule.
+        known: ``(N,)`` bool: whether ``actions`` has what was decided.
         action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such: the legal actions. None where all are.
         times: ``(N,)`` float64: the simulation's time at the decision. None where it has no clock.
         elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
             its end; nan where the model has let go of the agent before. None where there is no clock.
         extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
+        observation_space, action_space: Of the decision point. None where nobody has decided, and it is not known at
+            which point they would have.
+        collected: What ``collect`` has returned of each episode's simulation, in the order of the seeds. None where it
+            was not asked for.
     """
 
     _: KW_ONLY
@@ -66,6 +75,7 @@ class Trajectories:
     terminations: NDArray[np.bool_]
     truncations: NDArray[np.bool_]
     last_observations: Any
+    last_turns: NDArray[np.int64]
     starts: NDArray[np.int64]
     episodes: NDArray[np.int64]
     seeds: tuple[int, ...]
@@ -74,10 +84,14 @@ class Trajectories:
     steps: NDArray[np.int64]
     turns: NDArray[np.int64]
     by_rule: NDArray[np.bool_]
+    known: NDArray[np.bool_]
     action_masks: Any = None
     times: NDArray[np.float64] | None = None
     elapsed: NDArray[np.float64] | None = None
     extras: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    observation_space: spaces.Space[Any] | None = None
+    action_space: spaces.Space[Any] | None = None
+    collected: tuple[Any, ...] | None = None
 
     def __len__(self) -> int:
         """N, the number of decisions."""
@@ -93,6 +107,11 @@ class Trajectories:
     def lengths(self) -> NDArray[np.int64]:
         """``(M,)`` int64: how many decisions each trajectory has."""
         return np.diff(self.starts, append=len(self))
+
+    @cached_property
+    def returns(self) -> NDArray[np.float64]:
+        """``(M,)`` float64: the sum of the rewards of each trajectory, none of them discounted."""
+        return np.add.reduceat(self.rewards, self.starts) if len(self) else np.zeros(0)
 
     @cached_property
     def next_observations(self) -> Any:
@@ -113,8 +132,9 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
     first_rows = np.cumsum([0, *(len(part) for part in parts)])
     codes = {name: code for code, name in enumerate(dict.fromkeys(name for part in parts for name in part.names))}
     filled = [(number, part) for number, part in enumerate(parts) if len(part)]
+    collected = None if parts[0].collected is None else tuple(one for part in parts for one in part.collected or ())
     if not filled:
-        return replace(parts[0], seeds=seeds)
+        return replace(parts[0], seeds=seeds, collected=collected)
 
     def together(name: str) -> Any:
         values = [getattr(part, name) for _, part in filled]
@@ -122,8 +142,8 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
 
     _check_extras([part.extras for _, part in filled])
     same = (
-        "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "steps", "turns",
-        "by_rule", "action_masks", "times", "elapsed",
+        "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "last_turns", "steps",
+        "turns", "by_rule", "known", "action_masks", "times", "elapsed",
     )  # fmt: skip
     return Trajectories(
         **{name: together(name) for name in same},
@@ -133,6 +153,9 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
         agents=np.concatenate([np.array([codes[name] for name in part.names])[part.agents] for _, part in filled]),
         names=tuple(codes),
         extras={name: joined([part.extras[name] for _, part in filled]) for name in filled[0][1].extras},
+        observation_space=filled[0][1].observation_space,
+        action_space=filled[0][1].action_space,
+        collected=collected,
     )
 
 
@@ -159,6 +182,7 @@ class _Page:
         self.steps: list[int] = []
         self.turns: list[int] = []
         self.by_rule: list[bool] = []
+        self.rule_actions: dict[int, Any] = {}  # by row, as far as they are known
         self.times: list[float] = []
         self.rewards: list[float] = []
         self.elapsed: list[float] = []
@@ -169,6 +193,7 @@ class _Page:
         self.names: list[str] = []
         self.last_rows: list[int] = []
         self.last_observations: list[Any] = []
+        self.last_turns: list[int] = []
         self.terminated: list[bool] = []
         self.truncated: list[bool] = []
 
@@ -180,9 +205,24 @@ class _Page:
         self.names.append(record.agent)
         self.last_rows.append(-1)
         self.last_observations.append(None)
+        self.last_turns.append(-1)
         self.terminated.append(False)
         self.truncated.append(False)
         return len(self.names) - 1
+
+    def learn(self, record: Waiting) -> None:
+        """Note which action the rule's decision has corresponded to."""
+        self.rule_actions[record.row], record.rule_action = record.rule_action, None
+
+    def all_actions(self) -> Any:
+        """What was decided, in all rows."""
+        actions = joined(self.actions)
+        if not self.rule_actions:
+            return actions
+        rows = np.arange(len(self.rewards))
+        places = list(self.rule_actions)
+        rows[places] = len(rows) + np.arange(len(places))
+        return taken(joined([actions, self.stack_actions(list(self.rule_actions.values()))]), rows)
 
 
 class Ledger:
@@ -225,7 +265,8 @@ class Ledger:
             actions = [page.blank if action is RULE else action for action in actions]
         page.by_rule += by_rule
         page.actions.append(page.stack_actions(actions))
-        arrays = {str(name): np.array(values) for name, values in extras.items()}
+        # Copied, for policies may use their arrays again; in two steps, for tensors cannot be copied in one.
+        arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(
@@ -240,24 +281,29 @@ class Ledger:
         if record is not None and record.row >= 0:
             page = record.group.book
             page.rewards[record.row] = record.reward
+            if record.rule_action is not None:
+                page.learn(record)
             if "elapsed" in record.info:
                 page.elapsed[record.row] = record.info["elapsed"]
         if episode.parting:
             for record in episode.parting:
-                self._close(record, terminated=True, truncated=False)
+                self._close(record, episode.turns, terminated=True, truncated=False)
             episode.parting = []
         if episode.over:
             for record in episode.agents.values():
-                self._close(record, terminated=episode.terminated, truncated=episode.truncated)
+                self._close(record, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
-    def _close(self, record: Any, *, terminated: bool, truncated: bool) -> None:
+    def _close(self, record: Any, turns: int, *, terminated: bool, truncated: bool) -> None:
         if record.row < 0:  # it has never decided
             return
         page, trajectory = record.group.book, record.trajectory
         page.rewards[record.row] = record.reward
+        if record.rule_action is not None:
+            page.learn(record)
         page.elapsed[record.row] = record.info.get("elapsed", nan)
         page.last_rows[trajectory] = record.row
         page.last_observations[trajectory] = record.observation
+        page.last_turns[trajectory] = turns
         page.terminated[trajectory], page.truncated[trajectory] = terminated, truncated
 
     # -- afterwards -------------------------------------------------------------------------------
@@ -303,14 +349,16 @@ class _Sorted:
         self.ranks[order] = np.arange(len(order))
         self.rows = np.lexsort((self.steps, self.ranks[self.trajectory]))
         self.trajectories = order
-        self.observations, self.actions = joined(page.observations), joined(page.actions)
+        self.observations, self.actions = joined(page.observations), page.all_actions()
         self.masks = joined(page.masks) if page.masks else None
         self.extras = {name: joined([extras[name] for extras in page.extras]) for name in page.extras[0]}
         self.numbers = {
             "rewards": np.array(page.rewards, np.float64),
             "turns": np.array(page.turns, np.int64),
             "by_rule": np.array(page.by_rule, np.bool_),
+            "known": ~np.array(page.by_rule, np.bool_),
         }
+        self.numbers["known"][np.array(list(page.rule_actions), np.int64)] = True
         if page.times:
             self.numbers["times"] = np.array(page.times, np.float64)
             self.numbers["elapsed"] = np.array(page.elapsed, np.float64)
@@ -332,6 +380,7 @@ class _Sorted:
             observations=taken(self.observations, rows),
             actions=taken(self.actions, rows),
             last_observations=page.stack([page.last_observations[trajectory] for trajectory in trajectories]),
+            last_turns=np.array(page.last_turns, np.int64)[trajectories],
             starts=np.flatnonzero(steps == 0),
             episodes=self.episodes[self.trajectory[rows]],
             seeds=seeds,
@@ -340,6 +389,8 @@ class _Sorted:
             steps=steps,
             action_masks=None if self.masks is None else taken(self.masks, rows),
             extras=taken(self.extras, rows),
+            observation_space=page.binding.definition.observation_space,
+            action_space=page.binding.definition.action_space,
             **{name: array[rows] for name, array in self.numbers.items()},
         )
 
@@ -355,7 +406,7 @@ def _check_extras(extras: Sequence[Mapping[str, Any]]) -> None:
 
 def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
     """What there is to know of a policy that was never asked."""
-    binding = next((b for b in plan.bindings.values() if isinstance(b, Binding) and _answers(plan, b, place)), None)
+    binding = next((b for b in plan.bindings.values() if isinstance(b, Binding) and answers(plan, b, place)), None)
     definition = None if binding is None else binding.definition
     none = np.zeros(0, np.int64)
     observations = np.zeros(0) if definition is None else empty(definition.observation_space)
@@ -366,6 +417,7 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
         terminations=np.zeros(0, np.bool_),
         truncations=np.zeros(0, np.bool_),
         last_observations=observations,
+        last_turns=none,
         starts=none,
         episodes=none,
         seeds=seeds,
@@ -374,9 +426,13 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
         steps=none,
         turns=none,
         by_rule=np.zeros(0, np.bool_),
+        known=np.zeros(0, np.bool_),
+        observation_space=None if definition is None else definition.observation_space,
+        action_space=None if definition is None else definition.action_space,
     )
 
 
-def _answers(plan: Plan, binding: Binding, place: int) -> bool:
+def answers(plan: Plan, binding: Binding, place: int) -> bool:
+    """Whether it is known beforehand that a policy, by its place, answers at a decision point."""
     policy = binding.policy if binding.agent is None else plan.policies.get(binding.agent, binding.policy)
     return isinstance(policy, Entry) and policy.place == place

@@ -27,6 +27,8 @@ class Options:
         possible_agents: The roster, where agents are named by a callable: their names, or a dict from
             decision point to names. Declared agents are there from ``reset`` on.
         undeclared: What a decision of an agent outside the roster becomes: "error", or "rule".
+        padded: Whether everybody of the roster stands in ``agents`` from the reset to the end of an episode: also those
+            who are yet to be born or whom the model has removed, as agents that do not decide.
         max_steps: After how many calls of ``step`` with an action an episode is truncated; None: never.
         policies: Who decides without being an agent of the environment: from the name of an agent, or from a
             decision point (dotted name or decision function), to a callable of the observation, or of the
@@ -38,19 +40,21 @@ class Options:
             ``numpy.random``, which each reset seeds with the seed of the episode.
         flatten: Whether the joint view has one vector in place of dicts.
         state_space: The space to whose shape and dtype the environment's ``state()`` is cast; None: what the
-            simulation's own ``state()`` returns is taken as it is.
+            simulation's own ``state()`` returns is taken as it is. "observations": the state is what all possible
+            agents observe, in one vector, and the simulation needs no ``state()``.
         render_mode: What ``render`` returns; one of the simulation's ``render_modes``.
     """
 
     driver: str = "greenlet"
     possible_agents: Any = None
     undeclared: str = "error"
+    padded: bool = False
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
     plugins: Iterable[Any] = ()
     global_rng: bool = False
     flatten: bool = False
-    state_space: spaces.Space[Any] | None = None
+    state_space: spaces.Space[Any] | str | None = None
     render_mode: str | None = None
 
     def __post_init__(self) -> None:
@@ -62,10 +66,12 @@ class Options:
             )
         if self.undeclared not in ("error", "rule"):
             raise OptionValueError(f'undeclared must be "error" or "rule", not {self.undeclared!r}')
-        if not isinstance(self.global_rng, bool):
-            raise OptionValueError(f"global_rng must be True or False, not {self.global_rng!r}")
-        if self.state_space is not None and not isinstance(self.state_space, spaces.Space):
-            raise OptionValueError(f"state_space must be a gymnasium space, not {self.state_space!r}")
+        for name in ("global_rng", "padded"):
+            if not isinstance(getattr(self, name), bool):
+                raise OptionValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
+        state_space = self.state_space
+        if not (state_space is None or isinstance(state_space, spaces.Space) or state_space == "observations"):
+            raise OptionValueError(f'state_space must be a gymnasium space or "observations", not {state_space!r}')
         steps = self.max_steps
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
             raise OptionValueError(f"max_steps must be a positive integer or None, not {steps!r}")

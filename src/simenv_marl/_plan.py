@@ -42,7 +42,8 @@ class Plan:
         variant: The variant that it is made of; None if it is of none.
         options: Its options.
         render_modes: What its simulation can be rendered as.
-        bindings: The decision points that do not run their rule, with all that is known of them.
+        bindings: Of decision points that do not run their rule, all that is known (a ``Binding``); and what else the
+            user's side is told of: functions that remove agents (``Removal``), what rules have decided (``Ruled``).
         policies: By name: who answers the decisions of agents that are no agents of the environment.
         roster: By name: the agents that are known beforehand, in the order of the points.
         complete: Whether no others may join.
@@ -77,14 +78,16 @@ class Plan:
         agents = _name_agents(named)
         by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
         everything = [*named, *extra]
-        self.bindings: dict[DecisionPoint, Binding | Removal] = {}
+        self.bindings: dict[Any, Any] = {}
         active: list[Binding] = []
         for point, agent in zip(everything, _name_agents(everything), strict=True):
             policy = by_point.get(point.point)
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
             if policy is RULE and not excepted:
                 continue  # nobody needs to be asked
-            binding = self.bindings[point.point] = Binding(point, agent, policy)
+            binding = self.bindings[point.point] = Binding(
+                point, agent, policy, recorded=asked is not None, padded=options.padded
+            )
             if self._is_asked(agent, policy) if asked is not None else policy is None and agent not in self.policies:
                 active.append(binding)
         self.active = active
@@ -93,6 +96,9 @@ class Plan:
             for other in stand_ins(bound.point):
                 self.bindings.setdefault(other, bound)
         self._find_removals()
+        for bound in list(self.bindings.values()):
+            if isinstance(bound, Binding) and bound.ruled is not None:
+                self.bindings[bound.ruled] = bound.ruled
         self.plugins = Plugins(options.plugins) if options.plugins else None
         if not active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")

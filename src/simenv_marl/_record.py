@@ -28,18 +28,22 @@ class Record:
         decided: Whether a reward has been asked for it in this episode: the first one is dropped.
         acted: Whether an action of its user was used in the latest round.
         ended: Whether its episode has ended before the simulation's.
+        news: Whether the next info is to tell of ``rule_action``.
         handed_out: The observation that a view has given away, and which is not to be given away again.
         followed_up: Whether something is to be done when its decision is answered.
         observation: Its latest observation, cast to its space; None before it was ever observed.
         reward: The reward of its action before, as of its latest decision or its end.
         info: The info of its latest decision, a dict of its own.
         mask, choices: The legal actions of its pending decision, where its point restricts them.
+        offered: The choices of its latest decision, where somebody wants to know which of them the rule has taken.
+        rule_action: The action that its latest decision by the rule corresponds to; None if that is not known.
         memory: What differences remember for it.
     """
 
     __slots__ = (
         "_args", "_kwargs", "_now", "_time", "_weakly", "acted", "agent", "binding", "choices", "clock", "decided",
-        "ended", "followed_up", "handed_out", "info", "mask", "memory", "observation", "policy", "reward",
+        "ended", "followed_up", "handed_out", "info", "mask", "memory", "news", "observation", "offered", "policy",
+        "reward", "rule_action",
     )  # fmt: skip
 
     def __init__(self, agent: str, binding: Binding, policy: Any, clock: Callable[[], float] | None) -> None:
@@ -57,6 +61,9 @@ class Record:
         self.info: dict[str, Any] = {}
         self.mask: Any = None
         self.choices: Any = None
+        self.offered: Any = None
+        self.rule_action: Any = None
+        self.news = False
         self.memory: dict[Any, Any] = {}
         self._args: tuple[Any, ...] | None = None
         self._kwargs: dict[str, Any] = {}
@@ -64,7 +71,21 @@ class Record:
 
     def follow_up(self) -> None:
         """See to what is to be done when its decision is answered, if ``followed_up``."""
-        self._time, self.choices = self._now, None
+        self._time = self._now
+        if self.binding.ruled is not None:
+            self.offered = self.choices
+        self.choices = None
+
+    def decided_by_rule(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Find out which action a decision of the rule corresponds to. The arguments are those of the call.
+
+        Raises:
+            InvalidActionError: That is no action.
+        """
+        offered, self.offered = self.offered, None
+        assert self.binding.ruled is not None
+        self.rule_action = self.binding.ruled.action(decision, args, kwargs, offered)
+        self.news = self.binding.definition.rule_action_mapping is not None and self.rule_action is not None
 
     def arguments(self) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
         """The arguments of the latest decision; None where there are none any more."""
@@ -93,7 +114,7 @@ class Record:
 
     def forget(self) -> None:
         """Let go of the arguments; the agent has no more to observe."""
-        self._args = self._weakly = None
+        self._args = self._weakly = self._time = None
         self._kwargs = {}
 
     def settle(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
@@ -138,7 +159,7 @@ class Record:
         binding = self.binding
         if DIFFERENCES:
             EVALUATING[get_ident()] = self.memory
-        if binding.legal is None and self.clock is None:
+        if binding.legal is None and self.clock is None and not binding.tells:
             cast, observe = binding.cast, binding.observe
             self.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
             self.info = {}
@@ -149,9 +170,20 @@ class Record:
                 info[_spaces.MASK] = _spaces.duplicate(self.mask)
             if self.clock is not None:
                 info |= self._passed(self.clock())
+            if binding.padded:
+                info["present"] = True
+            if self.news:
+                info["rule_action"], self.news = _spaces.duplicate(self.rule_action), False
             self.observation = binding.observation(args, kwargs, self.mask)
         if DIFFERENCES:
             EVALUATING.pop(get_ident(), None)
+
+    def unseen(self) -> dict[str, Any]:
+        """Make the info of an agent that cannot be observed: that of any other of its point, with all actions legal."""
+        info: dict[str, Any] = {"present": False} if self.binding.padded else {}
+        if self.binding.legal is not None:
+            info[_spaces.MASK] = _spaces.open_mask(self.binding.definition.action_space)
+        return info if self.clock is None else info | self._passed(self.clock())
 
     def arise(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Find out what must be known of a decision in mid-round. The arguments are those of ``settle``."""

@@ -35,7 +35,10 @@ class Rounds(Episode):
             self._quick = {
                 binding: binding.name_agent
                 for binding in plan.active
-                if binding.name_agent is not None and binding.legal is None and binding.point.alone
+                if binding.name_agent is not None
+                and binding.legal is None
+                and binding.point.alone
+                and not binding.tells
             }
         super().__init__(plan, simulation, *others)
         self._announces = getattr(simulation, "expected_calls", None) is not None
@@ -247,7 +250,7 @@ class Rounds(Episode):
     def _settle(self, record: Record, pending: Record | None) -> None:
         arguments = record.arguments()
         if arguments is None:
-            record.reward, record.info = 0.0, {}
+            record.reward, record.info = 0.0, record.unseen()
             return
         self._latest = record
         record.settle(*arguments)

@@ -99,7 +99,7 @@ class ThreadDriver(Watchful):
         reply, self._reply = self._reply, _NOTHING
         RUNNING[thread] = self.ask
         if reply is RULE:
-            return point.rule(*args, **kwargs)
+            return point.rule(*args, **kwargs) if binding.by_rule is None else binding.by_rule(point, args, kwargs)
         if reply is _EXIT:
             raise SimulationExit
         return reply if deliver is None else deliver(reply, *args, **kwargs)

@@ -24,7 +24,7 @@ from gymnasium import spaces
 
 from ._driver import EVALUATING, RUNNING
 from ._wrappers import DECISION, beneath, generate, is_alone, is_method, kind_of, stands_in, with_exposure
-from .errors import DefinitionError, PatchError
+from .errors import DefinitionError, InvalidActionError, PatchError
 
 Mapped = Callable[..., Any]
 """A mapping: called with the arguments of the decision call as they were passed."""
@@ -49,6 +49,7 @@ class Definition:
     action_space_mapping: Callable[[Any], Any] | None
     apply: Mapped | None
     choices: Mapped | None
+    rule_action_mapping: Mapped | None
     agent: str | Mapped | None
     action_mask_mapping: Mapped | None
     removed_by: Mapping[str, Mapped | None]
@@ -92,6 +93,7 @@ def make_step(
     reward_mapping: Mapped,
     apply: Mapped | None = None,
     choices: Mapped | None = None,
+    rule_action_mapping: Mapped | Mapping[Any, Any] | None = None,
     agent: str | Mapped | None = None,
     action_mask_mapping: Mapped | None = None,
     removed_by: str | Iterable[str] | Mapping[str, Mapped | None] = (),
@@ -116,6 +118,10 @@ def make_step(
         choices: Instead of both: called with the call's arguments, returns the sequence of legal answers.
             The action is an index into it; ``action_space`` is a ``Discrete`` (from 0) of the largest
             length, and the mask follows by itself.
+        rule_action_mapping: Which action a decision of the rule corresponds to, for those who learn from it: a
+            callable of the decision (and of the call's arguments, where it takes more than one), which returns an
+            action or None for none; or a dict from decision to action. After a decision that was left to the rule,
+            the agent's next info has that action as ``"rule_action"``.
         agent: The name of the agent that decides here, or a callable of the call's arguments that names
             it (None: nobody, the rule decides). By default the function's letters in lower case and a
             number, such as ``choosewateramount_0``.
@@ -163,6 +169,14 @@ def make_step(
         raise DefinitionError(
             f"make_step: action_space_mapping must be a callable or a dict, not {action_space_mapping!r}"
         )
+    if isinstance(rule_action_mapping, Mapping):
+        rule_action_mapping = _look_back(rule_action_mapping)
+    elif callable(rule_action_mapping):
+        rule_action_mapping = _of_decision(rule_action_mapping)
+    elif rule_action_mapping is not None:
+        raise DefinitionError(
+            f"make_step: rule_action_mapping must be a callable or a dict, not {rule_action_mapping!r}"
+        )
     if action_mask_mapping is not None and not isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete)):
         raise DefinitionError(
             f"make_step: action_mask_mapping needs a Discrete or MultiDiscrete action_space, not {action_space}"
@@ -189,6 +203,7 @@ def make_step(
         action_space_mapping=action_space_mapping,
         apply=apply,
         choices=choices,
+        rule_action_mapping=rule_action_mapping,
         agent=agent,
         action_mask_mapping=action_mask_mapping,
         removed_by=_removals(removed_by),
@@ -221,6 +236,45 @@ def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[
             f" missing: {missing}, not in the space: {surplus}"
         )
     return dict(answers).__getitem__
+
+
+def inverse(definition: Definition) -> dict[Any, Any] | None:
+    """From decision to action, where ``action_space_mapping`` is a dict that can be read backwards."""
+    answers = getattr(definition.action_space_mapping, "__self__", None)
+    if not isinstance(answers, dict):
+        return None
+    try:
+        actions = {decision: action for action, decision in answers.items()}
+    except TypeError:  # decisions that cannot be looked up
+        return None
+    return actions if len(actions) == len(answers) else None
+
+
+def _look_back(actions: Mapping[Any, Any]) -> Mapped:
+    known = dict(actions)
+
+    def look_back(decision: Any, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return known[decision]
+        except (KeyError, TypeError):
+            raise InvalidActionError(
+                f"the dict rule_action_mapping has no action for the rule's decision {decision!r}; give it one, or a"
+                " callable that returns None where no action corresponds"
+            ) from None
+
+    return look_back
+
+
+def _of_decision(mapping: Callable[..., Any]) -> Mapped:
+    """Let a mapping be called with the decision and the call's arguments, whether it takes these or not."""
+    try:
+        parameters = list(inspect.signature(mapping).parameters.values())
+    except (TypeError, ValueError):
+        parameters = []
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if any(p.default is p.empty for p in positional[1:]) or any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        return mapping
+    return lambda decision, *args, **kwargs: mapping(decision)
 
 
 # -- decision points ------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from ._plan import Plan
 from ._session import checked_seed
 from ._spread import progress_bar, spread
 from .errors import OptionValueError
+from .simulation import RULE
 
 __all__ = ["Trajectories", "collect_episodes", "simulate_many"]
 
@@ -38,8 +40,10 @@ def simulate_many(
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
         policies: Who decides: from agent or decision point to a callable of the observations, or of the observations
-            and the infos, of as many decisions as wait for it. The observations are stacked, ``(batch, *shape)``;
-            where the space is a ``Dict`` or a ``Tuple``, a dict or a tuple of stacks. The infos are a list of dicts.
+            and the infos, or of these and the identities, of as many decisions as wait for it. The observations are
+            stacked, ``(batch, *shape)``; where the space is a ``Dict`` or a ``Tuple``, a dict or a tuple of stacks. The
+            infos are a list of dicts, the identities one of pairs: the seed of the episode, and the number of the
+            decision among all in it.
             It returns as many actions, in the same order: an array, what becomes one (a tensor), a sequence, or a dict
             of these. ``RULE`` in place of an action, or of all of them, leaves it to the model. A tuple of the actions
             and a dict is taken for actions alone (see ``collect_episodes``). Policies that are the same object are
@@ -70,8 +74,7 @@ def simulate_many(
     """
     checked = _checked_seeds(seeds)
     _check_numbers(batch_size, workers)
-    if collect is not None and not callable(collect):
-        raise OptionValueError(f"collect must be a callable of a simulation, or None, not {collect!r}")
+    _check_collect(collect)
     arguments = (simulation, dict(_checked_policies(policies)), points, collect, int(batch_size), options)
     # Made here also where the work is done elsewhere, so that what cannot work is found out before.
     plan = Plan.draw_up(simulation, points, {**options, "policies": entries(arguments[1])}, unanswered=True)
@@ -124,6 +127,7 @@ def collect_episodes(
     *,
     seeds: Iterable[int],
     points: Any = None,
+    collect: Callable[[Any], Any] | None = None,
     batch_size: int = 1024,
     workers: int = 0,
     progress: bool = False,
@@ -136,10 +140,12 @@ def collect_episodes(
 
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
-        policies: Who decides, as in ``simulate_many``. A policy may return a tuple of the actions and a dict of arrays
-            of shape ``(batch, ...)`` (log-probabilities, values), which become ``extras``; always of the same names.
+        policies: Who decides, as in ``simulate_many``; ``RULE`` is a policy like any other. A policy may return
+            a tuple of the actions and a dict of arrays of shape ``(batch, ...)`` (log-probabilities, values), which
+            become ``extras``; always of the same names.
         seeds: What the simulations are reset with, non-negative integers.
         points: The decision points, as ``generate_env`` takes them.
+        collect: Called with each simulation as soon as it has ended; what it returns stands in ``collected``.
         batch_size: How many simulations may be suspended together; in each worker. No more than 256 of them are
             as long as policies take less time than simulations do.
         workers: How many processes share the work: see ``simulate_many``.
@@ -148,8 +154,7 @@ def collect_episodes(
             ``possible_agents`` says.
 
     Returns:
-        By the keys of ``policies``, what those have lived through for whom each policy has answered; nothing for keys
-        whose policy is ``RULE``.
+        By the keys of ``policies``, what those have lived through for whom each policy has answered.
 
     Raises:
         OptionValueError: An argument cannot have its value, or the extras do not fit the decisions.
@@ -161,15 +166,16 @@ def collect_episodes(
     """
     checked = _checked_seeds(seeds)
     _check_numbers(batch_size, workers)
+    _check_collect(collect)
     given = dict(_checked_policies(policies))
-    plan, keys = _learners_plan(simulation, given, points, options)
+    plan, keys = learners_plan(simulation, given, points, options)
     bar = progress_bar(len(checked)) if progress else None
     try:
         if not workers or not checked:
-            found = _collect(plan, keys, int(batch_size), checked, bar)
+            found = _collect(plan, keys, collect, int(batch_size), checked, bar)
         else:
             parts = []
-            arguments = (simulation, given, points, int(batch_size), options)
+            arguments = (simulation, given, points, collect, int(batch_size), options)
             for number, part in spread(_collect_part, arguments, checked, int(workers), int(batch_size)):
                 parts.append(part)
                 if bar is not None:
@@ -181,40 +187,56 @@ def collect_episodes(
     return {key: found[place] for key, place in keys.items()}
 
 
-def _learners_plan(
+def learners_plan(
     simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
 ) -> tuple[Plan, dict[Any, int]]:
     """The plan of the episodes, and the places of the policies by their keys."""
-    found = entries(policies)
+    found = entries({key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()})
     keys = {key: entry.place for key, entry in found.items() if isinstance(entry, Entry)}
     return Plan.draw_up(simulation, points, {**options, "policies": found}, unanswered=True, asked=Entry), keys
+
+
+def _left_to_the_rule(observations: Any) -> Any:
+    return RULE
 
 
 def _collect_part(
     simulation: Any,
     policies: Mapping[Any, Any],
     points: Any,
+    collect: Callable[[Any], Any] | None,
     batch_size: int,
     options: dict[str, Any],
     seeds: list[int],
 ) -> dict[int, Trajectories]:
     """In a worker: play a part of the episodes."""
-    plan, keys = _learners_plan(simulation, policies, points, options)
-    return _collect(plan, keys, batch_size, seeds, None)
+    plan, keys = learners_plan(simulation, policies, points, options)
+    return _collect(plan, keys, collect, batch_size, seeds, None)
 
 
 def _collect(
-    plan: Plan, keys: Mapping[Any, int], batch_size: int, seeds: list[int], bar: Any
+    plan: Plan,
+    keys: Mapping[Any, int],
+    collect: Callable[[Any], Any] | None,
+    batch_size: int,
+    seeds: list[int],
+    bar: Any,
 ) -> dict[int, Trajectories]:
     ledger = Ledger()
     watcher: Watcher = ledger
+    collected: list[Any] = [None] * len(seeds)
 
     def finish(place: int, simulation: Any) -> None:
+        if collect is not None:
+            collected[place] = collect(simulation)
         if bar is not None:
             bar.update()
 
     run(plan, seeds, batch_size, finish, watcher)
-    return ledger.trajectories(plan, keys, seeds)
+    found = ledger.trajectories(plan, keys, seeds)
+    if collect is None:
+        return found
+    return {place: replace(own, collected=tuple(collected)) for place, own in found.items()}
 
 
 def _checked_seeds(seeds: Any) -> list[int]:
@@ -232,6 +254,11 @@ def _checked_policies(policies: Any) -> Mapping[Any, Any]:
     if policies is not None and not isinstance(policies, Mapping):
         raise OptionValueError(f"policies must be a dict from agents or points to callables, not {policies!r}")
     return policies or {}
+
+
+def _check_collect(collect: Any) -> None:
+    if collect is not None and not callable(collect):
+        raise OptionValueError(f"collect must be a callable of a simulation, or None, not {collect!r}")
 
 
 def _check_numbers(batch_size: Any, workers: Any) -> None:

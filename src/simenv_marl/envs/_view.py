@@ -16,14 +16,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
+from numpy.typing import NDArray
 
 from .._bindings import Binding
 from .._episode import Episode
 from .._plan import Plan
 from .._provenance import describe
 from .._session import AnyEpisode, Session, checked_seed, seed_space
-from .._spaces import blank, duplicate, observation_cast
-from ..errors import CopyError, ReentrancyError, UnknownAgentError, UnknownOptionError
+from .._spaces import duplicate, observation_cast
+from ..errors import CopyError, OptionValueError, ReentrancyError, UnknownAgentError, UnknownOptionError, ViewError
 from ..plugins import Entry
 
 
@@ -37,6 +38,7 @@ class View:
 
     metadata: dict[str, Any]
     render_mode: str | None
+    _together: tuple[spaces.Tuple[Any], spaces.Space[Any]] | None = None
 
     def __init__(self, plan: Plan) -> None:
         """Make the view of a plan.
@@ -95,23 +97,53 @@ class View:
     @property
     def state_space(self) -> spaces.Space[Any] | None:
         """The space of ``state()``, where the environment was made with one."""
-        return self._plan.options.state_space
+        space = self._plan.options.state_space
+        return self._seen_together()[1] if isinstance(space, str) else space
 
     def state(self) -> Any:
         """The state of the simulation, for centralised critics: what its own ``state()`` returns.
 
         Returns:
-            A new array; in the dtype of ``state_space``, where the environment was made with one.
+            A new array; in the dtype of ``state_space``, where the environment was made with one. With
+            ``state_space="observations"`` what all possible agents observe, flattened, one behind the other.
 
         Raises:
             NotImplementedError: The simulation has no ``state``, as PettingZoo has it.
+            ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
+        if isinstance(self._plan.options.state_space, str):
+            if self._episode is None:
+                raise self._session.not_running()
+            parts, space = self._seen_together()
+            return np.asarray(spaces.flatten(parts, self._seen(self._episode))).astype(space.dtype)
         tell = getattr(self.simulation, "state", None)
         if not callable(tell):
             raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
         with self._session.at_work():
             value = tell()
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
+
+    def _seen_together(self) -> tuple[spaces.Tuple[Any], spaces.Space[Any]]:
+        """The spaces of all that is observed, and the one of them all.
+
+        Raises:
+            ViewError: There is no vector of them.
+        """
+        if self._together is None:
+            parts = spaces.Tuple(self._seen_spaces())
+            together = spaces.flatten_space(parts)
+            if not isinstance(together, spaces.Box):
+                raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
+            self._together = parts, together
+        return self._together
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        """The spaces of all that is observed."""
+        raise NotImplementedError
+
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        """All that is observed."""
+        raise NotImplementedError
 
     def render(self) -> Any:
         """Render the simulation in ``render_mode``; without one, None and a warning.
@@ -232,6 +264,37 @@ class OneAgentView(View, gym.Env[Any, Any]):
     """A view with one agent, and so a Gymnasium environment."""
 
     _agent: str
+    action_space: spaces.Space[Any]
+    observation_space: spaces.Space[Any]
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        return [self.observation_space]
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which actions are legal now, in the shape in which sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns:
+            Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the masks of its parts, one behind the other.
+            True throughout where the decision point does not restrict its actions.
+
+        Raises:
+            ViewError: The action space is neither, and so there are no masks of it.
+            ResetNeededError: There is no episode.
+        """
+        if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+            raise ViewError(
+                f"there are masks of Discrete and MultiDiscrete action spaces, and not of {self.action_space}; joint"
+                " environments of discrete actions have a MultiDiscrete with flatten=True"
+            )
+        if self._episode is None:
+            raise self._session.not_running()
+        masks = self._legal(self._episode)
+        parts = [part for mask in masks for part in (mask if isinstance(mask, tuple) else (mask,))]
+        return np.concatenate(parts).astype(np.bool_)
+
+    def _legal(self, episode: Episode) -> list[Any]:
+        """The masks of all that is decided in a step."""
+        raise NotImplementedError
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None, kind: type[AnyEpisode]) -> AnyEpisode:
         """End the episode that runs, begin another, and seed the generator and the spaces."""
@@ -260,9 +323,12 @@ class AgentsView(View):
         Raises:
             SimEnvError: Something in the plan cannot work.
         """
+        if plan.options.padded and not plan.complete:
+            raise OptionValueError("padded=True needs a roster: say in possible_agents= who there may be")
         super().__init__(plan)
         if plan.possible_agents is not None:
             self.possible_agents = plan.possible_agents
+        self._padded = plan.options.padded
         self._generator: np.random.Generator | None = None
         self._observation_spaces: dict[str, spaces.Space[Any]] = {}
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
@@ -281,6 +347,25 @@ class AgentsView(View):
                 self._seed_spaces(agent, seed)
         return episode
 
+    @staticmethod
+    def check(plan: Plan) -> None:
+        """Make sure that a plan allows this view.
+
+        Raises:
+            ViewError: It does not.
+        """
+        View.check(plan)
+        if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
+            raise ViewError(
+                'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='
+            )
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        return [self.observation_space(agent) for agent in self.possible_agents]
+
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        return tuple(self._observation(episode, agent) for agent in self.possible_agents)
+
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The observation space of an agent: of this environment alone, and always the same object.
 
@@ -298,6 +383,24 @@ class AgentsView(View):
         """
         space = self._action_spaces.get(agent)
         return space if space is not None else self._make_spaces(agent)[1]
+
+    @property
+    def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """By possible agent, its observation space: for learners that ask for all at once.
+
+        Raises:
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+        """
+        return {agent: self.observation_space(agent) for agent in self.possible_agents}
+
+    @property
+    def action_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """By possible agent, its action space: for learners that ask for all at once.
+
+        Raises:
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+        """
+        return {agent: self.action_space(agent) for agent in self.possible_agents}
 
     def _binding(self, agent: str) -> Binding:
         binding = self._plan.roster.get(agent)
@@ -323,8 +426,8 @@ class AgentsView(View):
     def _observation(self, episode: Episode, agent: str) -> Any:
         """The latest observation of an agent, as a copy of the caller's own."""
         record = episode.record(agent)
-        if record is None or record.observation is None:
-            return blank(self._binding(agent).definition.observation_space)
+        if record is None or record.observation is None or (self._padded and agent in episode.gone):
+            return self._binding(agent).blank()
         return duplicate(record.observation)
 
 

@@ -30,7 +30,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         terminations, truncations: By agent, python bools.
         infos: By agent, the info of its latest decision. ``infos[agent]["action_mask"]``, np.int8, is there
             where the decision point restricts its actions; ``"time"`` and ``"elapsed"`` where the simulation
-            has a clock.
+            has a clock. The keys are there from the reset on, and stay; of an agent that has not been seen
+            yet, all actions are legal.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -88,6 +89,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             raise
         # The selected agent is the only one that the latest step has rewarded.
         self.rewards[agent] = self._cumulative_rewards[agent] = 0.0
+        if self._rewarded:
+            self._rest()
         record = episode.pending
         if record is None or episode.parting:
             self._enter(episode)
@@ -187,8 +190,14 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                 self._join(agent)
                 self.infos[agent] = record.info
         for record in episode.parting:
-            self._part(record, terminated=True, truncated=False)
+            if self._padded:
+                self._pad(record)
+            else:
+                self._part(record, terminated=True, truncated=False)
         if episode.over:
+            if self._padded:
+                for agent in episode.gone:
+                    self._dismiss(agent, terminated=episode.terminated, truncated=episode.truncated)
             # Those that have never decided come last.
             for record in sorted(episode.agents.values(), key=lambda record: not record.decided):
                 self._part(record, terminated=episode.terminated, truncated=episode.truncated)
@@ -202,15 +211,31 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     def _part(self, record: Record, *, terminated: bool, truncated: bool) -> None:
         """Enter the end of an agent: last reward, flags; its ``None`` step is to come."""
-        agent = record.agent
-        if agent not in self.rewards:
-            self._join(agent)
-        self.rewards[agent] = record.reward
-        self._cumulative_rewards[agent] += record.reward
+        if record.agent not in self.rewards:
+            self._join(record.agent)
+        self._reward(record)
+        self.infos[record.agent] = record.info
+        self._dismiss(record.agent, terminated=terminated, truncated=truncated)
+
+    def _pad(self, record: Record) -> None:
+        """Enter that an agent was removed, and stays among the others all the same."""
+        self._reward(record)
+        self.infos[record.agent] = record.unseen()
+
+    def _reward(self, record: Record) -> None:
+        self.rewards[record.agent] = record.reward
+        self._cumulative_rewards[record.agent] += record.reward
+        self._rewarded.append(record.agent)
+
+    def _dismiss(self, agent: str, *, terminated: bool, truncated: bool) -> None:
         self.terminations[agent], self.truncations[agent] = terminated, truncated
-        self.infos[agent] = record.info
         self._leaving.append(agent)
-        self._rewarded.append(agent)
+
+    def _rest(self) -> None:
+        """Take back what is only to be seen of the step before: the rewards of others than the selected agent."""
+        for agent in self._rewarded:
+            self.rewards[agent] = 0.0
+        self._rewarded = []
 
     def _take_leave(self, episode: Episode, action: Any) -> None:
         """The step of an agent whose episode has ended."""
@@ -220,9 +245,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {action!r}"
             )
-        for agent in self._rewarded:
-            self.rewards[agent] = 0.0
-        self._rewarded = []
+        self._rest()
         agent = self._leaving.pop()
         for book in (self.rewards, self._cumulative_rewards, self.terminations, self.truncations, self.infos):
             del book[agent]

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from .._episode import Episode
 from .._plan import Plan
 from .._rounds import Rounds
-from .._spaces import blank, duplicate
+from .._spaces import duplicate, open_mask
 from ..errors import InvalidActionError, ViewError
 from ..simulation import RULE
 from ._view import OneAgentView
@@ -26,7 +27,8 @@ class SimulationJointEnv(OneAgentView):
 
     Attributes:
         observation_space, action_space: ``Dict`` spaces keyed by agent, or, flattened, the one-dimensional
-            ``Box`` of all of them, one behind the other (the paper's two-dimensional action space).
+            ``Box`` of all of them, one behind the other (the paper's two-dimensional action space); actions of
+            ``Discrete`` and one-dimensional ``MultiDiscrete`` spaces come to a ``MultiDiscrete``.
     """
 
     _episode: Rounds | None
@@ -52,9 +54,9 @@ class SimulationJointEnv(OneAgentView):
         self._time: float | None = None
         self._flatten = plan.options.flatten
         if self._flatten:
-            self._cuts = np.cumsum([_length(space) for space in actions.values()])[:-1]
             self.observation_space: spaces.Space[Any] = _concatenate(observations)
-            self.action_space: spaces.Space[Any] = _concatenate(actions)
+            self.action_space: spaces.Space[Any] = _concatenate_actions(actions)
+            self._places = _places(actions)
         else:
             self.observation_space, self.action_space = spaces.Dict(observations), spaces.Dict(actions)
 
@@ -113,6 +115,17 @@ class SimulationJointEnv(OneAgentView):
             self.render()
         return self._observe(), reward, episode.terminated, episode.truncated, self._info()
 
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        return (self._observe(),)
+
+    def _legal(self, episode: Episode) -> list[Any]:
+        masks = []
+        for agent in self._agents:
+            record = episode.record(agent)
+            mask = None if record is None else record.mask
+            masks.append(open_mask(self._plan.roster[agent].definition.action_space) if mask is None else mask)
+        return masks
+
     def _split(self, action: Any) -> Mapping[str, Any]:
         """The actions of the agents in a joint action."""
         if action is RULE:
@@ -120,7 +133,7 @@ class SimulationJointEnv(OneAgentView):
         if self._flatten:
             if not isinstance(action, np.ndarray) or action.shape != self.action_space.shape:
                 raise InvalidActionError(f"the joint action {action!r} is not in {self.action_space}")
-            return dict(zip(self._agents, np.split(action, self._cuts), strict=True))
+            return {agent: action[place] for agent, place in self._places.items()}
         if not isinstance(action, Mapping) or set(action) != set(self._agents):
             given = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
@@ -135,7 +148,7 @@ class SimulationJointEnv(OneAgentView):
         for agent in self._agents:
             record = episode.record(agent)
             if record is None or record.observation is None:
-                observations[agent] = blank(self._plan.roster[agent].definition.observation_space)
+                observations[agent] = self._plan.roster[agent].blank()
             else:
                 observations[agent] = duplicate(record.observation)
         if self._flatten:
@@ -166,6 +179,34 @@ def _length(space: spaces.Space[Any]) -> int:
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise ViewError(f"flatten=True needs one-dimensional Box spaces, not {space}")
     return space.shape[0]
+
+
+def _concatenate_actions(parts: Mapping[str, spaces.Space[Any]]) -> spaces.Space[Any]:
+    """Actions are one vector where they are all numbers of one kind: all continuous, or all discrete."""
+    listed: list[Any] = list(parts.values())
+    if not all(_counts(space) for space in listed):
+        if any(_counts(space) for space in listed):
+            kinds = ", ".join(map(str, listed))
+            raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {kinds}")
+        return _concatenate(parts)
+    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in listed]
+    starts = [np.atleast_1d(space.start) for space in listed]
+    return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))
+
+
+def _counts(space: spaces.Space[Any]) -> bool:
+    return isinstance(space, spaces.Discrete) or (isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1)
+
+
+def _places(parts: Mapping[str, spaces.Space[Any]]) -> dict[str, int | slice]:
+    """By agent, where its action stands in the flattened one."""
+    places: dict[str, int | slice] = {}
+    begin = 0
+    for agent, space in parts.items():
+        length = space.shape[0] if space.shape else 1
+        places[agent] = slice(begin, begin + length) if space.shape else begin
+        begin += length
+    return places
 
 
 def _concatenate(parts: Mapping[str, spaces.Space[Any]]) -> spaces.Box:

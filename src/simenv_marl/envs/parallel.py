@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 from .._plan import Plan
 from .._record import Record
 from .._rounds import Rounds
-from .._spaces import blank, duplicate
+from .._spaces import duplicate
 from ..simulation import Sentinel
 from ._view import AgentsView
 
@@ -19,6 +19,9 @@ Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, boo
 
 class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     """A simulation as a PettingZoo parallel environment. Made by ``parallel_env`` and ``generate_env``.
+
+    With ``padded=True`` all of ``possible_agents`` are there until the episode ends, whether they are ``"present"``, as
+    their infos then tell, or not.
 
     A step answers each decision as it arises with the action given for its agent, once, and returns at the
     first decision whose action is missing or used already. All actions at once so give simultaneous moves,
@@ -61,13 +64,13 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         if self._shows:
             self.render()
         records = episode.agents.values()
-        return (
-            {record.agent: self._hand_out(record) for record in records},
-            {
-                record.agent: {**record.info, "deciding": record is episode.pending, "acted": False}
-                for record in records
-            },
-        )
+        observations = {record.agent: self._hand_out(record) for record in records}
+        infos = {
+            record.agent: {**record.info, "deciding": record is episode.pending, "acted": False} for record in records
+        }
+        if self._padded:
+            self._pad(episode, (observations, {}, {}, {}, infos))
+        return observations, infos
 
     def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
         """Play a round.
@@ -92,6 +95,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             raise self._session.not_running()
         if isinstance(actions, Sentinel):
             actions = dict.fromkeys(episode.agents, actions)
+        elif self._padded and isinstance(actions, Mapping):
+            actions = self._of_those_present(episode, actions)
         try:
             episode.play(actions)
         except BaseException:
@@ -122,6 +127,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         if pending is not None:
             pending.info["deciding"] = True
         self.agents = [] if episode.over else list(episode.agents)
+        if self._padded:
+            self._pad(episode, results)
         if self._shows:
             self.render()
         return results
@@ -130,11 +137,39 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         super()._clear()
         self.agents = []
 
+    def _of_those_present(self, episode: Rounds, actions: Mapping[str, Any]) -> dict[str, Any]:
+        """Take out the actions of agents of the roster that have not been seen yet or are gone."""
+        roster, agents = self._plan.roster, episode.agents
+        return {
+            agent: action
+            for agent, action in actions.items()
+            if agent not in roster or (agent in agents and agents[agent].info.get("present"))
+        }
+
+    def _pad(self, episode: Rounds, results: Results) -> None:
+        """Have everybody of the roster be there, and end together."""
+        observations, rewards, terminations, truncations, infos = results
+        for agent in self.possible_agents:
+            record = episode.record(agent)
+            assert record is not None
+            if agent in episode.gone or not record.info["present"]:
+                acted = agent in infos and infos[agent]["acted"]
+                observations[agent] = record.binding.blank()
+                infos[agent] = {**record.unseen(), "deciding": False, "acted": acted}
+                rewards.setdefault(agent, 0.0)
+            terminations[agent], truncations[agent] = episode.terminated, episode.truncated
+            part: Any
+            for part in results:
+                if agent in part:  # to stand in the order of the roster
+                    part[agent] = part.pop(agent)
+        if not episode.over:
+            self.agents = list(self.possible_agents)
+
     def _hand_out(self, record: Record) -> Any:
         """The observation of an agent, which nobody else gets to see: each return makes its own."""
         observation = record.observation
         if observation is None:
-            return blank(record.binding.definition.observation_space)
+            return record.binding.blank()
         if record.handed_out is observation:  # it could not be observed anew
             return duplicate(observation)
         record.handed_out = observation

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .._episode import Episode
 from .._plan import Plan
 from .._record import Record
+from .._spaces import open_mask
 from ..decision import Definition
 from ..errors import ViewError
 from ._view import OneAgentView, View
@@ -103,6 +104,13 @@ class SimulationEnv(OneAgentView):
             episode.truncated and not record.ended,
             record.info,
         )
+
+    def _legal(self, episode: Episode) -> list[Any]:
+        mask = self._record.mask
+        return [open_mask(self.action_space) if mask is None else mask]
+
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        return (self._record.observation,)
 
     def _go_on(self, episode: Any) -> None:
         super()._go_on(episode)

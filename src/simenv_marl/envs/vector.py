@@ -56,6 +56,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             SimEnvError: Something in it cannot work; the leaf says what.
         """
         super().__init__()
+        self.closed = True  # as long as it is not made; older versions of Gymnasium close what is dropped half made
         self.num_envs = _count(num_envs, "num_envs", 1)
         workers = _count(workers, "workers", 0)
         self._mode = _mode(autoreset_mode)
@@ -80,6 +81,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         self._finalizer = weakref.finalize(self, self._crew.abandon)
         if workers or plan.options.driver == "thread":
             one_at_a_time(self)
+        self.closed = False
 
     # -- episodes ---------------------------------------------------------------------------------
 

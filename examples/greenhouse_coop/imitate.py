@@ -1,0 +1,186 @@
+"""A network learns from the model's own rule what that does, and ventilates greenhouses in its place.
+
+``python -m examples.greenhouse_coop.imitate`` has the rule ventilate some greenhouses, writes down what it has decided
+as a Minari data set, clones its behaviour from that by TorchRL, and compares the two in greenhouses that neither has
+seen: decision by decision, by return, and in the model's own loop. It needs ``pip install "simenv-marl[minari]"
+torchrl``.
+
+The rule is that of the paper's plugin, the warmer the faster: a fixed 20 % would be learnt too soon. The waterer pours
+what the plants can take, for all of them die within days of the model's rule, and there would be little to see.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+from unittest.mock import patch
+
+import minari
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.modules import MLP
+from torchrl.objectives import BCLoss
+
+from simenv_marl import (
+    RULE,
+    Variant,
+    collect_episodes,
+    compare_with_rule,
+    make_step,
+    record_dataset,
+    simulate,
+)
+
+from .env import (
+    ACTION_SPACE,
+    MOST_WATER,
+    OBSERVATION_SPACE,
+    OBSERVED,
+    WATERING,
+    GreenhouseSim,
+    observe,
+    reward,
+    to_fraction,
+)
+from .model import Greenhouse
+from .variants import AIR_EXCHANGE
+
+HELD_OUT: Final = 1_000_000
+"""Seeds from here on are for the comparison; those below are learnt from."""
+
+WATERER, VENTILATOR = "waterer_0", "ventilator_0"
+
+DATASET: Final = "greenhouse/ventilator-rule-v0"
+
+TOLERANCE: Final = 0.01
+"""By how much actions may differ that are taken for the same: one per cent of the air."""
+
+
+# -- the model, and what is decided in it ---------------------------------------------------------
+
+
+@make_step(
+    observation_space=OBSERVATION_SPACE,
+    observation_space_mapping=observe,
+    action_space=ACTION_SPACE,
+    action_space_mapping=to_fraction,
+    rule_action_mapping=lambda fraction: [fraction],
+    reward_mapping=reward,
+    agent="ventilator_0",
+)
+def choose_air_exchange(greenhouse: Greenhouse) -> float:
+    """Decide which fraction of the air is replaced: more of it at higher temperatures (paper, section 4, step 3)."""
+    return (greenhouse.temp - 15) / 20
+
+
+def decided_air_exchange(greenhouse: Greenhouse) -> None:
+    """Exchange as much air as was decided."""
+    fraction = choose_air_exchange(greenhouse)
+    greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
+
+
+WARM: Final = Variant(
+    "ventilated_by_warmth",
+    GreenhouseSim,
+    points={**WATERING, choose_air_exchange: None},
+    plugins=[(decided_air_exchange, AIR_EXCHANGE, "instead")],
+)
+"""Two agents: the waterer, and one that ventilates as the paper's plugin does."""
+
+
+def sparing(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Water by the day: sixty litres."""
+    return np.full((len(observations), 1), 60 / MOST_WATER, np.float32)
+
+
+# -- learning -------------------------------------------------------------------------------------
+
+Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""Decides for many at once."""
+
+
+def clone(dataset: minari.MinariDataset, steps: int) -> Policy:
+    """Learn from a data set what to do.
+
+    Args:
+        dataset: What was decided, on which observations.
+        steps: How many batches to learn from.
+    """
+    episodes = list(dataset)
+    data = TensorDict(
+        {
+            "observation": torch.as_tensor(np.concatenate([episode.observations[:-1] for episode in episodes])),
+            "action": torch.as_tensor(np.concatenate([episode.actions for episode in episodes])),
+        },
+        [dataset.total_steps],
+    )
+    network = MLP(in_features=len(OBSERVED), out_features=1, num_cells=[32, 32])
+    loss = BCLoss(TensorDictModule(network, ["observation"], ["action"]), loss_function="mse")
+    optimizer = torch.optim.Adam(loss.parameters(), 3e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        loss(data[torch.randint(len(data), (256,))])["loss_bc"].backward()
+        optimizer.step()
+        schedule.step()
+
+    def policy(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        with torch.no_grad():
+            actions: NDArray[np.float32] = network(torch.as_tensor(observations)).clamp(0, 1).numpy()
+        return actions
+
+    return policy
+
+
+# -- the comparison -------------------------------------------------------------------------------
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
+    """Record, learn, compare.
+
+    Returns:
+        In which share of the decisions both agree, and the mean return with each.
+    """
+    parser = argparse.ArgumentParser(description="Clone the rule that ventilates.")
+    parser.add_argument("--episodes", type=int, default=50, help="greenhouses to learn from (default: %(default)s)")
+    parser.add_argument("--steps", type=int, default=3000, help="batches to learn from (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    # Leave this out to keep the data set.
+    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, MINARI_DATASETS_PATH=folder):
+        record_dataset({VENTILATOR: DATASET}, WARM, {WATERER: sparing, VENTILATOR: RULE}, seeds=range(options.episodes))
+        learned = clone(minari.load_dataset(DATASET), options.steps)
+
+    unseen = range(HELD_OUT, HELD_OUT + options.seeds)
+    compared = compare_with_rule(
+        WARM, {VENTILATOR: learned}, others={WATERER: sparing}, seeds=unseen, tolerance=TOLERANCE
+    )[VENTILATOR]
+    differences = np.abs(compared.policy_actions - compared.trajectories.actions)
+    print(f"agree in {compared.agreement:.1%} of the decisions; differ by {differences.max():.3f} at most")
+    results = {"agreement": compared.agreement}
+    for title, ventilate in (("rule", RULE), ("imitation", learned)):
+        collected = collect_episodes(WARM, {WATERER: sparing, VENTILATOR: ventilate}, seeds=unseen)
+        values = collected[VENTILATOR].returns  # of the team: both agents are rewarded for the same
+        results[title] = float(values.mean())
+        print(f"{title}: return {values.mean():.2f} ± {values.std():.2f}")
+    for title, alone in (("rule", RULE), ("imitation", one_by_one(learned))):
+        simulation = simulate(WARM, {WATERER: one_by_one(sparing), VENTILATOR: alone}, seed=HELD_OUT)
+        print(f"{title}, in the model itself, seed {HELD_OUT}: {simulation.render('ansi')}")
+    return results
+
+
+def one_by_one(policy: Policy) -> Callable[[Any], Any]:
+    """What a policy of many decides of one."""
+    return lambda observation: policy(observation[None])[0]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Mesa's wolves and sheep, unmodified, with one policy that all sheep share."""

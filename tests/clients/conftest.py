@@ -1,0 +1,22 @@
+"""Settings of the tests with real learners."""
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+
+def pytest_configure(config) -> None:
+    """Learners warn of much that is theirs; what this library warns of, and what nobody could catch, is an error."""
+    for line in (
+        "default",
+        "error:::simenv_marl",
+        "error::pytest.PytestUnraisableExceptionWarning",
+        "error::pytest.PytestUnhandledThreadExceptionWarning",
+    ):
+        config.addinivalue_line("filterwarnings", line)
+
+
+@pytest.fixture(autouse=True)
+def _the_same_at_every_run():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)

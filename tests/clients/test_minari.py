@@ -1,0 +1,312 @@
+"""Minari data sets of what was decided, read again by Minari and by a learner."""
+
+import sys
+from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, SKIP, DocTestParser, DocTestRunner
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    DefinitionError,
+    Mixture,
+    OptionValueError,
+    collect_episodes,
+    compare_with_rule,
+    record_dataset,
+    save_dataset,
+)
+
+from ..many_worlds import Being, beings
+from ..models import Script, calling, decision, script
+
+minari = pytest.importorskip("minari")
+
+NAME = "simenv/demo-v0"
+
+
+@pytest.fixture(autouse=True)
+def _where_data_sets_lie(monkeypatch, tmp_path):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data sets"))
+
+
+def ones(observations):
+    return np.ones(len(observations), np.int64)
+
+
+def same(one, other):
+    """Whether two stacks are equal, values, dtypes and all."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(part, other[key]) for key, part in one.items())
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, list):
+        return one == other
+    return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+
+
+def part(stack, rows):
+    if isinstance(stack, dict):
+        return {key: part(value, rows) for key, value in stack.items()}
+    if isinstance(stack, tuple):
+        return tuple(part(value, rows) for value in stack)
+    if isinstance(stack, list):  # of texts
+        return stack[rows]
+    return list(stack[rows]) if stack.dtype == object else stack[rows]
+
+
+def check(found, dataset):
+    """A data set has just what was found."""
+    assert dataset.total_episodes == len(found.starts)
+    assert dataset.total_steps == len(found)
+    assert (dataset.observation_space, dataset.action_space) == (found.observation_space, found.action_space)
+    metadata = list(dataset.storage.get_episode_metadata(range(dataset.total_episodes)))
+    for place, (start, length) in enumerate(zip(found.starts, found.lengths, strict=True)):
+        rows, episode = slice(start, start + length), dataset[place]
+        assert same(part(episode.observations, slice(0, length)), part(found.observations, rows))
+        assert same(part(episode.observations, slice(1, length + 1)), part(found.next_observations, rows))
+        assert same(episode.actions, part(found.actions, rows))
+        assert same(episode.rewards, found.rewards[rows])
+        assert same(episode.terminations, found.terminations[rows])
+        assert same(episode.truncations, found.truncations[rows])
+        assert same(episode.infos["by_rule"], np.append(found.by_rule[rows], False))
+        assert metadata[place]["seed"] == found.seeds[found.episodes[start]]
+        assert metadata[place]["agent"] == found.names[found.agents[start]]
+        assert metadata[place]["episode"] == found.episodes[start]
+        assert metadata[place]["turn"] == found.turns[start]
+
+
+def herd(simulation):
+    """Some beings; every second one goes after its first decision."""
+    simulation.crowd = [Being(number) for number in range(4)]
+    for being in simulation.crowd:
+        being.health = simulation.seed % 10
+    for _ in range(1 + simulation.seed % 3):
+        for being in list(simulation.crowd):
+            being.act()
+            being.health += 1
+            if being.number % 2:
+                being.leave()
+                simulation.crowd.remove(being)
+    return TRUNCATED
+
+
+def test_data_sets_hold_what_was_collected():
+    policies, points, seeds = {Being.act: lambda seen: seen[:, 1].astype(int) % 3}, beings(), [3, 1, 5, 2**70]
+    recorded = record_dataset(NAME, script(herd), policies, points=points, seeds=seeds, batch_size=2)
+    found = collect_episodes(script(herd), policies, points=points, seeds=seeds)[Being.act]
+    check(found, recorded)
+    check(found, minari.load_dataset(NAME))
+    sampled = list(minari.load_dataset(NAME).sample_episodes(5))
+    assert all(len(episode.observations) == len(episode.actions) + 1 for episode in sampled)
+
+
+SPACES = [
+    spaces.Discrete(5),
+    spaces.Box(-2, 2, (2, 3), np.float32),
+    spaces.MultiDiscrete([3, 4]),
+    spaces.MultiBinary(3),
+    spaces.Dict(a=spaces.Discrete(3), b=spaces.Tuple([spaces.Box(0, 1, (2,)), spaces.Discrete(2)])),
+    spaces.Tuple([spaces.Text(4, charset="ab"), spaces.Box(0, 255, (4, 4, 3), np.uint8)]),
+    spaces.Box(0, 255, (8, 8, 3), np.uint8),
+]
+
+
+@pytest.mark.parametrize("space", SPACES, ids=str)
+def test_all_kinds_of_spaces_are_read_again(space):
+    space.seed(1)
+    ant = decision(agent="ant_0", observation_space=space, observation_space_mapping=space.sample, action_space=space)
+    found = collect_episodes(
+        calling(ant, ant, ant), {ant: lambda seen: [space.sample() for _ in range(2)]}, seeds=[1, 2], points=ant
+    )[ant]
+    check(found, save_dataset(NAME, found))
+
+
+def test_infos_are_as_many_as_observations():
+    class Timed(Script):
+        def time(self):
+            return 10.0 * len(self.log)
+
+    def main(simulation):
+        simulation.log += [ant()]
+        simulation.log += [ant()]
+
+    ant = decision(agent="ant_0", action_mask_mapping=lambda: [0, 1] + [0] * 8)
+    policy = lambda seen: (ones(seen), {"values": np.full((len(seen), 2), 0.5)})  # noqa: E731
+    (episode,) = record_dataset(NAME, lambda: Timed(main), {ant: policy}, points=ant, seeds=[1])
+    assert episode.infos.keys() == {"by_rule", "action_mask", "time", "values"}
+    assert episode.infos["action_mask"].tolist() == [[0, 1] + [0] * 8] * 2 + [[1] * 10]
+    assert episode.infos["time"].tolist() == [0, 10, 20]
+    assert episode.infos["values"].tolist() == [[0.5, 0.5]] * 2 + [[0, 0]]
+
+
+def test_each_policy_has_a_data_set():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    policies = {"ant_0": ones, "bee_0": lambda seen: [2] * len(seen), ant: ones}
+    names = {"ant_0": "simenv/ants-v0", "bee_0": "simenv/bees-v1"}
+    written = record_dataset(names, calling(ant, bee, bee), policies, points=[ant, bee], seeds=[1, 2])
+    assert list(written) == ["ant_0", "bee_0"]
+    assert set(minari.list_local_datasets()) == {"simenv/ants-v0", "simenv/bees-v1"}
+    assert [episode.actions.tolist() for episode in minari.load_dataset("simenv/bees-v1")] == [[2, 2]] * 2
+
+
+def test_metadata_say_where_it_is_from():
+    ant = decision(agent="ant_0")
+    record_dataset(
+        NAME,
+        calling(ant),
+        {ant: ones},
+        points=ant,
+        seeds=[1],
+        max_steps=5,
+        metadata={"author": "An", "description": "?"},
+    )
+    metadata = minari.load_dataset(NAME).storage.metadata
+    assert metadata["algorithm_name"] == "ones"
+    assert (metadata["author"], metadata["description"]) == ({"An"}, "?")
+    assert "simulation" in metadata["provenance"]
+
+
+def test_the_environment_can_be_recovered():
+    greenhouse = pytest.importorskip("examples.greenhouse_coop.env")
+    policies, metadata = {"waterer_0": RULE}, {"env": "greenhouse_coop/Watering-v0"}
+    record_dataset(NAME, greenhouse.GreenhouseSim, policies, points=greenhouse.WATERING, seeds=[5], metadata=metadata)
+    dataset = minari.load_dataset(NAME)
+    env = dataset.recover_environment()
+    observation, _ = env.reset(seed=5)
+    assert np.array_equal(observation, dataset[0].observations[0])
+    for action, following, reward in zip(
+        dataset[0].actions, dataset[0].observations[1:], dataset[0].rewards, strict=True
+    ):
+        observation, obtained, *_ = env.step(action)
+        assert np.allclose(observation, following)
+        assert obtained == pytest.approx(reward)
+    env.close()
+
+
+def test_nothing_is_overwritten_and_nothing_is_run_in_vain():
+    ant = decision(agent="ant_0")
+    record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1])
+
+    def never(simulation):
+        raise AssertionError
+
+    with pytest.raises(OptionValueError, match="already"):
+        record_dataset(NAME, script(never), {ant: ones}, points=ant, seeds=[1])
+    with pytest.raises(OptionValueError, match="no name"):
+        record_dataset("no name", script(never), {ant: ones}, points=ant, seeds=[1])
+    with pytest.raises(OptionValueError, match="nobody"):
+        record_dataset("simenv/none-v0", script(lambda simulation: None), {ant: ones}, points=ant, seeds=[1])
+    assert minari.list_local_datasets().keys() == {NAME}
+
+
+def test_half_a_data_set_is_none():
+    ant = decision(agent="ant_0")
+    with pytest.raises(TypeError):
+        record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1], metadata={"no such argument": 1})
+    record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1])
+
+
+def told(**changes):
+    """Beings whose rule takes their health as an action."""
+    return beings(rule_action_mapping=lambda decided, being: being.health % 10, **changes)
+
+
+def test_the_rule_demonstrates():
+    recorded = record_dataset(NAME, script(herd), {Being.act: RULE}, points=told(), seeds=[3, 1, 5])
+    found = collect_episodes(script(herd), {Being.act: RULE}, points=told(), seeds=[3, 1, 5])[Being.act]
+    check(found, recorded)
+    for episode in minari.load_dataset(NAME):
+        assert episode.actions.tolist() == episode.observations[:-1, 1].tolist()
+        assert episode.infos["by_rule"].tolist() == [True] * len(episode) + [False]
+    assert recorded.storage.metadata["algorithm_name"] == "rule"
+
+
+def test_mixtures_demonstrate_alike_however_they_are_run():
+    mixture = Mixture({RULE: 1, ones: 1})
+    recorded = [
+        record_dataset(
+            f"simenv/mixed-v{n}", script(herd), {Being.act: mixture}, points=told(), seeds=range(5), **options
+        )
+        for n, options in enumerate([{}, {"batch_size": 2}, {"workers": 2}])
+    ]
+    for others in zip(*recorded, strict=True):
+        assert len({str(episode.actions.tolist()) for episode in others}) == 1
+        assert len({str(episode.infos["component"].tolist()) for episode in others}) == 1
+    by_rule = [rule for episode in recorded[0] for rule in episode.infos["by_rule"][:-1]]
+    assert 0 < sum(by_rule) < len(by_rule)
+
+
+def test_what_the_rule_has_taken_must_be_known():
+    with pytest.raises(DefinitionError, match=r"act.*rule_action_mapping"):
+        record_dataset(NAME, script(herd), {Being.act: RULE}, points=beings(), seeds=[1])
+    points = beings(rule_action_mapping=lambda decided, being: None)
+    with pytest.raises(DefinitionError, match="not known"):
+        record_dataset(NAME, script(herd), {Being.act: lambda seen: RULE}, points=points, seeds=[1])
+    assert not minari.list_local_datasets()
+
+
+def test_a_learner_imitates_the_rule():
+    """TorchRL's loss, on what Minari reads: what a rule does in many states is learnt from what it did in some."""
+    torch = pytest.importorskip("torch")
+    tensordict_nn = pytest.importorskip("tensordict.nn")
+    from tensordict import TensorDict
+    from torchrl.objectives import BCLoss
+
+    space = spaces.Box(-1, 1, (1,), np.float32)
+    points = beings(
+        observation_space=spaces.Box(0, 1, (2,), np.float32),
+        observation_space_mapping=lambda being: [being.number / 4, being.health / 12],
+        action_space=space,
+        rule_action_mapping=lambda decided, being: [being.number / 4 - being.health / 12],
+    )
+    record_dataset(NAME, script(herd), {Being.act: RULE}, points=points, seeds=range(40))
+    episodes = list(minari.load_dataset(NAME))
+    data = TensorDict(
+        {
+            "observation": torch.as_tensor(np.concatenate([episode.observations[:-1] for episode in episodes])),
+            "action": torch.as_tensor(np.concatenate([episode.actions for episode in episodes])),
+        },
+        [sum(map(len, episodes))],
+    )
+    network = torch.nn.Linear(2, 1)
+    loss = BCLoss(tensordict_nn.TensorDictModule(network, ["observation"], ["action"]), loss_function="mse")
+    optimizer = torch.optim.Adam(loss.parameters(), 0.05)
+    for _ in range(400):
+        optimizer.zero_grad()
+        loss(data)["loss_bc"].backward()
+        optimizer.step()
+
+    def policy(observations):
+        with torch.no_grad():
+            return network(torch.as_tensor(observations)).clamp(-1, 1)
+
+    compared = compare_with_rule(
+        script(herd), {Being.act: policy}, points=points, seeds=range(100, 140), tolerance=0.02
+    )
+    assert compared[Being.act].agreement == 1.0
+
+
+def test_the_page_on_demonstrations_does_what_it_says(monkeypatch):
+    """With the examples that need Minari, which are skipped where it is not there."""
+    page = Path(__file__).parents[2] / "docs" / "demonstrations.md"
+    monkeypatch.syspath_prepend(page.parent)
+    for model in ("bakery", "bakery_env"):
+        monkeypatch.delitem(sys.modules, model, raising=False)
+    examples = DocTestParser().get_doctest(page.read_text(encoding="utf-8"), {}, page.name, str(page), 0)
+    skipped = [example.options.pop(SKIP, False) for example in examples.examples]
+    assert sum(skipped) > 3
+    assert DocTestRunner(optionflags=ELLIPSIS | NORMALIZE_WHITESPACE).run(examples).failed == 0
+
+
+def test_the_example_imitates_the_rule(capsys):
+    pytest.importorskip("torchrl")
+    from examples.greenhouse_coop import imitate
+
+    results = imitate.main(["--episodes", "10", "--steps", "1000", "--seeds", "4"])
+    assert results["agreement"] > 0.5
+    assert results["imitation"] == pytest.approx(results["rule"], abs=2)
+    assert "in the model itself" in capsys.readouterr().out

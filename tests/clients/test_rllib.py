@@ -1,0 +1,244 @@
+"""RLlib's new API stack: its own wrappers, its own checker, its own training, and its modules in our loop."""
+
+import os
+import random
+
+os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+
+import numpy as np
+import pytest
+import ray
+import torch
+from examples.greenhouse_coop.env import parallel_env as parallel_greenhouse
+from examples.greenhouse_coop.env import raw_env as aec_greenhouse
+from examples.greenhouse_coop.env import watering_env
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.env.multi_agent_episode import MultiAgentEpisode
+from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv, PettingZooEnv
+from ray.rllib.examples.rl_modules.classes.action_masking_rlm import ActionMaskingTorchRLModule
+from ray.rllib.utils.pre_checks.env import check_multiagent_environments
+from ray.tune.registry import register_env
+
+from simenv_marl import aec_env, parallel_env, simulate
+
+from .fragments import blocks
+from .hive import BEES, DEFINITION, MASK_OBSERVED, Bee, HiveSim, points
+
+HELD_OUT = range(10_000, 10_010)
+GREENHOUSES = {
+    "parallel": lambda: ParallelPettingZooEnv(parallel_greenhouse()),
+    "aec": lambda: PettingZooEnv(aec_greenhouse()),
+}
+HIVES = {"parallel": (ParallelPettingZooEnv, parallel_env), "aec": (PettingZooEnv, aec_env)}
+
+
+def hive(view, definition=DEFINITION):
+    """Bees that are born and die, in RLlib's wrapper."""
+    wrapper, make = HIVES[view]
+    return wrapper(make(HiveSim, points(definition), possible_agents=BEES, padded=True))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _ray():
+    exec(blocks("_clients_rllib.md")[0], {})
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture(autouse=True)
+def _the_same_at_every_run():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    random.seed(0)
+    np.random.seed(0)
+
+
+# -- its wrappers and its checker -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", GREENHOUSES.values(), ids=GREENHOUSES)
+def test_its_checker_finds_nothing_in_the_greenhouse(make):
+    check_multiagent_environments(make())
+
+
+@pytest.mark.parametrize("view", HIVES)
+def test_its_checker_finds_nothing_in_the_hive(view):
+    check_multiagent_environments(hive(view))
+
+
+@pytest.mark.parametrize("view", HIVES)
+def test_its_roster_is_ours_and_its_episodes_end_when_ours_do(view):
+    """A death and a time limit in the same step are neither ``terminated`` nor ``truncated`` for all, unless padded."""
+    env = hive(view)
+    assert set(env.possible_agents) == set(BEES)
+    ends = set()
+    for seed in range(40):
+        choose = random.Random(seed)
+        observations, infos = env.reset(seed=seed)
+        episode = MultiAgentEpisode(observation_space=env.observation_space, action_space=env.action_space)
+        episode.add_env_reset(observations=observations, infos=infos)
+        total = 0.0
+        while not episode.is_done:
+            actions = {agent: choose.randrange(3) for agent in episode.get_agents_to_act()}
+            observations, rewards, terminateds, truncateds, infos = env.step(actions)
+            total += sum(rewards.values())
+            episode.add_env_step(
+                observations=observations,
+                actions=actions,
+                rewards=rewards,
+                terminateds=terminateds,
+                truncateds=truncateds,
+                infos=infos,
+            )
+        episode.validate()
+        assert terminateds["__all__"] != truncateds["__all__"]
+        assert episode.get_return() == pytest.approx(total)
+        ends.add(truncateds["__all__"])
+    assert ends == {True, False}
+
+
+# -- training -------------------------------------------------------------------------------------
+
+
+def config(name, make, **environment):
+    register_env(name, lambda config: make())
+    return (
+        PPOConfig()
+        .environment(name, **environment)
+        .env_runners(num_env_runners=0)
+        .rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[32, 32]))
+        .training(train_batch_size_per_learner=512, minibatch_size=128, num_epochs=8, lr=3e-3, gamma=0.9, grad_clip=1.0)
+        .debugging(seed=0)
+    )
+
+
+def in_the_greenhouse(policies):
+    """What policies are worth: the days' shares of living plants, less the water, over seeds that none has seen."""
+    env = parallel_greenhouse()
+    gained = 0.0
+    for seed in HELD_OUT:
+        observations, _ = env.reset(seed=seed)
+        while env.agents:
+            actions = {agent: policies[agent](observation) for agent, observation in observations.items()}
+            observations, rewards, _, _, _ = env.step(actions)
+            gained += rewards["ventilator_0"]
+    return gained / len(HELD_OUT)
+
+
+def in_the_hive(policy, seeds=range(10_000, 10_040)):
+    """The nectar that bees bring home in the model's own loop when a policy decides for each."""
+    brought = 0.0
+    for seed in seeds:
+        env = parallel_env(HiveSim, points(DEFINITION), possible_agents=BEES)
+        observations, _ = env.reset(seed=seed)
+        while env.agents:
+            observations, rewards, _, _, _ = env.step({agent: policy(observations[agent]) for agent in env.agents})
+            brought += sum(rewards.values())
+    return brought / len(seeds)
+
+
+def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
+    _, build, train, define, take_out = blocks("_clients_rllib.md")
+    names = {"__name__": "__main__"}
+    exec(define, names)
+    exec(build, names)
+    algorithm = names["algorithm"]
+    early = algorithm.save_to_path()
+    exec(train, names)
+    trained, names["checkpoint"] = names["checkpoint"], early
+    exec(take_out, names)
+    before = in_the_greenhouse(names["policies"])
+    names["checkpoint"] = trained
+    exec(take_out, names)
+    policies = names["policies"]
+    after = in_the_greenhouse(policies)
+    live = in_the_greenhouse({agent: names["policy_of"](algorithm.get_module(agent)) for agent in policies})
+    algorithm.stop()
+    assert live == after
+    assert after > before + 5
+    # The model's own loop runs just as the environment's in which one decides after the other.
+    env = aec_greenhouse()
+    env.reset(seed=1)
+    while not any(env.terminations.values()) and not any(env.truncations.values()):
+        env.step(policies[env.agent_selection](env.observe(env.agent_selection)))
+    assert names["greenhouse"].day == env.simulation.greenhouse.day
+    assert names["greenhouse"].water_use == env.simulation.greenhouse.water_use > 0
+
+
+@pytest.fixture
+def policy_of():
+    """The function on the page."""
+    names = {"__name__": "__main__"}
+    exec(blocks("_clients_rllib.md")[3], names)
+    return names["policy_of"]
+
+
+def test_training_in_turns(policy_of):
+    agents = ("waterer_0", "ventilator_0")
+    settings = config("greenhouse in turns", GREENHOUSES["aec"])
+    algorithm = settings.multi_agent(
+        policies=set(agents), policy_mapping_fn=lambda agent, episode, **_: agent
+    ).build_algo()
+    before = in_the_greenhouse({agent: policy_of(algorithm.get_module(agent)) for agent in agents})
+    for _ in range(8):
+        algorithm.train()
+    after = in_the_greenhouse({agent: policy_of(algorithm.get_module(agent)) for agent in agents})
+    algorithm.stop()
+    assert after > before + 5
+
+
+def test_training_a_single_agent(policy_of):
+    algorithm = config("watering", watering_env).build_algo()
+
+    def worth():
+        policy = policy_of(algorithm.get_module())
+        days = []
+        for seed in HELD_OUT:
+            env = watering_env()
+            observation, _ = env.reset(seed=seed)
+            over, gained = False, 0.0
+            while not over:
+                observation, reward, terminated, truncated, _ = env.step(policy(observation))
+                over, gained = terminated or truncated, gained + reward
+            days.append(gained)
+        return np.mean(days)
+
+    before = worth()
+    for _ in range(6):
+        algorithm.train()
+    after = worth()
+    algorithm.stop()
+    assert after > before + 2
+
+
+@pytest.mark.parametrize("view", HIVES)
+def test_one_policy_for_all_who_are_born(view, policy_of):
+    algorithm = (
+        config(f"hive {view}", lambda: hive(view))
+        .multi_agent(policies={"bee"}, policy_mapping_fn=lambda agent, episode, **_: "bee")
+        .build_algo()
+    )
+    policy = policy_of(algorithm.get_module("bee"))
+    before = in_the_hive(policy)
+    for _ in range(8):
+        algorithm.train()
+    after = in_the_hive(policy)
+    algorithm.stop()
+    assert after > before + 3
+    # All bees of a hive, born whenever, in the model's own loop.
+    policies = {Bee.choose_meadow: policy}
+    hives = [simulate(HiveSim, policies, points=points(DEFINITION), seed=seed).hive for seed in range(20)]
+    assert np.mean([hive.day for hive in hives]) > 10
+
+
+def test_masks_are_read_from_observations():
+    algorithm = (
+        config("masked hive", lambda: hive("parallel", MASK_OBSERVED), disable_env_checking=True)
+        .multi_agent(policies={"bee"}, policy_mapping_fn=lambda agent, episode, **_: "bee")
+        .rl_module(rl_module_spec=RLModuleSpec(module_class=ActionMaskingTorchRLModule))
+        .build_algo()
+    )
+    algorithm.train()  # an illegal action of the one who decides would be an error
+    algorithm.stop()

@@ -1,0 +1,201 @@
+"""Stable-Baselines3 and sb3-contrib: single views, joint views, goals, masks."""
+
+import gymnasium
+import pytest
+from examples.greenhouse_coop import env as greenhouse
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+from stable_baselines3 import PPO, SAC, HerReplayBuffer
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+from simenv_marl import joint_env, single_env, vector_env
+
+from . import page
+from .returns import single_return
+from .worlds import CraneSim, HerdSim, ReservoirSim, ShopSim, WorkbenchSim
+
+SMALL = {"net_arch": [32]}
+
+
+def policy_of(model):
+    return lambda observation, info: model.predict(observation, deterministic=True)[0]
+
+
+def gain(model, env, steps, **seeds):
+    """What a policy is worth before and after training."""
+    before = single_return(env, policy_of(model), **seeds)
+    model.learn(steps)
+    return before, single_return(env, policy_of(model), **seeds)
+
+
+def rescaled(env):
+    """With actions from -1 to 1, as Stable-Baselines3 recommends."""
+    return gymnasium.wrappers.RescaleAction(env, -1, 1)
+
+
+# -- its checker ----------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: single_env(ReservoirSim),
+        lambda: single_env(CraneSim),
+        lambda: single_env(CraneSim, driver="thread"),
+        lambda: joint_env(ShopSim, flatten=True),
+        lambda: rescaled(greenhouse.watering_env()),
+        lambda: rescaled(greenhouse.joint_env(flatten=True)),
+        lambda: gymnasium.make("greenhouse_coop/Watering-v0", max_steps=20),
+    ],
+    ids=["single", "goal", "thread", "joint", "greenhouse", "joint greenhouse", "registered"],
+)
+def test_check_env(make):
+    env = make()
+    check_env(env, warn=env.action_space == gymnasium.spaces.Box(-1, 1, env.action_space.shape))
+    env.close()
+
+
+def test_joint_actions_by_agent_are_refused():
+    """Observations may be dicts; actions may not, and are flattened."""
+    with pytest.raises(AssertionError, match="only supports"):
+        PPO("MultiInputPolicy", joint_env(ShopSim))
+
+
+def test_it_takes_no_vector_environments_of_gymnasium():
+    with pytest.raises(ValueError, match="not a Gymnasium environment"):
+        PPO("MlpPolicy", vector_env(ReservoirSim, num_envs=2))
+
+
+# -- training -------------------------------------------------------------------------------------
+
+
+def test_one_continuous_decision():
+    model = PPO(
+        "MlpPolicy",
+        single_env(ReservoirSim),
+        n_steps=200,
+        batch_size=50,
+        learning_rate=2e-3,
+        gamma=0.9,
+        policy_kwargs=SMALL,
+        seed=0,
+    )
+    before, after = gain(model, single_env(ReservoirSim), 4000)
+    assert before < -30
+    assert after > 15  # of 20
+
+
+def test_the_waterer_of_the_greenhouse():
+    env = rescaled(greenhouse.watering_env())
+    model = PPO("MlpPolicy", env, n_steps=500, batch_size=50, learning_rate=1e-3, gamma=0.95, seed=0)
+    before, after = gain(model, rescaled(greenhouse.watering_env()), 5000, seeds=range(1000, 1005))
+    assert before < 0
+    assert after > 20
+
+
+def test_both_decisions_of_the_greenhouse_by_one_learner():
+    env = rescaled(greenhouse.joint_env(flatten=True))
+    model = PPO("MlpPolicy", env, n_steps=500, batch_size=50, learning_rate=1e-3, gamma=0.95, seed=0)
+    before, after = gain(model, rescaled(greenhouse.joint_env(flatten=True)), 5000, seeds=range(1000, 1005))
+    assert before < 0
+    assert after > 15
+
+
+def learner_of_shops(envs):
+    return PPO(
+        "MlpPolicy", envs, n_steps=100, batch_size=100, learning_rate=2e-3, gamma=0.5, policy_kwargs=SMALL, seed=0
+    )
+
+
+def test_both_decisions_of_the_shop_in_many_shops_at_once():
+    envs = make_vec_env(lambda: joint_env(ShopSim, flatten=True), n_envs=4)
+    before, after = gain(learner_of_shops(envs), joint_env(ShopSim, flatten=True), 6000)
+    envs.close()
+    assert before < 0
+    assert after > 25  # of 30
+
+
+def test_many_shops_in_processes_of_their_own():
+    """They are told what they are told side by side in one process, and so learn the same."""
+    learnt = []
+    for kind in (DummyVecEnv, SubprocVecEnv):
+        envs = make_vec_env(lambda: joint_env(ShopSim, flatten=True), n_envs=2, vec_env_cls=kind)
+        model = learner_of_shops(envs).learn(200)
+        envs.close()
+        learnt.append(single_return(joint_env(ShopSim, flatten=True), policy_of(model)))
+    assert learnt[0] == learnt[1]
+
+
+def test_a_goal_with_hindsight():
+    model = SAC(
+        "MultiInputPolicy",
+        single_env(CraneSim),
+        replay_buffer_class=HerReplayBuffer,
+        learning_rate=3e-3,
+        gamma=0.9,
+        tau=0.02,
+        batch_size=128,
+        learning_starts=200,
+        policy_kwargs={"net_arch": [32, 32]},
+        seed=0,
+    )
+    before, after = gain(model, single_env(CraneSim), 1500)
+    assert before < -8
+    assert after > -3
+
+
+# -- masks ----------------------------------------------------------------------------------------
+
+
+def test_masked_decisions():
+    """A masked action would be an error, so that none has been taken where training comes to its end."""
+    env = single_env(WorkbenchSim)
+    assert is_masking_supported(env)
+    model = MaskablePPO(
+        "MlpPolicy",
+        make_vec_env(lambda: single_env(WorkbenchSim), n_envs=2),
+        n_steps=125,
+        batch_size=50,
+        learning_rate=3e-3,
+        gamma=1.0,
+        policy_kwargs={"net_arch": [64]},
+        seed=0,
+    )
+
+    def act(observation, info):
+        masks = get_action_masks(env)
+        assert masks.tolist() == info["action_mask"].astype(bool).tolist()
+        return int(model.predict(observation, deterministic=True, action_masks=masks)[0])
+
+    before = single_return(env, act)
+    model.learn(4000)
+    assert single_return(env, act) > max(before + 0.8, -6.8)  # at best -6.7, and -8.3 by chance
+
+
+def test_masked_decisions_of_a_joint_view():
+    env = joint_env(HerdSim, possible_agents=["forager_0", "forager_1"], undeclared="rule", flatten=True)
+    model = MaskablePPO("MlpPolicy", env, n_steps=100, batch_size=50, seed=0)
+    model.learn(200)
+    assert get_action_masks(env).tolist() == [True] * 4
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+
+def test_the_page(monkeypatch):
+    steps = page.steps("Stable-Baselines3 and sb3-contrib", monkeypatch)
+    names = next(steps)
+    env = single_env(names["FourWeeks"], names["points"])
+
+    def act(observation, info):
+        return names["model"].predict(observation)[0]
+
+    before = single_return(env, act)
+    names = next(steps)
+    assert single_return(env, act) > before + 100
+    together, masked = [dict(names) for names in steps]
+    assert together["env"].action_space == gymnasium.spaces.MultiDiscrete([5, 3])
+    assert masked["env"].action_masks()[masked["action"]]

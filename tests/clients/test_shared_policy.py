@@ -1,0 +1,140 @@
+"""TorchRL: one policy for all sheep of Mesa's model, learnt from the episodes that ``collect_episodes`` returns."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+from examples.wolf_sheep import picture, results, train
+from examples.wolf_sheep.env import MOVE, Meadow, sheep_points
+
+from simenv_marl import collect_episodes
+
+torch.set_num_threads(1)
+
+SMALL = {"width": 10, "height": 10, "initial_sheep": 30, "initial_wolves": 12}
+
+
+def lived(seeds=range(4), ticks=10):
+    """A herd, and what it has lived through on small meadows."""
+    herd = train.Herd(2, 0)
+    found = collect_episodes(lambda: Meadow(ticks, **SMALL), {MOVE: herd.explore}, points=sheep_points(2), seeds=seeds)
+    return herd, found[MOVE]
+
+
+def weights(herd):
+    return {name: tensor.clone() for name, tensor in herd.logits.state_dict().items()}
+
+
+def same(one, other):
+    return all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_trajectories_as_tensors():
+    _, found = lived()
+    rows = train.tensors(found)
+    assert rows.batch_size == (len(found),)
+    ends = found.starts + found.lengths - 1
+    assert torch.equal(rows["next", "done"][:, 0].nonzero()[:, 0], torch.from_numpy(ends))
+    assert rows["next", "terminated"].sum() == found.terminations.sum() > 0
+    assert rows["next", "done"].sum() > rows["next", "terminated"].sum()  # some have lived to see the end
+    within = np.setdiff1d(np.arange(len(found)), ends)
+    assert torch.equal(rows["next", "observation"][within], rows["observation"][within + 1])
+    assert torch.equal(rows["next", "observation"][ends], torch.from_numpy(found.last_observations))
+
+
+def test_actions_are_drawn_with_the_chances_that_they_are_said_to_have():
+    herd, found = lived()
+    chances = herd.logits(torch.from_numpy(found.observations)).log_softmax(-1)
+    expected = chances.gather(1, torch.from_numpy(found.actions)[:, None])[:, 0]
+    assert torch.allclose(torch.from_numpy(found.extras["log_prob"]), expected, atol=1e-5)
+    assert len(set(found.actions.tolist())) == 4
+
+
+def test_whoever_dies_is_worth_no_more_and_whoever_is_cut_off_is():
+    """The advantages of last rows, from TorchRL, beside what they must be."""
+    herd, found = lived()
+    with torch.no_grad():
+        herd.values[-1].bias += 0.5  # a life to come that is worth something
+    rows = train.tensors(found)
+    learner = train.Learner(herd, 0)
+    with torch.no_grad():
+        learner._advantage(rows)
+        now = herd.values(torch.from_numpy(found.observations))[:, 0]
+        later = herd.values(torch.from_numpy(found.next_observations))[:, 0]
+    paid = 1 - train.DISCOUNT
+    for ended, to_come in ((found.terminations, 0 * later), (found.truncations, train.DISCOUNT * later)):
+        at = torch.from_numpy(ended)
+        assert at.any()
+        assert torch.allclose(rows["advantage"][at, 0], (paid + to_come - now)[at], atol=1e-5)
+
+
+def test_a_seed_determines_everything():
+    def run(seed):
+        herd, course = train.train(2, seed, decisions=5000, each=1000, ticks=20, **SMALL)
+        return weights(herd), [(one.decisions, one.sheep, one.life, one.survived) for one in course]
+
+    (one, course), (another, again), (other, _) = run(0), run(0), run(1)
+    assert len(course) >= 2
+    assert course == again
+    assert same(one, another)
+    assert not same(one, other)
+
+
+def test_saved_and_loaded_it_decides_alike(tmp_path):
+    herd, found = lived()
+    herd.save(tmp_path / "deep" / "herd.pt")
+    loaded = train.Herd.load(tmp_path / "deep" / "herd.pt", 2)
+    assert torch.equal(herd.decide(found.observations), loaded.decide(found.observations))
+    assert same(weights(herd), weights(loaded))
+
+
+def test_sheep_learn_to_live_longer():
+    """Of the default meadow, on seeds that nobody was trained on: more turns for each sheep than before."""
+
+    def turns(policy):
+        found = results.play(policy, 2, range(train.HELD_OUT, train.HELD_OUT + 8), ticks=40, only_with_sheep=True)
+        return len(found) / len(found.starts)
+
+    herd, _ = train.train(2, 0, decisions=50_000, each=8_000, ticks=40)
+    before = turns(train.Herd(2, 0).explore)
+    assert turns(herd.decide) > 1.5 * before
+
+
+def test_lives_are_told_by_kaplan_and_meier():
+    lengths = np.array([1, 1, 2, 3, 3])
+    died = np.array([True, False, True, True, False])
+    told = results.lives(lengths, died, 5)
+    assert told[:4].tolist() == pytest.approx([1, 4 / 5, 4 / 5 * 2 / 3, 4 / 5 * 2 / 3 * 1 / 2])
+    assert np.isnan(told[4:]).all()
+
+
+def test_by_hand_one_stays_away_from_wolves():
+    played = {
+        name: results.play(policy, 2, range(6), ticks=15)
+        for name, policy in (("hand", results.by_hand), ("random", results.at_random(0)))
+    }
+    eaten = {name: ((found.terminations).sum() / len(found)) for name, found in played.items()}
+    assert eaten["hand"] < 0.7 * eaten["random"]
+
+
+def test_from_training_to_the_pictures(tmp_path, capsys):
+    curves = tmp_path / "shared-policy-training.csv"
+    train.main(["--seeds", "2", "--decisions", "1", "--ticks", "5", "--out", str(tmp_path), "--curves", str(curves)])
+    with curves.open(newline="") as file:
+        course = list(csv.DictReader(file))
+    assert {(row["sight"], row["seed"]) for row in course} == {(s, n) for s in "12" for n in "01"}
+    path = tmp_path / "shared-policy.json"
+    compared = results.compare(tmp_path, 2, range(2), ticks=20)
+    results.write(compared, path)
+    assert json.loads(path.read_text()) == compared
+    assert list(compared["results"]) == list(picture.STYLES)
+    rule = compared["results"]["the model's rule"]
+    assert rule["numbers"]["sheep"]["50"][0] == 100
+    assert len(rule["numbers"]["wolves"]["25"]) == 21
+    assert len(compared["results"]["trained, one step of sight"]["survived"]) == 2
+    picture.main(["--figures", str(tmp_path)])
+    assert (tmp_path / "shared-policy.png").stat().st_size > 10_000
+    assert (tmp_path / "shared-policy-training.png").stat().st_size > 10_000
+    assert capsys.readouterr().out.count("\n") == 2 + len(picture.STYLES)

@@ -1,0 +1,145 @@
+"""TorchRL: its wrappers, its checker, and a policy that all agents of one kind share."""
+
+import numpy as np
+import pytest
+import torch
+from examples.greenhouse_coop import env as greenhouse
+from gymnasium import spaces
+from torchrl.envs import ExplorationType, GymWrapper, PettingZooWrapper, check_env_specs, set_exploration_type
+
+from simenv_marl import RULE, aec_env, parallel_env, simulate
+
+from .fragments import blocks
+from .hive import BEES, DEFINITION, MASKED, Hive, HiveSim, points
+
+HELD_OUT = range(10_000, 10_020)
+VIEWS = {"parallel": parallel_env, "aec": aec_env}
+EVERY_VIEW = pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS)
+
+
+@pytest.fixture(autouse=True)
+def _the_same_at_every_run():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+# -- its wrappers and its checker -----------------------------------------------------------------
+
+
+def test_the_pages_checks():
+    exec(blocks("_clients_torchrl.md")[0], {})
+
+
+@pytest.mark.parametrize("make", [greenhouse.parallel_env, greenhouse.raw_env, greenhouse.env])
+@pytest.mark.parametrize("grouped", [None, {"agents": ["waterer_0", "ventilator_0"]}])
+def test_the_greenhouse(make, grouped):
+    env = PettingZooWrapper(make(), use_mask=True, group_map=grouped)
+    check_env_specs(env)
+    env.set_seed(1)
+    days = env.rollout(300)
+    assert days["next", "done"][-1].all()
+    assert not days["next", "done"][:-1].any()
+
+
+def test_one_agent():
+    check_env_specs(GymWrapper(greenhouse.watering_env()))
+
+
+@EVERY_VIEW
+@pytest.mark.parametrize("done_on_any", [True, False])
+@pytest.mark.parametrize("grouped", [None, {"bees": BEES}], ids=["apart", "together"])
+@pytest.mark.parametrize("definition", [DEFINITION, MASKED], ids=["free", "masked"])
+def test_births_and_deaths(view, definition, grouped, done_on_any):
+    env = PettingZooWrapper(
+        view(HiveSim, points(definition), possible_agents=BEES, padded=True),
+        use_mask=True,
+        group_map=grouped,
+        done_on_any=done_on_any,
+    )
+    check_env_specs(env)
+    ends = set()
+    for seed in range(60):
+        env.set_seed(seed)
+        ended = env.rollout(200)["next"]
+        assert ended["done"][-1].all()
+        assert not ended["done"][:-1].any()
+        ends.add(bool(ended["truncated"][-1]))
+        if len(ends) == 2:
+            break
+    assert ends == {True, False}
+
+
+@EVERY_VIEW
+def test_no_reward_is_lost(view):
+    """All that bees bring home is in the rewards of a rollout: also what they brought on the day on which they died."""
+    base = view(HiveSim, points(), possible_agents=BEES, padded=True)
+    env = PettingZooWrapper(base, use_mask=True, group_map={"bees": BEES})
+    brought = []
+    fly = Hive.update_day
+
+    def count(hive):
+        bees = list(hive.bees)
+        fly(hive)
+        brought.extend(bee.brought for bee in bees)
+
+    Hive.update_day = count
+    try:
+        for seed in range(10):
+            env.set_seed(seed)
+            brought.clear()
+            rollout = env.rollout(200)
+            present = rollout["bees", "info", "present"] > 0
+            rewards = rollout["next", "bees", "reward"].squeeze(-1)
+            assert rewards.sum().item() == pytest.approx(sum(brought), rel=1e-5)
+            assert (rewards[~present] == 0).all()
+    finally:
+        Hive.update_day = fly
+
+
+@EVERY_VIEW
+def test_its_state(view):
+    options = {"possible_agents": BEES, "padded": True, "state_space": spaces.Box(0, 1, (4,), np.float32)}
+    env = PettingZooWrapper(view(HiveSim, points(), **options), use_mask=True, return_state=True)
+    check_env_specs(env)
+    assert env.rollout(5)["state"].shape == (5, 4)
+
+
+# -- training -------------------------------------------------------------------------------------
+
+
+def worth(env, policy):
+    """The nectar that all bees bring home over seeds that no training has seen."""
+    brought = 0.0
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for seed in HELD_OUT:
+            env.set_seed(seed)
+            brought += env.rollout(1000, policy)["next", "bees", "reward"].sum().item()
+    return brought / len(HELD_OUT)
+
+
+@EVERY_VIEW
+def test_one_policy_for_all_who_are_born(view):
+    _, define, _, take_out = blocks("_clients_torchrl.md")
+    names = {"__name__": "__main__"}
+    exec(define, names)
+    env = names["make"](view)
+    policy, loss = names["learner"](env)
+    before = worth(env, policy)
+    names["train"](env, policy, loss)
+    after = worth(env, policy)
+    assert after > before + 4
+    names["policy"] = policy
+    exec(take_out, names)
+    assert names["hive"].day > 0
+    days = {
+        name: np.mean([simulate(HiveSim, *given, points=points(), seed=seed).hive.day for seed in HELD_OUT])
+        for name, given in {
+            "learnt": ({points_of_bees(): names["decide"]},),
+            "rule": ({points_of_bees(): RULE},),
+        }.items()
+    }
+    assert days["learnt"] >= days["rule"]
+
+
+def points_of_bees():
+    return next(iter(points()))

@@ -157,6 +157,19 @@ def test_runs_are_the_same_in_several_processes(tmp_path):
     assert found(tmp_path / "two", name) == found(tmp_path / "one", name)
 
 
+def test_batches_of_torchrl_follow_the_greenhouses_and_explore():
+    learner = script("torchrl")
+    networks = learner.Networks.of("4b")
+    batch = learner.Greenhouses("4b", 0).collect(networks.actor)
+    assert batch.shape == (learner.GREENHOUSES, learner.SETTINGS["days"])
+    noise = (batch["agents", "action"] - batch["agents", "loc"]).flatten()
+    assert float(noise.std()) == pytest.approx(np.exp(learner.SETTINGS["log_std"]), rel=0.1)
+    over = batch["next", "agents", "done"].any(dim=(2, 3))
+    follows = (batch["next", "state"][:, :-1] == batch["state"][:, 1:]).all(dim=-1)
+    assert over.any()
+    assert (follows == ~over[:, :-1]).all()
+
+
 # -- back in the model ----------------------------------------------------------------------------
 
 

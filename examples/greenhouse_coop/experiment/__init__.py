@@ -7,7 +7,7 @@ the model is changed for any of them, and nothing in its definitions either; onl
     runs                command line, workers, files: what all scripts have in common
     baselines           what learning is compared with: the rule, random actions, constants, CMA-ES
     sb3                 questions 1, 2, 3 and 5, by PPO of stable-baselines3
-    torchrl             question 4, by IPPO and MAPPO of TorchRL, and question 3 to compare the libraries
+    torchrl             question 4, by IPPO and MAPPO of TorchRL
     rllib               question 4 without a common critic, by PPO of RLlib
     results             learning curves and a table out of all runs
     back_in_the_model   what has been learnt, at work in the model's own loop

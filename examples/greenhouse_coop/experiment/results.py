@@ -62,7 +62,6 @@ PANELS: Final = (
         "Both: by one agent or by two",
         {
             ("sb3", "3"): "#1b6f5f",
-            ("torchrl", "3"): "#7cc6a4",
             ("torchrl", "4a"): "#2f6da8",
             ("torchrl", "4b"): "#b0413e",
             ("rllib", "4a"): "#d39b1f",

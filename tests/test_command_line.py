@@ -129,7 +129,7 @@ def test_points_by_name(capsys):
         ("walking:Wlak", "did you mean Walk?"),
         ("walking:Xyz", "it has the simulations Walk, Limping"),
         ("walking:Walk.nothing", "Walk has no 'nothing'"),
-        ("simenv_marl.registraton:x", "did you mean simenv_marl.registration?"),
+        ("simenv_marl.registraton:x", "did you mean simenv_marl.registration"),
         ("broken_walk:Walk", "needs 'no_such_package_at_all'"),
         ("failing_walk:Walk", "cannot be imported: ZeroDivisionError"),
         ("walking:number", "is no simulation"),

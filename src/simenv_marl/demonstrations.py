@@ -79,7 +79,8 @@ class Mixture:
         self._asked = [None if policy is RULE else Asked(policy) for policy in self.policies]
 
     def __repr__(self) -> str:
-        return f"Mixture({list(zip(self.policies, self.weights.tolist(), strict=True))})"
+        parts = zip(self.policies, self.weights.tolist(), strict=True)
+        return f"<Mixture: {', '.join(f'{weight:.3g} {_name(policy)}' for policy, weight in parts)}>"
 
     def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
         """Answer decisions, as policies of ``collect_episodes`` do."""
@@ -176,6 +177,8 @@ def record_dataset(
     _check_knowable(simulation, policies, names, points, options)
     sizes: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress}
     collected = collect_episodes(simulation, policies, seeds=seeds, points=points, **sizes, **options)
+    for key, name in names.items():
+        _check_writable(name, collected[key])
     origin = provenance(simulation, points, **options)
     written = {}
     for key, name in names.items():
@@ -240,9 +243,7 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
             f"{dataset_id!r} is to be made of what collect_episodes has returned under one key, not of {trajectories!r}"
         )
     (path,) = _check_free([dataset_id])
-    if not len(trajectories):
-        raise OptionValueError(f"there is nothing to write to {dataset_id!r}: nobody has decided in any episode")
-    _check_known(trajectories)
+    _check_writable(dataset_id, trajectories)
     import minari
 
     given = {"jpeg_encoding": False, **metadata}
@@ -284,6 +285,12 @@ def _check_free(names: Iterable[str]) -> list[Any]:
                 " with minari.delete_dataset"
             )
     return paths
+
+
+def _check_writable(name: str, found: Trajectories) -> None:
+    if not len(found):
+        raise OptionValueError(f"there is nothing to write to {name!r}: nobody has decided in any episode")
+    _check_known(found)
 
 
 def _episodes(found: Trajectories, buffer: Any) -> Iterable[Any]:

@@ -203,6 +203,14 @@ def test_nothing_is_overwritten_and_nothing_is_run_in_vain():
     assert minari.list_local_datasets().keys() == {NAME}
 
 
+def test_all_data_sets_are_written_or_none():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    names = {ant: "simenv/ants-v0", bee: "simenv/bees-v0"}
+    with pytest.raises(OptionValueError, match="bees-v0"):
+        record_dataset(names, calling(ant), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
+    assert not minari.list_local_datasets()
+
+
 def test_half_a_data_set_is_none():
     ant = decision(agent="ant_0")
     with pytest.raises(TypeError):
@@ -236,6 +244,7 @@ def test_mixtures_demonstrate_alike_however_they_are_run():
     for others in zip(*recorded, strict=True):
         assert len({str(episode.actions.tolist()) for episode in others}) == 1
         assert len({str(episode.infos["component"].tolist()) for episode in others}) == 1
+    assert recorded[0].storage.metadata["algorithm_name"] == "<Mixture: 0.5 rule, 0.5 ones>"
     by_rule = [rule for episode in recorded[0] for rule in episode.infos["by_rule"][:-1]]
     assert 0 < sum(by_rule) < len(by_rule)
 

@@ -125,7 +125,7 @@ def table(results: Mapping[str, Any]) -> str:
         shares = own["survived"]
         survived = f"{np.mean(shares):.0%}"
         if len(shares) > 1:
-            survived += f" ({min(shares):.0%} to {max(shares):.0%})"
+            survived += f" ({min(shares):.0%} to {max(shares):.0%} of {len(shares)})"
         low, middle, high = own["sheep at the end"]
         lines.append(
             f"| {name} | {survived} | {middle:.0f} ({low:.0f} to {high:.0f}) | {own['turns per death']:.1f} |"

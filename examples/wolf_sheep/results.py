@@ -22,13 +22,16 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from simenv_marl import RULE, Trajectories, collect_episodes
 
 from .env import DIRECTIONS, MOVE, SIGHT, Meadow, cells, numbers, sheep_points
-from .train import HELD_OUT, OUT, SIGHTS, Herd, path_of
+from .train import HELD_OUT, OUT, SIGHTS, Herd, policies_of
 from .train import TICKS as TRAINED_FOR
 
 RESULTS: Final = Path(__file__).parents[2] / "docs" / "figures" / "shared-policy.json"
 
 LIVES: Final = 60
 """How many turns of a life are told."""
+
+UNTRAINED: Final = 3
+"""How many policies that have learnt nothing are among those that are compared."""
 
 Policy = Callable[[NDArray[np.float32]], Any]
 
@@ -131,26 +134,23 @@ def summary(played: Sequence[Trajectories]) -> dict[str, Any]:
     }
 
 
-def compare(folder: Path, trainings: int, seeds: Sequence[int], **parameters: Any) -> dict[str, Any]:
+def compare(folder: Path, seeds: Sequence[int], **parameters: Any) -> dict[str, Any]:
     """Let all policies lead the sheep of the same meadows.
 
     Args:
-        folder: Where the trained policies are.
-        trainings: From how many seeds they were trained.
+        folder: Where the trained policies are; as many as there are.
         seeds: Of the meadows.
         **parameters: As ``Meadow`` takes them.
     """
     contenders: dict[str, Sequence[tuple[Policy, int]]] = {
         "the model's rule": [(by_rule, SIGHT)],
         "random moves": [(at_random(0), SIGHT)],
-        "untrained": [(Herd(SIGHT, seed).decide, SIGHT) for seed in range(trainings)],
+        "untrained": [(Herd(SIGHT, seed).decide, SIGHT) for seed in range(UNTRAINED)],
         "by hand, two steps of sight": [(by_hand, 2)],
     }
     for sight in SIGHTS:
         title = f"trained, {'one step' if sight == 1 else 'two steps'} of sight"
-        contenders[title] = [
-            (Herd.load(path_of(sight, seed, folder), sight).decide, sight) for seed in range(trainings)
-        ]
+        contenders[title] = [(Herd.load(path, sight).decide, sight) for path in policies_of(sight, folder)]
     results: dict[str, Any] = {}
     with tqdm(total=sum(map(len, contenders.values())), unit="policy") as bar:
         for title, policies in contenders.items():
@@ -158,8 +158,9 @@ def compare(folder: Path, trainings: int, seeds: Sequence[int], **parameters: An
             for policy, sight in policies:
                 played.append(play(policy, sight, seeds, **parameters))
                 bar.update()
-            results[title] = summary(played)
-    return {"meadows": len(seeds), "trainings": trainings, "results": results}
+            if played:
+                results[title] = summary(played)
+    return {"meadows": len(seeds), "results": results}
 
 
 def write(results: Mapping[str, Any], path: Path) -> None:
@@ -172,13 +173,12 @@ def write(results: Mapping[str, Any], path: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compare, and write down the results."""
     parser = argparse.ArgumentParser(description="Compare the policies that lead the sheep.")
-    parser.add_argument("--meadows", type=int, default=32, help="to compare on (default: %(default)s)")
-    parser.add_argument("--trainings", type=int, default=5, help="as train's --seeds (default: %(default)s)")
+    parser.add_argument("--meadows", type=int, default=16, help="to compare on (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=OUT, help="where the policies are (default: beside this file)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="file to write (default: %(default)s)")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    write(compare(options.out, options.trainings, range(HELD_OUT, HELD_OUT + options.meadows)), options.results)
+    write(compare(options.out, range(HELD_OUT, HELD_OUT + options.meadows)), options.results)
 
 
 if __name__ == "__main__":

@@ -272,6 +272,11 @@ def path_of(sight: int, seed: int, folder: Path = OUT) -> Path:
     return folder / f"sight-{sight}-seed-{seed}.pt"
 
 
+def policies_of(sight: int, folder: Path = OUT) -> list[Path]:
+    """All policies that are kept for sheep that see so far, in the order of their seeds."""
+    return sorted(folder.glob(f"sight-{sight}-seed-*.pt"), key=lambda path: int(path.stem.rpartition("-")[2]))
+
+
 def write(course: Iterable[Progress], path: Path = CURVES) -> None:
     """Write how training went."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -288,7 +293,7 @@ def write(course: Iterable[Progress], path: Path = CURVES) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train all of them."""
     parser = argparse.ArgumentParser(description="Train one policy for all sheep.")
-    parser.add_argument("--seeds", type=int, default=5, help="how often to train (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=3, help="how often to train (default: %(default)s)")
     parser.add_argument("--decisions", type=int, default=300_000, help="to learn from (default: %(default)s)")
     parser.add_argument("--ticks", type=int, default=TICKS, help="of an episode (default: %(default)s)")
     parser.add_argument("--sight", type=int, nargs="+", default=SIGHTS, help="how far sheep see (default: 1 2)")

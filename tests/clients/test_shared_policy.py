@@ -126,7 +126,7 @@ def test_from_training_to_the_pictures(tmp_path, capsys):
         course = list(csv.DictReader(file))
     assert {(row["sight"], row["seed"]) for row in course} == {(s, n) for s in "12" for n in "01"}
     path = tmp_path / "shared-policy.json"
-    compared = results.compare(tmp_path, 2, range(2), ticks=20)
+    compared = results.compare(tmp_path, range(2), ticks=20)
     results.write(compared, path)
     assert json.loads(path.read_text()) == compared
     assert list(compared["results"]) == list(picture.STYLES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 from collections.abc import Callable, Mapping
 from time import sleep
 from typing import Any, NamedTuple
@@ -12,6 +13,12 @@ import numpy as np
 from gymnasium import spaces
 
 from simenv_marl import RULE, Definition, make_step
+
+
+def plainly(value: Any) -> str:
+    """What a test with that value is called: the same in every process, whatever lies where in memory."""
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
 
 PAIR = spaces.Box(-1e6, 1e6, (2,), np.float64)
 

@@ -26,7 +26,7 @@ from simenv_marl import (
     single_env,
 )
 
-from .models import Script, calling, decision, decisions, define, play, rewards_of, script
+from .models import Script, calling, decision, decisions, define, plainly, play, rewards_of, script
 
 # -- outside any environment ----------------------------------------------------------------------
 
@@ -272,7 +272,7 @@ def test_sentinels_stay_themselves():
         {"agent": ""},
         {"agent": ["a"]},
     ],
-    ids=str,
+    ids=plainly,
 )
 def test_definitions_that_cannot_work_are_refused(changes):
     with pytest.raises(DefinitionError, match="make_step") as caught:
@@ -305,7 +305,7 @@ def test_make_step_takes_no_unknown_arguments():
 @pytest.mark.parametrize(
     "function",
     [len, [].append, property(lambda self: 1), functools.partial(int), int, 3, None, Pump().bare, math.sqrt, "name"],
-    ids=repr,
+    ids=plainly,
 )
 def test_only_functions_can_be_decided(function):
     with pytest.raises(PatchError):

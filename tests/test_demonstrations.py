@@ -21,7 +21,7 @@ from simenv_marl import (
 )
 
 from .many_worlds import Being, beings
-from .models import calling, decision, script
+from .models import calling, decision, plainly, script
 
 
 def ones(observations):
@@ -332,7 +332,7 @@ def test_decisions_that_correspond_to_no_action():
         {"others": 3},
         {"tolerance": "1"},
     ],
-    ids=str,
+    ids=plainly,
 )
 def test_comparisons_that_cannot_be(wrong):
     ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 1)

@@ -24,7 +24,7 @@ from simenv_marl import (
     single_env,
 )
 
-from .models import Script, calling, decision, decisions, define, play, rewards_of, script
+from .models import Script, calling, decision, decisions, define, plainly, play, rewards_of, script
 
 PUMP, FAN = decision(agent="pump_0"), decision(agent="fan_0")
 NAMED = define(agent=lambda name: name)(lambda name: "rule")
@@ -167,7 +167,7 @@ def test_unknown_options_of_instances_are_refused():
         {"policies": {"pump_0": None}},
         {"render_mode": "human"},
     ],
-    ids=str,
+    ids=plainly,
 )
 def test_options_that_cannot_be_are_refused(make, options):
     with pytest.raises(OptionValueError) as caught:

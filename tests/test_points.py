@@ -22,7 +22,7 @@ from simenv_marl import (
 
 from .foreign import market, shop
 from .foreign.market import Broker, Cautious, Dealer, Junior, Trader
-from .models import Script, calling, decision, decisions, define, play
+from .models import Script, calling, decision, decisions, define, plainly, play
 
 MARKET = "tests.foreign.market"
 
@@ -99,7 +99,7 @@ HOME = f"{__name__}.Home"
         (vars(Home)["air"], ["air_0"]),
         (vars(Home)["light"], ["light_0"]),
     ],
-    ids=str,
+    ids=plainly,
 )
 def test_points_in_all_forms(points, agents):
     env = aec_env(home(), points)
@@ -250,7 +250,7 @@ def test_without_any_point_nothing_can_be_made(tmp_path):
         ({3: define()}, PatchError),
         ([None], SimEnvError),
     ],
-    ids=str,
+    ids=plainly,
 )
 def test_points_that_cannot_be_decided_are_refused_at_construction(points, error):
     for make in (aec_env, generate_env):

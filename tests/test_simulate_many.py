@@ -27,7 +27,7 @@ from simenv_marl import (
 
 from . import worlds
 from .many_worlds import Being, Colony, Creature, beings, colony_points, designs
-from .models import Script, calling, decision, define, notes, script, stacks
+from .models import Script, calling, decision, define, notes, plainly, script, stacks
 
 some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=12)
 sizes = st.integers(1, 14)
@@ -570,7 +570,7 @@ def test_seeds_may_be_an_array():
         {"policies": {Going.decide: 3}},
         {"policies": {"nobody": ones}},
     ],
-    ids=str,
+    ids=plainly,
 )
 def test_arguments_that_cannot_be(wrong):
     with pytest.raises(SimEnvError):

@@ -21,7 +21,7 @@ from simenv_marl import (
 )
 
 from .many_worlds import beings
-from .models import Script, calling, decision, decisions, define, play, script
+from .models import Script, calling, decision, decisions, define, plainly, play, script
 
 # -- sources --------------------------------------------------------------------------------------
 
@@ -146,7 +146,7 @@ class Lockable(Simulation):
 
 
 @pytest.mark.parametrize(
-    "source", [3, "Simulation", None, NoReset(), NoReset, NoRun, NoRun(), lambda: None, Lockable()], ids=repr
+    "source", [3, "Simulation", None, NoReset(), NoReset, NoRun, NoRun(), lambda: None, Lockable()], ids=plainly
 )
 def test_what_is_no_simulation_is_refused(source):
     with pytest.raises(SimulationError) as caught:

@@ -109,6 +109,11 @@ class Binding:
         if isinstance(actions, spaces.Discrete) and self.legal is None:
             self.first, self.end = int(actions.start), int(actions.start + actions.n)
 
+    @property
+    def tells_of_many(self) -> bool:
+        """Whether it ``tells`` something that is not over with the next decision at the point."""
+        return self.padded or (self.tells and self.agent is None)
+
     def observation(self, args: tuple[Any, ...], kwargs: dict[str, Any], mask: Any) -> Any:
         """The observation of a call whose legal actions are known."""
         value = self.observe(*args, **kwargs)

@@ -336,7 +336,7 @@ class Episode:
             self._max_turns, self.taken = self._most_turns, LOST
         record.settle(args, kwargs)
         binding = record.binding
-        if self.clock is None and binding.legal is None and binding.point.alone and not binding.tells:
+        if self.clock is None and binding.legal is None and binding.point.alone and not binding.tells_of_many:
             self._swift[binding] = NAMED_AT_CALL if binding.agent is None else record
         self.pending = record
 
@@ -398,6 +398,7 @@ class Episode:
         if record is not None and record.binding is binding:
             self._latest = record
             record.decided_by_rule(decision, args, kwargs)
+            self._swift.pop(binding, None)  # there is more in its next info than the swift way would put there
 
     def record(self, agent: str) -> Record | None:
         """What is known of an agent of the environment, whether it lives or is gone."""

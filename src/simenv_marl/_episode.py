@@ -398,7 +398,8 @@ class Episode:
         if record is not None and record.binding is binding:
             self._latest = record
             record.decided_by_rule(decision, args, kwargs)
-            self._swift.pop(binding, None)  # there is more in its next info than the swift way would put there
+            if record.news:  # there is more in its next info than the swift way would put there
+                self._swift.pop(binding, None)
 
     def record(self, agent: str) -> Record | None:
         """What is known of an agent of the environment, whether it lives or is gone."""

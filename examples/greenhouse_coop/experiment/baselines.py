@@ -19,13 +19,20 @@ import numpy as np
 
 from ..env import raw_env
 from ..train import EXCHANGES, VENTILATOR, Constant, Team, compare, draw_seeds
-from .questions import FINAL, Verdict, judge
+from .questions import BEST_CONSTANTS, BEST_WATERING, CURVE, FINAL, Verdict, judge
 from .runs import RUNS, each, write
 
 LIBRARY: Final = "baselines"
 
 TEAMS: Final = ("rule", "random actions", "constant watering", "constant pair", "CMA-ES, watering", "CMA-ES, both")
 """Whom ``compare`` compares, in its order."""
+
+BESIDE_CURVES: Final[dict[str, Team]] = {
+    "rule": {},
+    "constant watering": BEST_WATERING,
+    "constant pair": BEST_CONSTANTS,
+}
+"""Who is also judged as learners are on their way."""
 
 SEARCHED_ON: Final = 8
 """On how many greenhouses constant ventilation is tried."""
@@ -62,6 +69,20 @@ def search(out: Path, job: tuple[int, int]) -> str:
     return f"{path.name}: CMA-ES pair {found['CMA-ES, both']['value']:.1f}"
 
 
+def beside_curves(out: Path) -> None:
+    """Judge on the greenhouses of the learning curves those who have nothing to learn.
+
+    Args:
+        out: The folder of all runs.
+    """
+    path = out / f"{LIBRARY}-curve.json"
+    if not path.exists():
+        environment = raw_env()
+        found = {title: asdict(judge(environment, team, CURVE)) for title, team in BESIDE_CURVES.items()}
+        environment.close()
+        write(path, {"library": LIBRARY, "beside_curves": found})
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Carry out what has not been carried out before."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -71,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    beside_curves(options.out)
     jobs = [(episodes, seed) for episodes in options.episodes for seed in options.seeds]
     for said in each(partial(search, options.out), jobs, options.workers):
         print(said, flush=True)

@@ -39,7 +39,6 @@ MEASURED: Final = ("value", "alive", "litres")
 
 INK: Final = "#333333"
 LINES: Final = {
-    "CMA-ES, both, 3600 episodes": ("CMA-ES pair", "#8e6bb0"),
     "constant pair": ("best constant pair", "#d1812c"),
     "constant watering": ("best constant watering", "#e3b778"),
     "rule": ("rule", "#8c8c8c"),
@@ -84,10 +83,14 @@ def gather(runs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     found = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(runs.glob("*.json"))]
     learnt = [run for run in found if run["library"] != "baselines"]
-    searches = [run for run in found if run["library"] == "baselines"]
+    searches = [run for run in found if "teams" in run]
     if not learnt:
         raise SystemExit(f"there are no runs in {runs}")
-    curves: list[dict[str, Any]] = []
+    curves: list[dict[str, Any]] = [
+        {"library": "baselines", "question": title, "seed": 0, "days": 0, **verdict}
+        for run in found
+        for title, verdict in run.get("beside_curves", {}).items()
+    ]
     finals = _baselines(searches)
     for run in learnt:
         key = {name: run[name] for name in ("library", "question", "seed")}
@@ -149,7 +152,7 @@ def table(finals: pd.DataFrame) -> str:
             )
         )
     head = ("who decides", "learner", "days", "seeds", "return", "quartiles", "worst", "alive in the end", "litres")
-    lines = ["| " + " | ".join(head) + " |", "| --- | --- | " + "---: | " * (len(head) - 2)]
+    lines = ["| " + " | ".join(head) + " |", "| --- | --- |" + " ---: |" * (len(head) - 2)]
     lines += ["| " + " | ".join(cells) + " |" for _, cells in sorted(rows)]
     return "\n".join(lines) + "\n"
 
@@ -162,13 +165,13 @@ def _place(library: str, question: str, median: float) -> tuple[bool, str | floa
 # -- drawing --------------------------------------------------------------------------------------
 
 
-def draw_curves(curves: pd.DataFrame, finals: pd.DataFrame, path: Path) -> None:
+def draw_curves(curves: pd.DataFrame, path: Path) -> None:
     """Draw the learning curves: medians and quartiles over seeds, by simulated days."""
     figure = Figure(figsize=(12, 5.4), layout="constrained")
     FigureCanvasAgg(figure)  # no window, no state of pyplot
     left, right = figure.subplots(1, 2, sharey=True)
     for axes, (heading, colours) in zip((left, right), PANELS, strict=True):
-        _draw_lines(axes, finals)
+        _draw_lines(axes, curves)
         for (library, question), colour in colours.items():
             runs = curves[(curves.library == library) & (curves.question == question)]
             if runs.empty:
@@ -186,12 +189,12 @@ def draw_curves(curves: pd.DataFrame, finals: pd.DataFrame, path: Path) -> None:
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, frameon=False, loc="center right", bbox_to_anchor=(1, 0.36))
         _tidy(axes, "y")
-    left.set_ylabel("return of the team: median and quartiles over seeds", fontsize=9)
+    left.set_ylabel("return of the team on 8 greenhouses: median and quartiles over seeds", fontsize=9)
     _save(figure, path)
 
 
-def _draw_lines(axes: Axes, finals: pd.DataFrame) -> None:
-    baselines = finals[finals.library == "baselines"]
+def _draw_lines(axes: Axes, curves: pd.DataFrame) -> None:
+    baselines = curves[curves.library == "baselines"]
     for question, (label, colour) in LINES.items():
         runs = baselines[baselines.question == question]
         if not runs.empty:
@@ -271,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     told = table(finals)
     (options.figures / "experiment.md").write_text(told, encoding="utf-8")
     print(told)
-    draw_curves(curves, finals, options.figures / "experiment-curves.png")
+    draw_curves(curves, options.figures / "experiment-curves.png")
     draw_finals(finals, options.figures / "experiment-finals.png")
 
 

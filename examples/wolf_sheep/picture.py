@@ -60,24 +60,19 @@ def draw_training(course: Sequence[Mapping[str, str]], results: Mapping[str, Any
         axes.spines[["top", "right"]].set_visible(False)
     rule = "the model's rule"
     left.axhline(results["results"][rule]["sheep while training"], label=rule, linewidth=1.5, **STYLES[rule])
-    left.legend(frameon=False, fontsize=9, loc="center right")
+    left.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.0, 0.95))
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
 
 
 def _draw_course(axes: Axes, course: Sequence[Mapping[str, str]], what: str, name: str) -> None:
-    """A thin line for each training, and a thick one for their median, on a grid of decisions."""
-    curves = []
-    for seed in sorted({row["seed"] for row in course}):
+    """A line for each training."""
+    label: str | None = name
+    for seed in sorted({row["seed"] for row in course}, key=int):
         own = [row for row in course if row["seed"] == seed]
-        curves.append(([int(row["decisions"]) / 1000 for row in own], [float(row[what]) for row in own]))
-    if not curves:
-        return
-    grid = np.linspace(0, min(decisions[-1] for decisions, _ in curves), 200)
-    values = np.array([np.interp(grid, *curve) for curve in curves])
-    style = STYLES[name]
-    axes.fill_between(grid, values.min(axis=0), values.max(axis=0), color=style["color"], alpha=0.2, linewidth=0)
-    axes.plot(grid, np.median(values, axis=0), label=name, linewidth=2, **style)
+        decisions = [int(row["decisions"]) / 1000 for row in own]
+        axes.plot(decisions, [float(row[what]) for row in own], label=label, linewidth=1.4, alpha=0.85, **STYLES[name])
+        label = None
 
 
 # -- what the policies are worth ------------------------------------------------------------------

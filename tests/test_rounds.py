@@ -1459,7 +1459,7 @@ def test_api(make):
     parallel_api_test(make(), num_cycles=100)
 
 
-@pytest.mark.parametrize("shape", SHAPES.keys() - {"masked"})
+@pytest.mark.parametrize("shape", sorted(SHAPES.keys() - {"masked"}))
 def test_seeds(shape):
     # PettingZoo's test knows of no masks, and a masked action is an illegal one.
     parallel_seed_test(SHAPES[shape], num_cycles=100)

@@ -9,7 +9,7 @@ demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
 
 test: lint docs
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 coverage: .venv/.test
 	$(BIN)/python -m pytest --cov --cov-report=term

@@ -51,7 +51,7 @@ benchmark: .venv/.test
 clean:
 	rm -rf .venv .venv-dask .venv-ray docs/_build
 
-# The cooperative experiment, all of it: about an hour on two cores. What is done already is not done again.
+# The cooperative experiment, all of it: less than half an hour on two cores. What is done already is not done again.
 .PHONY: experiment
 EXPERIMENT := examples.greenhouse_coop.experiment
 EXPERIMENT_OUT ?= examples/greenhouse_coop/out/experiment

@@ -81,7 +81,7 @@ wolf-sheep: .venv-clients/.clients
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.results
 	.venv-clients/bin/python -m examples.wolf_sheep.picture
 
-# The cooperative experiment, all of it: about an hour on two cores. What is done already is not done again.
+# The cooperative experiment, all of it: less than half an hour on two cores. What is done already is not done again.
 .PHONY: experiment
 EXPERIMENT := examples.greenhouse_coop.experiment
 EXPERIMENT_OUT ?= examples/greenhouse_coop/out/experiment

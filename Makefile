@@ -23,7 +23,7 @@ test-clients: .venv-clients/.clients
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest tests/clients --ignore tests/clients/test_rllib.py
 
 test-rllib: .venv-rllib/.rllib
-	OMP_NUM_THREADS=1 RAY_USAGE_STATS_ENABLED=0 .venv-rllib/bin/python -m pytest tests/clients/test_rllib.py
+	OMP_NUM_THREADS=1 RAY_USAGE_STATS_ENABLED=0 .venv-rllib/bin/python -m pytest tests/clients/test_rllib.py tests/clients/test_experiment.py
 
 .venv-clients/.clients .venv-rllib/.rllib: pyproject.toml
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)

@@ -1,6 +1,7 @@
 """Settings of the tests, and the drivers with which they run."""
 
 import gc
+import signal
 
 import pytest
 from hypothesis import settings
@@ -10,6 +11,10 @@ from simenv_marl._options import Options
 # Hypothesis draws the same examples at every run, and keeps no files.
 settings.register_profile("tests", deadline=None, derandomize=True, database=None)
 settings.load_profile("tests")
+
+# A shell that starts the tests in the background has them ignore interrupts, which some are about.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 DRIVERS = ("greenlet", "thread")
 

@@ -27,6 +27,12 @@ from simenv_marl import (
 from .many_worlds import Colony, Creature, Design, colony_points
 from .models import PAIR, decision, define, notes, script
 
+# Where work is given up, joblib empties its queue of work while a thread of its own may be about to take from it, and
+# ends that thread in any case.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Exception in thread ExecutorManagerThread:pytest.PytestUnhandledThreadExceptionWarning"
+)
+
 DESIGN = Design(initial=4, most=12, ticks=4, overseen="before", truncates=True)
 POINTS = colony_points(overseen=True)
 
@@ -274,7 +280,10 @@ def test_an_interrupt_ends_all_processes(tmp_path):
                 break
             time.sleep(0.1)
         os.killpg(process.pid, signal.SIGINT)
-        printed, _ = process.communicate(timeout=30)  # and not after the minute for which they sleep
+        try:
+            printed, _ = process.communicate(timeout=30)  # and not after the minute for which they sleep
+        finally:
+            process.kill()  # which else is waited for, for ever
     assert printed.split() == [b"interrupted"]
 
 

@@ -22,6 +22,9 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     however many agents there are: PettingZoo's helpers for rewards and dead steps, which pass over all
     agents, are not used.
 
+    With ``padded=True`` all of ``possible_agents`` are there until the episode ends, whether they are ``"present"``, as
+    their infos then tell, or not; those who are not are never selected before.
+
     Attributes:
         agents: The agents that have not yet taken leave of the episode.
         agent_selection: The agent whose decision is pending; where agents have ended, the one that is to take

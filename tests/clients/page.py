@@ -1,4 +1,4 @@
-"""The code of the page on clients, ready to be run."""
+"""The code of the page on clients, ready to be run as its reader would run it: one block after the other."""
 
 from __future__ import annotations
 
@@ -6,13 +6,30 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 DOCS = Path(__file__).parents[2] / "docs"
 
 
+def blocks(name: str, section: str | None = None) -> list[CodeType]:
+    """Compile all python blocks of a file in ``docs``, or of a section of it, in their order.
+
+    Args:
+        name: The file's name.
+        section: The heading of the section.
+    """
+    text = (DOCS / name).read_text(encoding="utf-8")
+    if section is not None:
+        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    found = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert found, f"docs/{name} has no python under {section!r}"
+    where = f"docs/{name}: {section}" if section else f"docs/{name}"
+    return [compile(block, f"{where}, block {number}", "exec") for number, block in enumerate(found)]
+
+
 def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
-    """Run the python blocks of a section of ``docs/clients.md``, one after the other, as its reader would.
+    """Run the python blocks of a section of ``docs/clients.md``.
 
     Args:
         section: The heading of the section.
@@ -21,15 +38,10 @@ def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
     Yields:
         After each block, the names that the code has left behind.
     """
-    text = (DOCS / "clients.md").read_text(encoding="utf-8")
-    _, _, rest = text.partition(f"\n## {section}\n")
-    body = rest.partition("\n## ")[0]
-    blocks = re.findall(r"^```python\n(.*?)^```$", body, re.MULTILINE | re.DOTALL)
-    assert blocks, f"docs/clients.md has no python under {section!r}"
     monkeypatch.syspath_prepend(DOCS)
     for model in ("bakery", "bakery_env", "lake"):
         monkeypatch.delitem(sys.modules, model, raising=False)
     names: dict[str, Any] = {"__name__": "__main__"}
-    for number, block in enumerate(blocks):
-        exec(compile(block, f"docs/clients.md: {section}, block {number}", "exec"), names)
+    for code in blocks("clients.md", section):
+        exec(code, names)
         yield names

@@ -23,8 +23,8 @@ from ray.tune.registry import register_env
 
 from simenv_marl import aec_env, parallel_env, simulate
 
-from .fragments import blocks
 from .hive import BEES, DEFINITION, MASK_OBSERVED, Bee, HiveSim, points
+from .page import blocks
 
 HELD_OUT = range(10_000, 10_010)
 GREENHOUSES = {

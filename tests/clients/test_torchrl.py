@@ -9,8 +9,8 @@ from torchrl.envs import ExplorationType, GymWrapper, PettingZooWrapper, check_e
 
 from simenv_marl import RULE, aec_env, parallel_env, simulate
 
-from .fragments import blocks
 from .hive import BEES, DEFINITION, MASKED, Hive, HiveSim, points
+from .page import blocks
 
 HELD_OUT = range(10_000, 10_020)
 VIEWS = {"parallel": parallel_env, "aec": aec_env}

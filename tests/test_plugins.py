@@ -41,7 +41,6 @@ HERE = __name__
 
 @pytest.fixture(autouse=True)
 def _nothing_stays_attached():
-    gc.collect()  # environments of other tests, which have set something in these places
     places = [market, shop, Trader, Broker, Junior, Dealer, Cautious, Greenhouse, Heated]
     before = [held(place) for place in places]
     yield

@@ -44,7 +44,6 @@ BID = f"{MARKET}.Trader.bid"
 
 @pytest.fixture(autouse=True)
 def _nothing_stays_attached():
-    gc.collect()  # environments of other tests, which have set something in these places
     places = [market, shop, Trader, Broker, House]
     before = [held(place) for place in places]
     yield

@@ -19,7 +19,6 @@ from simenv_marl import (
     UnknownPointError,
     generate_env,
 )
-from simenv_marl._points import Site
 
 from .foreign import market, shop
 from .foreign.market import Broker, Cautious, Dealer, Junior, Trader
@@ -710,21 +709,6 @@ def test_two_environments_may_define_the_same_undecorated_point_differently():
     assert one.unwrapped.simulation.log == [("one", 1)]
     assert two.unwrapped.simulation.log == [("two", 2)]
     assert (one.possible_agents, two.possible_agents) == (["bid_0"], ["b_0"])
-
-
-def test_nothing_is_kept_of_a_place_where_nothing_is_set_any_more():
-    def sites():
-        return [site for site in Site._all.values() if site.point.name == f"{MARKET}.Trader.bid"]
-
-    gc.collect()
-    assert sites() == []
-    env = aec_env(calling(lambda: Trader().bid("tea")), {f"{MARKET}.Trader.bid": define()})
-    env.reset()
-    assert len(sites()) == 1
-    env.close()
-    del env
-    gc.collect()
-    assert sites() == []
 
 
 def test_local_classes_are_found_by_their_functions():

@@ -275,9 +275,6 @@ class Place:
             except BaseException:  # an interrupt has come in between
                 self._set()
                 raise
-            finally:
-                if level not in self._levels:
-                    self._wraps.pop(level, None)  # it may lead back to whoever has held the place
 
     @classmethod
     def where(cls, function: Any) -> Place | None:

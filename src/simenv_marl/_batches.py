@@ -10,7 +10,6 @@ one ``Asked``, whose decisions are asked in ``Group`` s, each of the same spaces
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from threading import get_ident
 from time import perf_counter
@@ -26,6 +25,7 @@ from ._plan import Plan, two_arguments
 from ._record import Record
 from ._session import Session
 from ._stacks import rows, stacker
+from ._wrappers import positional
 from .decision import DIFFERENCES
 from .errors import InvalidActionError, annotate
 from .simulation import RULE
@@ -71,14 +71,7 @@ class Asked:
 
 def _takes_three(policy: Callable[..., Any]) -> bool:
     """Whether a policy has to be given a third argument."""
-    try:
-        parameters = list(inspect.signature(policy).parameters.values())
-    except (TypeError, ValueError):
-        return False
-    required = [
-        p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty
-    ]
-    return len(required) > 2
+    return sum(p.default is p.empty for p in positional(policy)) > 2
 
 
 class Entry:

@@ -6,7 +6,6 @@ options. It holds no state of any episode, so that one plan serves any number of
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
@@ -17,6 +16,7 @@ from ._driver import Surrounding, unattended
 from ._generators import GlobalRandom
 from ._options import Options
 from ._points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, portable, stand_ins
+from ._wrappers import positional
 from .decision import DecisionPoint, Definition, unwrapped
 from .errors import (
     AgentError,
@@ -351,11 +351,7 @@ def _assign(
 
 def two_arguments(policy: Callable[..., Any]) -> Policy:
     """Let a policy be called with observation and info, whether it takes the info or not."""
-    try:
-        parameters = list(inspect.signature(policy).parameters.values())
-    except (TypeError, ValueError):
-        parameters = []
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    if len(positional) > 1 and (positional[1].default is positional[1].empty or positional[1].name == "info"):
+    parameters = positional(policy)
+    if len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info"):
         return policy
     return lambda observation, info: policy(observation)

@@ -158,6 +158,15 @@ def generate(
     return function
 
 
+def positional(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """The parameters of a function that can be passed by position; none where its signature is not known."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return []
+    return [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+
+
 def _anything(*args: Any, **kwargs: Any) -> None:
     """Bind arguments of which nothing is known."""
 

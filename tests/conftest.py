@@ -6,7 +6,7 @@ import signal
 import pytest
 from hypothesis import settings
 
-from simenv_marl._options import Options
+from simenv_marl.core.options import Options
 
 # Hypothesis draws the same examples at every run, and keeps no files.
 settings.register_profile("tests", deadline=None, derandomize=True, database=None)

@@ -24,7 +24,6 @@ from simenv_marl import (
     OptionValueError,
     ReentrancyError,
     ViewError,
-    _episode,
     aec_env,
     branch,
     difference,
@@ -32,6 +31,7 @@ from simenv_marl import (
     parallel_env,
     single_env,
 )
+from simenv_marl.core import episode
 
 from .copied import Walk
 from .many_worlds import Being, beings
@@ -337,7 +337,7 @@ def test_simulations_that_are_random_for_themselves():
 
 
 def test_too_many_decisions_to_be_kept(monkeypatch):
-    monkeypatch.setattr(_episode, "MOST_TAKEN", 3)
+    monkeypatch.setattr(episode, "MOST_TAKEN", 3)
     env = single_env(lambda: Walk(9), Walk.choose)
     for _ in range(2):
         env.reset(seed=3)
@@ -354,7 +354,7 @@ def test_too_many_decisions_to_be_kept(monkeypatch):
 
 
 def test_too_many_rounds_to_be_kept(monkeypatch):
-    monkeypatch.setattr("simenv_marl._rounds.MOST_TAKEN", 2)
+    monkeypatch.setattr("simenv_marl.core.rounds.MOST_TAKEN", 2)
     env = parallel_env(lambda: Walk(9), Walk.choose)
     env.reset(seed=3)
     env.step({"walker_0": 1})

@@ -192,7 +192,7 @@ def test_what_cannot_be_saved():
 
 
 def test_what_the_rule_decides_must_be_known_before_anything_runs(monkeypatch):
-    monkeypatch.setattr("simenv_marl.demonstrations._check_free", lambda names: [])
+    monkeypatch.setattr("simenv_marl.many.demonstrations._check_free", lambda names: [])
 
     def never(simulation):
         raise AssertionError

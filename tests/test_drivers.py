@@ -15,7 +15,7 @@ from textwrap import dedent
 import pytest
 
 from simenv_marl import RULE, WrongThreadError, aec_env, parallel_env, single_env
-from simenv_marl._driver import RUNNING
+from simenv_marl.core.switch import RUNNING
 
 from .models import Script, calling, culprits, decision, notes, play, script
 from .test_threads import in_a_thread
@@ -553,7 +553,7 @@ def test_what_a_forked_model_in_a_thread_does_not_catch_is_printed():
 @DRIVERS
 def test_a_fork_while_other_threads_are_moving_leaves_nothing_of_them_in_the_child(driver):
     said = run(f"""
-        from simenv_marl._driver import RUNNING
+        from simenv_marl.core.switch import RUNNING
         inside, go_on = threading.Event(), threading.Event()
         decide = decision()
         def main(simulation):

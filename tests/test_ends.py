@@ -14,7 +14,7 @@ import pytest
 from benchmarks import soak
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
-from simenv_marl._options import Options
+from simenv_marl.core.options import Options
 
 from .models import decision, define, script
 
@@ -27,7 +27,7 @@ needs_signals = pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="thi
 PRELUDE = """
     import os, random, signal, sys, threading, time
     from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
-    from simenv_marl._options import Options
+    from simenv_marl.core.options import Options
     from tests.models import calling, decision, script
     Options.__init__.__kwdefaults__["driver"] = {driver!r}
 """
@@ -288,8 +288,8 @@ def test_a_model_may_end_the_process():
 @pytest.mark.parametrize("where", ["rule", "mapping", "reset"])
 def test_ctrl_c_in_mid_step_surfaces_and_the_next_episode_is_as_ever(where):
     result = process(f"""
-        import simenv_marl._threads
-        simenv_marl._threads.SECONDS_TO_UNWIND = 0.2
+        import simenv_marl.core.threads
+        simenv_marl.core.threads.SECONDS_TO_UNWIND = 0.2
         where, armed = {where!r}, [True]
         def linger(place):
             if place == where and armed and armed.pop():

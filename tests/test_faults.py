@@ -15,7 +15,8 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import RULE, ResetNeededError, _driver, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, ResetNeededError, aec_env, joint_env, parallel_env, single_env
+from simenv_marl.core import switch
 
 from .models import Script, culprits, decision, define, notes, play
 from .test_threads import in_a_thread
@@ -215,7 +216,7 @@ def cut_short(env, view):
 
 def nothing_is_left():
     """In this thread nothing runs, and what was patched is as it was."""
-    for book in (_driver.RUNNING, _driver.EVALUATING, _driver.PLUGGED):
+    for book in (switch.RUNNING, switch.EVALUATING, switch.PLUGGED):
         assert get_ident() not in book
         assert ~get_ident() not in book
     for owner in (Farm, Beast):
@@ -351,7 +352,7 @@ def interrupt_at(number, function, *args):
 
 @VIEWS
 def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view, monkeypatch):
-    monkeypatch.setattr("simenv_marl._threads.SECONDS_TO_UNWIND", 0.05)
+    monkeypatch.setattr("simenv_marl.core.threads.SECONDS_TO_UNWIND", 0.05)
     decide = decision()
 
     class Model(Script):
@@ -383,8 +384,8 @@ def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view, mo
             break
         assert type(raised) is KeyboardInterrupt, where
         del raised
-        assert get_ident() not in _driver.RUNNING, where
-        assert get_ident() not in _driver.EVALUATING, where
+        assert get_ident() not in switch.RUNNING, where
+        assert get_ident() not in switch.EVALUATING, where
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ResourceWarning)  # a thread that was never begun cannot be unwound
             whole_run(env)
@@ -448,7 +449,7 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
         for _ in range(3):
             step()
         assert env.unwrapped.simulation.log == [3, 3, 3, "unwound"]
-        assert get_ident() not in _driver.RUNNING
+        assert get_ident() not in switch.RUNNING
     assert ends >= {"went well", "came to the end"}
 
 

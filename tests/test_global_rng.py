@@ -13,13 +13,13 @@ from simenv_marl import (
     TRUNCATED,
     OptionValueError,
     WrongThreadError,
-    _generators,
     aec_env,
     joint_env,
     parallel_env,
     simulate,
     single_env,
 )
+from simenv_marl.core import rng
 
 from .models import decision, define, play
 
@@ -47,7 +47,7 @@ class Casino:
 
 BET = f"{__name__}.Casino.bet"
 POINTS = {BET: define(agent="player_0", observation_space_mapping=lambda casino, card: [card, np.random.random()])}
-BOTH_STATES = pytest.mark.parametrize("state", [_generators.SwiftState, _generators.PortableState])
+BOTH_STATES = pytest.mark.parametrize("state", [rng.SwiftState, rng.PortableState])
 
 
 def world():
@@ -62,10 +62,10 @@ def world():
     )
 
 
-@pytest.fixture(params=[_generators.SwiftState, _generators.PortableState])
+@pytest.fixture(params=[rng.SwiftState, rng.PortableState])
 def _states(request, monkeypatch):
-    monkeypatch.setattr(_generators, "_State", request.param)
-    monkeypatch.setattr(_generators, "_owners", [_generators._Owner()])
+    monkeypatch.setattr(rng, "_State", request.param)
+    monkeypatch.setattr(rng, "_owners", [rng._Owner()])
 
 
 @pytest.fixture(autouse=True)
@@ -90,7 +90,7 @@ def plain(seed):
 
 
 def test_here_states_are_copied_swiftly():
-    assert _generators._State is _generators.SwiftState
+    assert rng._State is rng.SwiftState
 
 
 @pytest.mark.usefixtures("_states")
@@ -284,7 +284,7 @@ import numpy as np
 before = np.random.get_state(legacy=False)["state"]["pos"]
 import ctypes
 ctypes.string_at = lambda *args: b""
-import simenv_marl._generators as generators
+import simenv_marl.core.rng as generators
 print(generators._State.__name__, np.random.get_state(legacy=False)["state"]["pos"] == before)
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

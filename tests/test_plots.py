@@ -21,7 +21,7 @@ from simenv_marl import (
     plot_returns,
     plot_timeline,
 )
-from simenv_marl.plots import COLOURS, UNKNOWN
+from simenv_marl.many.plots import COLOURS, UNKNOWN
 
 from .many_worlds import Being, beings
 from .models import Script, calling, decision, script

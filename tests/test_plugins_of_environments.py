@@ -271,7 +271,7 @@ def test_a_plugins_error_surfaces_from_step_and_the_next_reset_works():
     env.reset()
     env.step(1)
     env.close()
-    assert simenv_marl._driver.PLUGGED == simenv_marl._driver.EVALUATING == {}
+    assert simenv_marl.core.switch.PLUGGED == simenv_marl.core.switch.EVALUATING == {}
 
 
 def fail_once():
@@ -297,7 +297,7 @@ def test_nothing_is_left_behind():
     gc.collect()
     assert stacks() <= before
     assert alive(House) == 0
-    assert simenv_marl._driver.PLUGGED == simenv_marl._driver.EVALUATING == {}
+    assert simenv_marl.core.switch.PLUGGED == simenv_marl.core.switch.EVALUATING == {}
 
 
 def test_environments_in_threads_of_their_own_have_their_own_plugins():

@@ -641,7 +641,7 @@ def test_what_is_missing_is_named(monkeypatch, missing, wanted):
 
 def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch):
     """Few at first, which stay in the processor's caches; never more than asked for, and the same comes of it."""
-    monkeypatch.setattr("simenv_marl._batches.CROWD", 4)
+    monkeypatch.setattr("simenv_marl.many.batch.CROWD", 4)
     ant = decision(agent="ant_0")
     source = calling(*[ant] * 6)
 

@@ -29,8 +29,8 @@ from simenv_marl import (
     aec_env,
 )
 from simenv_marl.testing import CheckReport, Finding, check_simulation, inspect_simulation
-from simenv_marl.testing._fingerprint import fingerprint
-from simenv_marl.testing._report import compressed, short_names
+from simenv_marl.testing.fingerprint import fingerprint
+from simenv_marl.testing.report import compressed, short_names
 
 from . import many_worlds, worlds
 from .models import define

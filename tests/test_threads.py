@@ -15,7 +15,8 @@ import greenlet
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, ReentrancyError, _threads, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl import RULE, ReentrancyError, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl.core import threads
 
 from .models import calling, culprits, decision, notes, play, script
 
@@ -430,7 +431,7 @@ def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_
 @needs_signals
 @pytest.mark.usefixtures("interruptible")
 def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkeypatch, older_threads):
-    monkeypatch.setattr(_threads, "SECONDS_TO_UNWIND", 0.05)
+    monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
     go_on, log = threading.Event(), []
 
     def main(simulation):
@@ -461,7 +462,7 @@ def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkey
 
 @pytest.mark.parametrize("how", ["close", "collect"])
 def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(monkeypatch, how, older_threads):
-    monkeypatch.setattr(_threads, "SECONDS_TO_UNWIND", 0.05)
+    monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
     go_on = threading.Event()
 
     def main(simulation):

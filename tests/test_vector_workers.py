@@ -396,7 +396,7 @@ def test_an_environment_that_is_dropped_ends_its_workers():
 
 
 def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
-    monkeypatch.setattr("simenv_marl.envs._workers.SECONDS_TO_CLOSE", 0.5)
+    monkeypatch.setattr("simenv_marl.envs.workers.SECONDS_TO_CLOSE", 0.5)
     envs = workers(Hanging)
     envs.reset(seed=0)
     with pytest.warns(ResourceWarning, match="did not close"):

@@ -214,7 +214,7 @@ def test_an_error_that_cannot_be_pickled_is_told_of():
 def test_what_nobody_wants_any_more_is_cancelled(monkeypatch):
     """An interrupt while results arrive: the rest is given up, and nothing is in the way of the next call."""
     with monkeypatch.context() as patch:
-        patch.setattr("simenv_marl._spread.unpack", interrupted)
+        patch.setattr("simenv_marl.many.spread.unpack", interrupted)
         with pytest.raises(KeyboardInterrupt):
             traces(seeds=range(40), workers=2, batch_size=1)
     assert len(traces(seeds=range(2), workers=2)) == 2

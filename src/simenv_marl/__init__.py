@@ -44,11 +44,10 @@ The layers, each importing only from those above it::
 """
 
 from . import errors
-from ._handlers import Call, ChangedArgs, ChangedResult
-from ._provenance import provenance
 from .branching import branch
+from .core.provenance import provenance
+from .core.variant import Variant
 from .decision import Definition, difference, make_step
-from .demonstrations import Comparison, Mixture, compare_with_rule, record_dataset, save_dataset
 from .envs import (
     SimulationAECEnv,
     SimulationEnv,
@@ -63,9 +62,8 @@ from .envs import (
     vector_env,
 )
 from .errors import *  # noqa: F403 - the whole tree is public
-from .many import Trajectories, collect_episodes, simulate_many
-from .plots import plot_returns, plot_timeline
-from .plugins import (
+from .hooks.handlers import Call, ChangedArgs, ChangedResult
+from .hooks.plugins import (
     attach_handler,
     attached_handlers,
     decision_points,
@@ -75,10 +73,12 @@ from .plugins import (
     remove_handler,
     trace,
 )
-from .policies import simulate
+from .many.collect import Trajectories, collect_episodes, simulate_many
+from .many.demonstrations import Comparison, Mixture, compare_with_rule, record_dataset, save_dataset
+from .many.plots import plot_returns, plot_timeline
+from .many.simulate import simulate
 from .registration import register_simulation
 from .simulation import RULE, TRUNCATED, SimulationInterface
-from .variants import Variant
 
 __version__ = "0.1.0"
 

@@ -14,7 +14,7 @@ from contextlib import suppress
 from selectors import EVENT_READ, DefaultSelector
 from typing import Any, Final, NoReturn, TypeVar
 
-from ._parcels import pack, pack_error, unpack, unpack_error
+from .core.processes import pack, pack_error, unpack, unpack_error
 from .envs import View
 from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate
 

@@ -22,9 +22,9 @@ from weakref import WeakKeyDictionary, WeakSet, WeakValueDictionary
 import numpy as np
 from gymnasium import spaces
 
-from ._driver import EVALUATING, RUNNING
-from ._wrappers import DECISION, beneath, generate, is_alone, is_method, kind_of, stands_in, with_exposure
+from .core.switch import EVALUATING, RUNNING
 from .errors import DefinitionError, InvalidActionError, PatchError
+from .hooks.hook import DECISION, beneath, generate, is_alone, is_method, kind_of, stands_in, with_exposure
 
 Mapped = Callable[..., Any]
 """A mapping: called with the arguments of the decision call as they were passed."""

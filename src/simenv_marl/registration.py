@@ -11,11 +11,11 @@ from typing import Any
 import gymnasium
 import pettingzoo
 
-from ._plan import Plan
+from .core.plan import Plan
+from .core.variant import Variant
 from .envs import aec_env, joint_env, parallel_env, single_env, vector_env
 from .errors import OptionValueError, UnknownPointError
 from .simulation import RULE
-from .variants import Variant
 
 
 @dataclass(frozen=True)

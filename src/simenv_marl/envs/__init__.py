@@ -7,15 +7,15 @@ from typing import Any, Final
 
 from gymnasium.vector import AutoresetMode
 
-from .._plan import Plan
+from ..core.plan import Plan
 from ..errors import OptionValueError
-from ._view import View
-from ._workers import Recipe
 from .aec import SimulationAECEnv
+from .base import View
 from .joint import SimulationJointEnv
 from .parallel import SimulationParallelEnv
 from .single import SimulationEnv, single_view
 from .vector import SimulationVectorEnv
+from .workers import Recipe
 
 __all__ = [
     "VIEWS",

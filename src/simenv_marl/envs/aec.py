@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from pettingzoo import AECEnv
 
-from .._episode import Episode
-from .._plan import Plan
-from .._record import Record
+from ..core.agent import Record
+from ..core.episode import Episode
+from ..core.plan import Plan
 from ..errors import InvalidActionError
 from ..simulation import RULE
-from ._view import AgentsView
+from .base import AgentsView
 
 
 class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from .._episode import Episode
-from .._plan import Plan
-from .._rounds import Rounds
-from .._spaces import duplicate, open_mask
+from ..core.episode import Episode
+from ..core.plan import Plan
+from ..core.rounds import Rounds
+from ..core.spaces import duplicate, open_mask
 from ..errors import InvalidActionError, ViewError
 from ..simulation import RULE
-from ._view import OneAgentView
+from .base import OneAgentView
 
 
 class SimulationJointEnv(OneAgentView):

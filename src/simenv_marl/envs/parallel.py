@@ -7,12 +7,12 @@ from typing import Any
 
 from pettingzoo import ParallelEnv
 
-from .._plan import Plan
-from .._record import Record
-from .._rounds import Rounds
-from .._spaces import duplicate
+from ..core.agent import Record
+from ..core.plan import Plan
+from ..core.rounds import Rounds
+from ..core.spaces import duplicate
 from ..simulation import Sentinel
-from ._view import AgentsView
+from .base import AgentsView
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
 

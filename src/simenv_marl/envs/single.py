@@ -10,13 +10,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from .._episode import Episode
-from .._plan import Plan
-from .._record import Record
-from .._spaces import open_mask
+from ..core.agent import Record
+from ..core.episode import Episode
+from ..core.plan import Plan
+from ..core.spaces import open_mask
 from ..decision import Definition
 from ..errors import ViewError
-from ._view import OneAgentView, View
+from .base import OneAgentView, View
 
 
 class SimulationEnv(OneAgentView):

@@ -11,8 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from .._session import checked_seed
-from .._spaces import duplicate
+from ..core.session import checked_seed
+from ..core.spaces import duplicate
 from ..errors import (
     ClosedError,
     CopyError,
@@ -21,9 +21,9 @@ from ..errors import (
     OptionValueError,
     ReentrancyError,
 )
-from ._seats import Actions, Batch, Row, Seat, Seating, Told
-from ._view import one_at_a_time
-from ._workers import Recipe, Workers
+from .base import one_at_a_time
+from .rows import Actions, Batch, Row, Seat, Seating, Told
+from .workers import Recipe, Workers
 
 
 class SimulationVectorEnv(VectorEnv[Any, Any, Any]):

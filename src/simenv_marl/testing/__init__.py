@@ -31,13 +31,13 @@ from typing import Any
 
 import numpy as np
 
-from .._driver import unattended
-from .._plan import Plan
+from ..core.plan import Plan
+from ..core.switch import unattended
 from ..envs import SimulationAECEnv, aec_env
 from ..errors import OptionValueError, SimEnvError
-from ._check import Checker
-from ._inspect import described, ending, fitting_views
-from ._report import (
+from .check import Checker
+from .inspect import described, ending, fitting_views
+from .report import (
     CheckReport,
     ComponentStatistics,
     EpisodeStatistics,
@@ -47,7 +47,7 @@ from ._report import (
     PointStatistics,
     Timing,
 )
-from ._runs import (
+from .runs import (
     culprit,
     global_generators,
     plain_run,
@@ -55,7 +55,7 @@ from ._runs import (
     seed_global_generators,
     set_global_generators,
 )
-from ._words import order_of
+from .words import order_of
 
 __all__ = [
     "CheckReport",

@@ -1,0 +1,357 @@
+"""What an environment is made of, all of it known and checked before anything runs.
+
+A plan says which decision points an environment decides, under which agents' names, with which policies and
+options. It holds no state of any episode, so that one plan serves any number of environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any
+
+from ..decision import DecisionPoint, Definition, unwrapped
+from ..errors import (
+    AgentError,
+    DefinitionError,
+    OptionValueError,
+    SimEnvError,
+    UnknownPointError,
+    warn_user,
+)
+from ..hooks.hook import positional
+from ..hooks.plugins import Plugged, Plugins
+from ..simulation import RULE, make_simulation
+from .bindings import Binding, Policy, Removal
+from .options import Options
+from .points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, portable, stand_ins
+from .rng import GlobalRandom
+from .switch import Surrounding, unattended
+from .variant import Variant
+
+RENDER_MODES = ("ansi", "human", "rgb_array")
+"""What a simulation with a method ``render`` is taken to render, unless it has ``render_modes``."""
+
+
+class Plan:
+    """What an environment is made of.
+
+    Attributes:
+        source: Of what its simulation is made.
+        variant: The variant that it is made of; None if it is of none.
+        options: Its options.
+        render_modes: What its simulation can be rendered as.
+        bindings: Of decision points that do not run their rule, all that is known (a ``Binding``); and what else the
+            user's side is told of: functions that remove agents (``Removal``), what rules have decided (``Ruled``).
+        policies: By name: who answers the decisions of agents that are no agents of the environment.
+        roster: By name: the agents that are known beforehand, in the order of the points.
+        complete: Whether no others may join.
+        unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
+        asked: Of what kind are the policies whose agents are agents of the environment all the same, with rewards and
+            ends, because somebody else asks these policies; None: there are no such.
+        plugins: The handlers for its simulation alone; None if it has none.
+        sites: Where decision functions must be set while the environment is in use.
+    """
+
+    def __init__(
+        self,
+        source: Any,
+        named: list[NamedPoint],
+        options: Options,
+        render_modes: list[str],
+        *,
+        unanswered: bool = False,
+        asked: type | None = None,
+        spare: list[Any] | None = None,
+        variant: Variant | None = None,
+    ) -> None:
+        self.source, self.options, self._named = source, options, named
+        self.variant = variant
+        self._spare = [] if spare is None else spare  # the simulation that was looked at, until an environment takes it
+        self.render_modes = render_modes
+        if options.render_mode is not None and options.render_mode not in render_modes:
+            raise OptionValueError(
+                f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
+            )
+        self.unanswered, self.asked = unanswered, asked
+        agents = _name_agents(named)
+        by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
+        everything = [*named, *extra]
+        self.bindings: dict[Any, Any] = {}
+        active: list[Binding] = []
+        for point, agent in zip(everything, _name_agents(everything), strict=True):
+            policy = by_point.get(point.point)
+            excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
+            if policy is RULE and not excepted:
+                continue  # nobody needs to be asked
+            binding = self.bindings[point.point] = Binding(
+                point, agent, policy, recorded=asked is not None, padded=options.padded
+            )
+            if self._is_asked(agent, policy) if asked is not None else policy is None and agent not in self.policies:
+                active.append(binding)
+        self.active = active
+        self.sites: list[Site] = [point.site for point in everything if point.site is not None]
+        for bound in list(self.bindings.values()):
+            for other in stand_ins(bound.point):
+                self.bindings.setdefault(other, bound)
+        self._find_removals()
+        for bound in list(self.bindings.values()):
+            if isinstance(bound, Binding) and bound.ruled is not None:
+                self.bindings[bound.ruled] = bound.ruled
+        self.plugins = Plugins(options.plugins) if options.plugins else None
+        if not active and not unanswered:
+            raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
+        self.roster: dict[str, Binding] = {}
+        self.complete = False
+        if asked is not None:
+            self.roster = {binding.agent: binding for binding in active if binding.agent is not None}
+        else:
+            roster, self.complete = _call_the_roll(active, options.possible_agents)
+            if not unanswered:
+                self.roster = {name: binding for name, binding in roster.items() if name not in self.policies}
+
+    @property
+    def possible_agents(self) -> list[str] | None:
+        """The names of all agents that there may be; None where they are only known when they decide."""
+        return list(self.roster) if self.complete else None
+
+    @property
+    def patches(self) -> list[Site | Plugins]:
+        """What must be set in the model while an environment is in use."""
+        return [*self.sites] if self.plugins is None else [*self.sites, self.plugins]
+
+    def surroundings(self) -> list[Surrounding]:
+        """What the simulation of one environment is to find around it, from the outermost to the innermost."""
+        found: list[Surrounding] = [GlobalRandom()] if self.options.global_rng else []
+        return found if self.plugins is None else [*found, Plugged(self.plugins)]
+
+    def _is_asked(self, agent: str | None, policy: Any) -> bool:
+        """Whether somebody else may ask a policy at a point of that agent (None: of many) and with that policy."""
+        assert self.asked is not None
+        policies = [self.policies.get(agent, policy)] if agent is not None else [policy, *self.policies.values()]
+        return any(isinstance(policy, self.asked) for policy in policies)
+
+    def _find_removals(self) -> None:
+        for binding in dict.fromkeys(self.bindings.values()):
+            assert isinstance(binding, Binding)
+            for name, agent in binding.definition.removed_by.items():
+                point, _, site = locate(name)
+                removal = self.bindings.setdefault(point, Removal(point))
+                if not isinstance(removal, Removal):
+                    raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
+                owner, remover = owner_class(binding.point), owner_class(point)
+                if agent is None and point.bound and owner and remover and not have_instances(owner, remover):
+                    warn_user(
+                        f"{name}, which removed_by= of {binding.point.name} names, is called on a {remover.__name__},"
+                        f" which is no {owner.__name__}, and so ends no agent; give a dict from {name!r} to a callable"
+                        " of the call's arguments that names the agent"
+                    )
+                removal.of.append((binding, agent, owner))
+                if site is not None and site not in self.sites:
+                    self.sites.append(site)
+
+    @classmethod
+    def draw_up(
+        cls,
+        source: Any,
+        points: Any,
+        options: Mapping[str, Any],
+        *,
+        unanswered: bool = False,
+        asked: type | None = None,
+    ) -> Plan:
+        """Make a plan of what users say.
+
+        Args:
+            source: A simulation, its class, a factory, or a variant.
+            points: The active decision points, as ``generate_env`` takes them.
+            options: The options, by name.
+            unanswered: Whether there is no environment's user.
+            asked: Of what kind are the policies whose agents are agents of the environment all the same.
+
+        Raises:
+            SimEnvError: Something in them cannot work; the leaf says what.
+        """
+        variant = source if isinstance(source, Variant) else None
+        if variant is not None:
+            source, points, options = variant.applied(points, options)
+        checked = Options().amended(options)
+        model, spare = source, []
+        plain_factory = not isinstance(source, type) and not hasattr(source, "run")
+        if plain_factory or (points is None and getattr(source, "points", None) is None):
+            with unattended():
+                model = make_simulation(source)
+            spare.append(model)
+        modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
+        named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
+        return cls(
+            source, named, checked, list(modes), unanswered=unanswered, asked=asked, spare=spare, variant=variant
+        )
+
+    def __deepcopy__(self, memory: Any) -> Plan:
+        return self  # it holds nothing of any environment
+
+    def __reduce__(self) -> Any:
+        points = {point.key: point.own_definition for point in self._named}
+        options = {option.name: getattr(self.options, option.name) for option in fields(Options)}
+        for name in ("policies", "possible_agents"):
+            if isinstance(options[name], Mapping):
+                options[name] = {portable(key): value for key, value in options[name].items()}
+        options["plugins"] = [] if self.plugins is None else self.plugins.portable
+        return _remade, (self.source, points, options, self.variant, self.unanswered)
+
+    def make_simulation(self) -> Any:
+        """Make a simulation for one environment.
+
+        Raises:
+            SimulationError: The source makes none.
+        """
+        if self._spare and not (self.plugins or self.options.global_rng):  # which it was made without
+            try:
+                return self._spare.pop()
+            except IndexError:  # another thread was faster
+                pass
+        return make_simulation(self.source)
+
+    def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
+        """The same plan, with another definition of a point."""
+        named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
+        return self._like(named, self.options)
+
+    def declared(self, roster: Mapping[str, Binding]) -> Plan:
+        """The same plan, with a roster of agents that has been found out."""
+        names: dict[str, list[str]] = {b.point.name: [] for b in self.active if b.agent is None}
+        for agent, binding in roster.items():
+            if binding.agent is None:
+                names[binding.point.name].append(agent)
+        return self.amended({"possible_agents": names})
+
+    @property
+    def stale(self) -> bool:
+        """Whether a function that it patches has been replaced by another one since it was made."""
+        return any(site.stale for site in self.sites) or (self.plugins is not None and self.plugins.stale)
+
+    @property
+    def name(self) -> str:
+        """What the simulation is called: the name of its class or factory."""
+        return str(self.maker.__name__)
+
+    @property
+    def maker(self) -> Any:
+        """The class or factory of the simulation."""
+        source = self.source
+        while isinstance(source, partial):
+            source = source.func
+        return source if hasattr(source, "__qualname__") else type(source)
+
+    def amended(self, options: Mapping[str, Any]) -> Plan:
+        """The same plan, but for the options that are given."""
+        if not options:
+            return self
+        return self._like(self._named, self.options.amended(options))
+
+    def _like(self, named: list[NamedPoint], options: Options) -> Plan:
+        return Plan(self.source, named, options, self.render_modes, spare=self._spare, variant=self.variant)
+
+
+def _remade(source: Any, points: Any, options: dict[str, Any], variant: Variant | None, unanswered: bool) -> Plan:
+    plan = Plan.draw_up(source, points, options, unanswered=unanswered)
+    plan.variant = variant
+    return plan
+
+
+def _names_agents(policies: Mapping[Any, Any] | None) -> bool:
+    """Whether some policy's key names no point by itself, so that the agents of all points are to be known."""
+    return any(isinstance(key, str) and "." not in key for key in policies or {})
+
+
+def _name_agents(named: list[NamedPoint]) -> list[str | None]:
+    """Name the agent of each point; None where a callable does it."""
+    given = [point.definition.agent for point in named]
+    owners: dict[str, str] = {}
+    for point, agent in zip(named, given, strict=True):
+        if isinstance(agent, str):
+            if agent in owners:
+                raise AgentError(f"{owners[agent]} and {point.point.name} have the same agent {agent!r}")
+            owners[agent] = point.point.name
+    names: list[str | None] = []
+    for point, agent in zip(named, given, strict=True):
+        number = 0
+        while agent is None and (name := f"{point.point.letters}_{number}") in owners:
+            number += 1
+        if agent is None:
+            agent, owners[name] = name, point.point.name
+        names.append(agent if isinstance(agent, str) else None)
+    return names
+
+
+def _call_the_roll(active: list[Binding], declared: Any) -> tuple[dict[str, Binding], bool]:
+    """Find out which agents are known beforehand, and whether these are all."""
+    named = [binding for binding in active if binding.agent is None]
+    names: dict[Binding, list[Any]] = {}
+    if isinstance(declared, Mapping):
+        for key, value in declared.items():
+            point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
+            if point is None:
+                raise OptionValueError(
+                    f"possible_agents names {key!r}, which is no active decision point whose agents are named by a"
+                    f" callable; those are {[b.point.name for b in named]}"
+                )
+            names[point] = value
+    elif declared is not None:
+        others = [name for name in declared if name not in [b.agent for b in active]]
+        if len(named) > 1 or (others and not named):
+            raise OptionValueError(
+                "possible_agents must be a dict from decision point to names where"
+                f" {len(named)} points name their agents by a callable"
+            )
+        names = dict.fromkeys(named, others)
+    roster: dict[str, Binding] = {}
+    for binding in active:
+        for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
+            if not isinstance(name, str) or name in roster:
+                raise AgentError(f"possible_agents must be names, and each but once, not {name!r}")
+            roster[name] = binding
+    return roster, not named or declared is not None
+
+
+def _assign(
+    policies: Mapping[Any, Any], named: list[NamedPoint], agents: list[str | None]
+) -> tuple[dict[DecisionPoint, Any], dict[str, Any], list[NamedPoint]]:
+    """Find out whom each policy answers for: a point (maybe one that was not named yet) or an agent."""
+    by_point: dict[DecisionPoint, Any] = {}
+    by_agent: dict[str, Any] = {}
+    extra: list[NamedPoint] = []
+    for key, value in policies.items():
+        policy = value if value is RULE else two_arguments(value)
+        if isinstance(key, str) and key in agents:
+            by_agent[key] = policy
+            continue
+        point = next((p for p in named if key == p.point.name or unwrapped(key) is p.point.rule), None)
+        if point is None:
+            try:
+                point = find_point(key)
+            except SimEnvError as error:
+                if policy is RULE and isinstance(error, DefinitionError):
+                    continue  # nobody decides there anyway
+                if isinstance(key, str) and isinstance(error, UnknownPointError) and None in agents:
+                    by_agent[key] = policy  # an agent that a callable may name
+                    continue
+                names = sorted([a for a in agents if a] + [p.point.name for p in named])
+                raise UnknownPointError(
+                    f"policies names {key!r}, which is neither an agent nor a decision point ({error});"
+                    f" known are {', '.join(names)}"
+                ) from error
+            if not any(point.point is other.point for other in (*named, *extra)):
+                extra.append(point)
+        by_point[point.point] = policy
+    return by_point, by_agent, extra
+
+
+def two_arguments(policy: Callable[..., Any]) -> Policy:
+    """Let a policy be called with observation and info, whether it takes the info or not."""
+    parameters = positional(policy)
+    if len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info"):
+        return policy
+    return lambda observation, info: policy(observation)

@@ -1,0 +1,128 @@
+"""Variants: one model, many experiments, each with a name for all that it changes.
+
+A variant holds what makes an experiment on a model different from another one: parameters of the model, plugins,
+definitions of decision points, and policies that decide in place of others. It serves wherever a simulation is
+asked for. What is given beside it there comes on top of it.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping
+from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+from ..errors import OptionValueError, SimulationError
+from .points import portable
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A simulation with everything that an experiment changes about it, under one name. Immutable.
+
+    To vary it further, use ``dataclasses.replace``.
+
+    Attributes:
+        name: What it is called in results.
+        simulation: A simulation (which is copied), its class, or a factory.
+        parameters: What the class or factory is called with, by keyword.
+        points: The decision points and their definitions, as ``generate_env`` takes them.
+        plugins: Handlers for its simulations alone, as the option ``plugins`` takes them; more of them can be given
+            where the variant is used, and run after these.
+        policies: Who decides without being an agent, as the option ``policies`` takes them.
+        options: All other options of its environments.
+    """
+
+    name: str
+    simulation: Any
+    _: KW_ONLY
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    points: Any = None
+    plugins: Iterable[Any] = ()
+    policies: Mapping[Any, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise OptionValueError(f"a variant needs a name, not {self.name!r}")
+        if isinstance(self.simulation, Variant):
+            raise SimulationError(
+                f"the variant {self.name!r} is one of a simulation, not of {self.simulation.name!r}; derive variants"
+                " from each other with dataclasses.replace"
+            )
+        for name in ("parameters", "policies", "options"):
+            value = getattr(self, name)
+            if not isinstance(value, Mapping):
+                raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {value!r}")
+            # Nobody else can change it: what is frozen is the variant and all that it names.
+            object.__setattr__(self, name, MappingProxyType(dict(value)))
+        twice = [name for name in ("plugins", "policies") if name in self.options]
+        if twice:
+            raise OptionValueError(f"{' and '.join(twice)} of the variant {self.name!r} are not among its options")
+        object.__setattr__(self, "plugins", tuple(self.plugins))
+        self._check_parameters()
+
+    def _check_parameters(self) -> None:
+        source = self.simulation
+        if not self.parameters:
+            return
+        if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
+            raise SimulationError(
+                f"the variant {self.name!r} has parameters, for which its simulation must be a class or a factory, not"
+                f" {source!r}"
+            )
+        try:
+            inspect.signature(source).bind(**self.parameters)
+        except TypeError as error:
+            raise SimulationError(
+                f"{getattr(source, '__qualname__', source)} cannot be called with the parameters of the variant"
+                f" {self.name!r}: {error}"
+            ) from error
+        except ValueError:  # a builtin, which cannot say what it takes
+            pass
+
+    def __reduce__(self) -> Any:
+        # Functions go by their names: while environments are in use, others may stand in their places.
+        points, plugins = self.points, [(handler, portable(target), *rest) for handler, target, *rest in self.plugins]
+        if isinstance(points, Mapping):
+            points = {portable(key): definition for key, definition in points.items()}
+        elif points is not None and not isinstance(points, str):
+            points = [portable(key) for key in (points if isinstance(points, Iterable) else [points])]
+        policies = {portable(key): policy for key, policy in self.policies.items()}
+        return _remake, (
+            self.name,
+            self.simulation,
+            dict(self.parameters),
+            points,
+            plugins,
+            policies,
+            dict(self.options),
+        )
+
+    def applied(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
+        """What an environment is made of that is made of this variant.
+
+        Args:
+            points: The decision points that are given beside it; None: its own.
+            options: The options that are given beside it.
+
+        Returns:
+            The source of its simulation, the decision points, and the options.
+        """
+        source = partial(self.simulation, **self.parameters) if self.parameters else self.simulation
+        merged = {**self.options, **options}
+        policies = {**self.policies, **(options.get("policies") or {})}
+        plugins = (*self.plugins, *options.get("plugins", ()))
+        if policies:
+            merged["policies"] = policies
+        if plugins:
+            merged["plugins"] = plugins
+        return source, self.points if points is None else points, merged
+
+
+def _remake(name: str, simulation: Any, parameters: Any, points: Any, plugins: Any, policies: Any, options: Any) -> Any:
+    return Variant(
+        name, simulation, parameters=parameters, points=points, plugins=plugins, policies=policies, options=options
+    )

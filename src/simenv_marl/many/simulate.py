@@ -1,0 +1,46 @@
+"""Policies back in the model: a simulation runs its own loop, and policies answer its decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..core.episode import Episode
+from ..core.plan import Plan
+from ..core.session import Session, checked_seed
+
+
+def simulate(
+    simulation: Any,
+    policies: Mapping[Any, Any] | None = None,
+    *,
+    points: Any = None,
+    seed: int | None = None,
+    **options: Any,
+) -> Any:
+    """Run a simulation's own loop to its end, with policies answering and all else on its rule.
+
+    Args:
+        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
+        policies: Who decides: from agent or decision point to a callable of the observation, or of the
+            observation and the info, that returns an action.
+        points: The decision points, as ``generate_env`` takes them. None and no policies: none.
+        seed: What the simulation is reset with, where its ``reset`` takes a seed; None: one is drawn.
+        **options: As ``aec_env`` takes them.
+
+    Returns:
+        The simulation, after its ``run``.
+
+    Raises:
+        SimEnvError: Something in it cannot work; the leaf says what.
+        BaseException: Whatever the model, a mapping or a policy raises.
+    """
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
+    session = Session(plan)
+    try:
+        session.start(checked_seed(seed), None, np.random.default_rng(), Episode)
+        return session.simulation
+    finally:
+        session.close()

@@ -1,0 +1,100 @@
+"""Work on many simulations that is spread over processes, here or elsewhere, by joblib."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from math import ceil
+from typing import Any
+
+from ..core.processes import pack, pack_error, unpack, unpack_error
+from ..errors import MissingExtraError
+
+
+def progress_bar(total: int) -> Any:
+    """A bar that shows how many simulations have ended.
+
+    Raises:
+        MissingExtraError: tqdm is not installed.
+    """
+    try:
+        from tqdm.auto import tqdm  # type: ignore[import-untyped]
+    except ImportError:
+        raise _missing("progress=True", "tqdm") from None
+    return tqdm(total=total, unit="simulation")
+
+
+def _missing(what: str, package: str) -> MissingExtraError:
+    return MissingExtraError(f"{what} needs {package}: install simenv-marl[many]")
+
+
+def spread(
+    work: Callable[..., Any], arguments: tuple[Any, ...], seeds: Sequence[int], workers: int, least: int
+) -> Iterator[tuple[int, Any]]:
+    """Have worker processes do some work, each of a part of the seeds.
+
+    Args:
+        work: Called with the arguments and a list of seeds; a function of this package.
+        arguments: What it is called with.
+        seeds: All seeds.
+        workers: How many processes; -1: as many as joblib's backend has.
+        least: How many seeds are not to be parted, if every worker is to have some.
+
+    Yields:
+        How many seeds a part has, and what came of it; in the order of the seeds.
+
+    Raises:
+        MissingExtraError: joblib is not installed.
+        WorkerError: An error in a worker cannot be brought here as itself.
+        BaseException: What the work raises.
+    """
+    try:
+        import joblib
+    except ImportError:
+        raise _missing(f"workers={workers}", "joblib") from None
+    processes = max(1, joblib.effective_n_jobs(workers))
+    size = max(1, ceil(len(seeds) / (4 * processes)), min(least, ceil(len(seeds) / processes)))
+    parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]
+    parcel = pack((work, arguments))
+    try:
+        parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
+    except ValueError:  # this backend tells nothing before everything is done
+        parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
+    results = parallel(joblib.delayed(_work)(parcel, part) for part in parts)
+    with _closing(results):
+        remaining = iter(results)
+        for part in parts:
+            failed, result = next(remaining)
+            if failed:
+                raise unpack_error(result)
+            yield len(part), unpack(result)
+
+
+@contextmanager
+def _closing(results: Any) -> Iterator[None]:
+    """Cancel what is still to be done where nobody wants to know its results any more."""
+    try:
+        yield
+    finally:
+        close = getattr(results, "close", None)
+        if close is not None:
+            with warnings.catch_warnings():  # that it cancels what it was to cancel
+                warnings.simplefilter("ignore")
+                close()
+
+
+def _work(parcel: bytes, seeds: list[int]) -> tuple[bool, bytes]:
+    """In a worker: do the work.
+
+    Returns:
+        Whether that has failed, and a parcel with what came of it or with the error, which joblib's backends would pass
+        on each in its own guise.
+    """
+    try:
+        work, arguments = unpack(parcel)
+        return False, pack(work(*arguments, seeds))
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        return True, pack_error(error)

@@ -1,0 +1,241 @@
+"""What is left of a run: all that an arbitrary simulation holds, written down so that two runs can be compared.
+
+Nobody asks models to be comparable. So their attributes are gone through, as far as they lead, down to numbers,
+strings, arrays and the states of random generators; each of these *parts* has a path, which is what a difference is
+told by. What cannot be compared (open files, generators, locks) is left out, and its kind is noted.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import warnings
+import weakref
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property, partial
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Any, Final
+
+import numpy as np
+
+from ..core.switch import unattended
+from ..simulation import Sentinel
+
+MOST_PARTS: Final = 50_000
+"""How many parts are compared; larger models are compared in as many."""
+
+ABSENT: Final = Sentinel("nothing")
+
+_ATOMS: Final = (int, float, complex, str, bytes, bool, type(None), range, type(Ellipsis), type(NotImplemented))
+_NAMED: Final = (type, FunctionType, BuiltinFunctionType, ModuleType)
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """All parts of a simulation at one moment.
+
+    Attributes:
+        parts: By path.
+        left_out: The kinds of what cannot be compared.
+        complete: Whether there were no more than ``MOST_PARTS``.
+    """
+
+    parts: dict[str, Any]
+    left_out: frozenset[str]
+    complete: bool
+
+    def differences(self, other: Fingerprint, but: frozenset[str] = frozenset()) -> list[tuple[str, Any, Any]]:
+        """Where two differ: path, and what stands there here and in the other; ``ABSENT`` for nothing.
+
+        Args:
+            other: The other.
+            but: What is not compared: paths, as ``general`` writes them.
+        """
+        found = []
+        for path, here in self.parts.items():
+            there = other.parts.get(path, ABSENT)
+            if not alike(here, there) and general(path) not in but and (there is not ABSENT or other.complete):
+                found.append((path, here, there))
+        if self.complete:
+            found += [
+                (path, ABSENT, there)
+                for path, there in other.parts.items()
+                if path not in self.parts and general(path) not in but
+            ]
+        return found
+
+
+def fingerprint(simulation: Any, own: Callable[[Any], Any] | None = None) -> Fingerprint:
+    """Write down what a simulation holds.
+
+    Args:
+        simulation: The simulation.
+        own: What its user has given to be compared by: a callable of the simulation. Without it the
+            simulation's own ``state()``, or else all its attributes.
+    """
+    tell = getattr(simulation, "state", None)
+    with unattended():
+        if own is not None:
+            return _written("fingerprint", own(simulation))
+        if callable(tell):
+            return _written("state()", tell())
+        return _written("simulation", simulation)
+
+
+def _written(name: str, root: Any) -> Fingerprint:
+    parts: dict[str, Any] = {}
+    left_out: set[str] = set()
+    met: dict[int, str] = {}
+    kept = []  # what is made on the way: its id must not be given away again
+    # The nearest first: a long history that the model keeps is not to hide the rest of it.
+    left = deque([(name, root)])
+    while left and len(parts) < MOST_PARTS:
+        path, value = left.popleft()
+        if isinstance(value, _ATOMS) and not isinstance(value, Enum):
+            parts[path] = value
+        elif isinstance(value, np.ndarray) and value.dtype != object:
+            parts[path] = value.copy()
+        elif isinstance(value, np.generic):
+            parts[path] = value
+        elif isinstance(value, Enum):
+            parts[path] = str(value)
+        elif isinstance(value, _NAMED):
+            parts[path] = title(value)
+        elif id(value) in met:
+            parts[path] = f"what is also {met[id(value)]}"
+        else:
+            if not isinstance(value, (tuple, frozenset)):  # equal ones may or may not be one and the same
+                met[id(value)] = path
+            kept.append(value)
+            parts[path] = title(type(value))
+            inside = _inside(path, value)
+            if inside is None:
+                left_out.add(title(type(value)))
+            else:
+                left += inside
+    return Fingerprint(parts, frozenset(left_out), not left)
+
+
+def _inside(path: str, value: Any) -> Iterator[tuple[str, Any]] | None:
+    """What a value holds, by path; None where that cannot be told."""
+    if isinstance(value, (set, frozenset, weakref.WeakSet)):
+        return _of_set(path, value)
+    if isinstance(value, random.Random):
+        return iter([(f"{path} (state of the generator)", str(value.getstate()))])
+    if isinstance(value, (np.random.Generator, np.random.RandomState)):
+        bits = value.bit_generator if isinstance(value, np.random.Generator) else value._bit_generator
+        return iter([(f"{path} (state of the generator)", str(bits.state))])
+    if isinstance(value, weakref.ref):
+        return iter([(f"{path}()", value())])
+    if isinstance(value, MethodType):
+        return iter([(f"{path}.__func__", value.__func__), (f"{path}.__self__", value.__self__)])
+    if isinstance(value, partial):
+        return iter([(f"{path}.func", value.func), (f"{path}.args", value.args), (f"{path}.keywords", value.keywords)])
+    if isinstance(value, np.ndarray):
+        return _of_sequence(path, value.ravel())
+    return _of_object(path, value)
+
+
+def _of_object(path: str, value: Any) -> Iterator[tuple[str, Any]] | None:
+    attributes = list(_attributes(path, value))
+    known = bool(attributes)
+    if isinstance(value, (list, tuple, deque)):
+        attributes += _of_sequence(path, value)
+        known = True
+    elif isinstance(value, (dict, weakref.WeakKeyDictionary, weakref.WeakValueDictionary, Mapping)):
+        attributes += _of_mapping(path, value)
+        known = True
+    if known or hasattr(value, "__dict__"):
+        return iter(attributes)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            reduced = value.__reduce_ex__(4)
+    except Exception:  # an open file, a lock, a generator: whatever its reason is
+        return None
+    if isinstance(reduced, str):
+        return iter([(f"{path} (itself)", reduced)])
+    lists = [list(part) if number > 2 and part is not None else part for number, part in enumerate(reduced[:5])]
+    return iter([(f"{path} (itself)", lists[1:])])
+
+
+def _attributes(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    kind = type(value)
+    for name, part in list(getattr(value, "__dict__", {}).items()):
+        if not isinstance(getattr(kind, name, None) if isinstance(name, str) else None, cached_property):
+            yield f"{path}.{name}", part
+    for owner in kind.__mro__:
+        slots = vars(owner).get("__slots__", ())
+        for name in [slots] if isinstance(slots, str) else slots:
+            private = name.startswith("__") and not name.endswith("__")
+            held = f"_{owner.__name__.lstrip('_')}{name}" if private else name
+            if name not in ("__dict__", "__weakref__") and hasattr(value, held):
+                yield f"{path}.{name}", getattr(value, held)
+
+
+def _of_sequence(path: str, values: Any) -> Iterator[tuple[str, Any]]:
+    return ((f"{path}[{number}]", value) for number, value in enumerate(values))
+
+
+def _of_mapping(path: str, values: Any) -> Iterator[tuple[str, Any]]:
+    for number, (key, value) in enumerate(list(values.items())):
+        if isinstance(key, (*_ATOMS, np.generic, tuple, Enum)) and len(shown := repr(key)) < 80:
+            yield f"{path}[{shown}]", value
+        else:
+            yield f"{path} (key {number})", key
+            yield f"{path}[key {number}]", value
+
+
+def _of_set(path: str, values: Any) -> Iterator[tuple[str, Any]]:
+    """A set has no order: of what is no atom, only how many there are of each kind."""
+    atoms = sorted(repr(value) for value in values if isinstance(value, _ATOMS))
+    others = Counter(title(type(value)) for value in values if not isinstance(value, _ATOMS))
+    return iter([(f"{path} (members)", ", ".join(atoms)), (f"{path} (kinds)", str(sorted(others.items())))])
+
+
+def general(path: str) -> str:
+    """A path that is the same for all members of a list or dict."""
+    return re.sub(r"\[[^\]]*\]", "[]", path)
+
+
+def title(thing: Any) -> str:
+    """The name of a class, function or module."""
+    name = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
+    return str(name) if name else type(thing).__qualname__
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Whether two values of atoms, arrays and containers of them are the same, bit for bit."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, (np.ndarray, np.generic)):
+        return bool(one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes())
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(alike(value, other[key]) for key, value in one.items())
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(alike, one, other))
+    return bool(one == other or (one != one and other != other))
+
+
+def brief(value: Any, depth: int = 3) -> Any:
+    """What of a rule's result can be compared at little cost: atoms, arrays, containers of them; else its kind."""
+    if isinstance(value, _ATOMS) and not isinstance(value, Enum):
+        return value
+    if isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
+        return value.copy()
+    if depth and isinstance(value, (list, tuple)) and len(value) <= 1000:
+        return [type(value).__name__, *(brief(part, depth - 1) for part in value)]
+    if depth and type(value) is dict and len(value) <= 1000:
+        return {"dict": [(brief(key, depth - 1), brief(part, depth - 1)) for key, part in value.items()]}
+    return f"<{title(type(value))}>" if not isinstance(value, Enum) else str(value)
+
+
+def shown(value: Any, most: int = 60) -> str:
+    """A value in few words."""
+    if value is ABSENT:
+        return "nothing"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= most else f"{text[: most - 4]} ..."

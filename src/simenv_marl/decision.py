@@ -9,22 +9,22 @@ rule, however many definitions there are of it.
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
-from threading import get_ident
-from types import FunctionType, MethodType
+from types import FunctionType
 from typing import Any
-from weakref import WeakKeyDictionary, WeakSet, WeakValueDictionary
+from weakref import WeakSet, WeakValueDictionary
 
 import numpy as np
+from greenlet import getcurrent
 from gymnasium import spaces
 
-from .core.switch import EVALUATING, RUNNING
 from .errors import DefinitionError, InvalidActionError, PatchError
-from .hooks.hook import DECISION, beneath, generate, is_alone, is_method, kind_of, stands_in, with_exposure
+from .hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
+from .hooks.places import stays, unbind
+from .hooks.stacks import DIFFERENCES, EVALUATING
 
 Mapped = Callable[..., Any]
 """A mapping: called with the arguments of the decision call as they were passed."""
@@ -73,12 +73,16 @@ class Definition:
             PatchError: ``function`` is none of these.
         """
         given, binding = unbind(function)
-        rule = beneath(given)
-        if not isinstance(rule, FunctionType):
-            raise PatchError(f"{rule!r} cannot be a decision point: it is no function written in Python")
-        known = point_of(rule)
-        point = known[0] if known else DecisionPoint(rule, bound=binding is not staticmethod)
-        wrapper = with_exposure(point.wrap(self), given)  # handlers lie outside the decision
+        hook = hook_of(given)
+        if hook is None:
+            name = f"{given.__module__}.{given.__qualname__}"
+            hook = Hook(given, name, bound=binding is not staticmethod)
+        elif not isinstance(hook.function, FunctionType):
+            raise PatchError(f"{hook.function!r} cannot be a decision point: it is no function written in Python")
+        elif not hook.for_good:  # fetched while it was set for a while
+            stays(hook)
+        point = point_for(hook)
+        wrapper = hook.stand_in(self)
         point.definition = self
         _REGISTRY[point.name] = point
         return wrapper if binding is None else binding(wrapper)
@@ -123,7 +127,7 @@ def make_step(
             action or None for none; or a dict from decision to action. After a decision that was left to the rule,
             the agent's next info has that action as ``"rule_action"``.
         agent: The name of the agent that decides here, or a callable of the call's arguments that names
-            it (None: nobody, the rule decides). By default the function's letters in lower case and a
+            it (None: the rule decides). By default the function's letters in lower case and a
             number, such as ``choosewateramount_0``.
         action_mask_mapping: Called with the call's arguments, returns which actions of a ``Discrete`` or
             ``MultiDiscrete`` are legal: 1 or 0 for each.
@@ -282,55 +286,57 @@ def _of_decision(mapping: Callable[..., Any]) -> Mapped:
 _REGISTRY: WeakValueDictionary[str, DecisionPoint] = WeakValueDictionary()
 """The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
 
-_FAMILIES: WeakKeyDictionary[FunctionType, WeakSet[DecisionPoint]] = WeakKeyDictionary()
-"""By rule: the points that were made of it, each by a decoration of its own."""
-
 
 class DecisionPoint:
-    """One function of a model that decides something.
+    """One function of a model that decides something: what is asked, under whatever definition.
 
     Attributes:
-        name: Its dotted name, ``package.module.Class.function``.
-        rule: The function itself, which decides where nobody else does.
+        hook: The hook of the function.
         definition: The latest definition, which the bare name means; None for a point that was named from
             outside and is a decision point for some environments alone.
-        alone: Whether every call has one argument, which is what it is called on.
-        bound: Whether its first argument is what it is called on, which nobody passes by keyword.
-        wrappers: Its decision functions.
-        kind: "function", "generator" or "coroutine": what a call of it returns.
     """
 
-    __slots__ = ("__weakref__", "alone", "bound", "definition", "kind", "name", "rule", "wrappers")
+    __slots__ = ("__weakref__", "definition", "hook")
 
-    def __init__(
-        self, rule: FunctionType, name: str | None = None, *, bound: bool, like: FunctionType | None = None
-    ) -> None:
-        """Make the point of a rule.
-
-        Args:
-            rule: The function that decides.
-            name: Its dotted name, where it is not the one that it was defined with.
-            bound: Whether, in a class, its first argument is what it is called on.
-            like: A function that tells what calls return, where the rule only passes them on to it.
-
-        Raises:
-            PatchError: An async generator function, which cannot return a decision.
-        """
-        self.rule = rule
-        self.name = name or f"{rule.__module__}.{rule.__qualname__}"
-        self.bound = bound and is_method(rule, self.name)
+    def __init__(self, hook: Hook) -> None:
+        self.hook = hook
         self.definition: Definition | None = None
-        self.kind = kind_of(like or rule, self.name)
-        self.alone = is_alone(inspect.signature(rule, follow_wrapped=False), bound=self.bound)
-        self.wrappers: WeakSet[FunctionType] = WeakSet()
-        _FAMILIES.setdefault(rule, WeakSet()).add(self)
 
     def __repr__(self) -> str:
         return f"<DecisionPoint {self.name}>"
 
     def __reduce__(self) -> Any:
-        made_of = (self.rule, self.name, self.bound, self.kind)
-        return _restored, made_of, self.definition, None, None, _redefined
+        return point_for, (self.hook,), self.definition, None, None, _redefined
+
+    @property
+    def name(self) -> str:
+        """Its dotted name, ``package.module.Class.function``."""
+        return self.hook.name
+
+    @property
+    def rule(self) -> Any:
+        """The function itself, which decides where no environment or policy does."""
+        return self.hook.function
+
+    @property
+    def kind(self) -> str:
+        """What a call of it returns: "function" (its value), "generator" or "coroutine"."""
+        return self.hook.kind
+
+    @property
+    def alone(self) -> bool:
+        """Whether every call has one argument, which is what it is called on."""
+        return self.hook.alone
+
+    @property
+    def bound(self) -> bool:
+        """Whether its first argument is what it is called on, which is never passed by keyword."""
+        return self.hook.bound
+
+    @property
+    def wrappers(self) -> WeakSet[FunctionType]:
+        """Its decision functions."""
+        return self.hook.stand_ins
 
     @property
     def letters(self) -> str:
@@ -339,48 +345,36 @@ class DecisionPoint:
         return "".join(letter for letter in name if "a" <= letter <= "z") or "agent"
 
     def wrap(self, definition: Definition | None) -> FunctionType:
-        """Make a decision function of this point.
-
-        Args:
-            definition: What the decision function stands for where it is named as a point.
-        """
-        wrapper = generate(
-            self.rule,
-            inspect.signature(self.rule, follow_wrapped=False),
-            what=DECISION,
-            name=self.name,
-            kind=self.kind,
-            alone=self.alone,
-            guard="RUNNING",
-            ask="RUNNING.get(get_ident(), unattended)(point, {}, {})",
-            namespace={
-                "RUNNING": RUNNING,
-                "get_ident": get_ident,
-                "point": self,
-                "unattended": _Unattended(definition),
-            },
-        )
-        self.wrappers.add(wrapper)
-        return wrapper
+        """Make a decision function of this point, which stands for a definition where it is named as a point."""
+        return self.hook.stand_in(definition)
 
     def family(self) -> list[DecisionPoint]:
         """The other points of the same rule."""
-        return [point for point in _FAMILIES[self.rule] if point is not self]
+        return [hook.point for hook in MADE_OF[self.rule] if hook.point is not None and hook is not self.hook]
+
+
+def point_for(hook: Hook) -> DecisionPoint:
+    """The decision point of a hook, whether it was one before or not."""
+    if hook.point is None:
+        hook.point = DecisionPoint(hook)
+    point: DecisionPoint = hook.point
+    return point
 
 
 def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
     """The point of a decision function and the definition that it was made with; None for anything else."""
-    function = beneath(function)
-    if stands_in(function, DECISION):
-        return function.__globals__["point"], function.__globals__["unattended"].definition
-    return None
+    hook = hook_of(function)
+    if hook is None:
+        return None
+    definition: Definition | None = made_with(function)
+    if definition is None and hook.point is None:
+        return None
+    return point_for(hook), definition
 
 
 def unwrapped(function: Any) -> Any:
-    """The rule of a decision function; any other function as it is, without its binding and its handlers."""
-    function = beneath(getattr(function, "__func__", function))
-    known = point_of(function)
-    return known[0].rule if known else function
+    """The function that a decision function or an exposed one stands in front of; any other as it is, unbound."""
+    return beneath(getattr(function, "__func__", function))
 
 
 def registered(name: str) -> DecisionPoint | None:
@@ -388,72 +382,9 @@ def registered(name: str) -> DecisionPoint | None:
     return _REGISTRY.get(name)
 
 
-def registered_names() -> list[str]:
+def decision_points() -> list[str]:
     """The dotted names of all decorated decision points, in the order of their decoration."""
     return list(_REGISTRY)
-
-
-def unbind(function: Any) -> tuple[FunctionType, type | None]:
-    """Find the plain function under a binding.
-
-    Args:
-        function: A function, staticmethod or classmethod, or one of these as an attribute of its class.
-
-    Returns:
-        The function, and ``staticmethod`` or ``classmethod`` where it was bound so.
-
-    Raises:
-        PatchError: It is something else.
-    """
-    if isinstance(function, (staticmethod, classmethod)):
-        inner, binding = function.__func__, type(function)
-        if isinstance(inner, FunctionType):
-            return inner, binding
-    elif isinstance(function, MethodType):
-        if isinstance(function.__self__, type) and isinstance(function.__func__, FunctionType):
-            return function.__func__, classmethod
-        raise PatchError(
-            f"{function!r} is bound to one object; name the function of its class,"
-            f" {type(function.__self__).__name__}.{function.__name__}"
-        )
-    elif isinstance(function, FunctionType):
-        # A staticmethod that was fetched from its class is a plain function: see how the class holds it.
-        owner: Any = sys.modules.get(function.__module__)
-        path = function.__qualname__.split(".")
-        for name in path[:-1]:
-            owner = getattr(owner, name, None)
-        held = vars(owner).get(path[-1]) if isinstance(owner, type) else None
-        if isinstance(held, staticmethod) and held.__func__ is function:
-            return function, staticmethod
-        return function, None
-    raise PatchError(f"{function!r} cannot be a decision point: it is no function written in Python")
-
-
-class _Unattended:
-    """Whom decision functions ask where no simulation runs, while one runs elsewhere: the rule.
-
-    Attributes:
-        definition: What the decision function was made with. It is kept here so that it stays with the function when
-            that is pickled by value, which takes along what its code names, and nothing else.
-    """
-
-    __slots__ = ("definition",)
-
-    def __init__(self, definition: Definition | None) -> None:
-        self.definition = definition
-
-    def __call__(self, point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        return point.rule(*args, **kwargs)
-
-
-def _restored(rule: FunctionType, name: str, bound: bool, kind: str) -> DecisionPoint:
-    """The point of a rule, in whichever process: the one that is there, or a new one."""
-    for point in _FAMILIES.get(rule, ()):
-        if point.name == name:
-            return point
-    point = DecisionPoint(rule, name, bound=bound)
-    point.bound, point.kind = bound, kind
-    return point
 
 
 def _redefined(point: DecisionPoint, definition: Definition | None) -> None:
@@ -464,10 +395,6 @@ def _redefined(point: DecisionPoint, definition: Definition | None) -> None:
 
 
 # -- differences ----------------------------------------------------------------------------------
-
-DIFFERENCES: list[str] = []
-"""Not empty once a difference was made. Where there is none, nobody needs to say whose mapping is
-being evaluated."""
 
 
 class Difference:
@@ -485,7 +412,8 @@ class Difference:
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """The change of the function's value at these arguments."""
         value = self._function(*args, **kwargs)
-        memory = EVALUATING.get(get_ident())
+        evaluation = EVALUATING.get(getcurrent())
+        memory = None if evaluation is None else evaluation.memory
         if memory is None:
             return 0.0
         before = memory.get(self, value)

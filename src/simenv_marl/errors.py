@@ -36,6 +36,7 @@ Every error is raised with its message alone, so that it survives pickling.
 
 import sys
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 __all__ = [
@@ -88,6 +89,16 @@ def annotate(error: BaseException, note: str) -> None:
         notes = vars(error).setdefault("__notes__", [])
         if isinstance(notes, list):
             notes.append(note)
+
+
+def clear_frames(error: BaseException) -> None:
+    """Have this package's frames in an error's traceback let go of what they hold, such as arguments of a model's."""
+    trace = error.__traceback__
+    while trace is not None:
+        frame, trace = trace.tb_frame, trace.tb_next
+        if frame.f_code.co_filename.startswith(_PACKAGE):
+            with suppress(RuntimeError):  # it is still running
+                frame.clear()
 
 
 class SimEnvError(Exception):

@@ -147,3 +147,12 @@ def takes(function: Callable[..., Any], name: str) -> bool:
     if parameter is not None:
         return parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
     return any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+
+
+def positional(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    """The parameters of a function that can be passed by position; none where its signature is not known."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return []
+    return [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]

@@ -3,227 +3,284 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite
 from numbers import Real
-from threading import get_ident
-from typing import Any
+from typing import Any, Final
 from weakref import ref
 
 import numpy as np
+from greenlet import getcurrent, greenlet
 
-from ..decision import DIFFERENCES
 from ..errors import MaskError, RewardError
-from . import spaces as _spaces
-from .bindings import Binding
-from .switch import EVALUATING
+from ..hooks.stacks import DIFFERENCES, EVALUATING
+from ..simulation import RULE
+from .bound import BoundPoint, DeferredPolicy
+from .spaces import MASK, duplicate
+
+_NOTHING: Final[dict[str, Any]] = {}
+"""The keyword arguments of calls that have none. It is only ever unpacked."""
 
 
-class Record:
+class Agent:
     """What an episode knows of one agent.
 
     Attributes:
+        name: Its name.
+        point: The decision point at which it decides.
+        policy: The policy that answers for it; None: the environment's user.
+        deferred: Whether that policy answers many decisions at once, and so an episode waits for it.
         clock: Returns the simulation's time; None where it has none.
-        agent: Its name.
-        binding: The decision point where it decides.
-        policy: Who answers for it; None: the environment's user.
-        decided: Whether a reward has been asked for it in this episode: the first one is dropped.
+        settle: Rewards and observes the agent: see ``settling``.
+        settle_again: The same once it has decided before.
+        decided: Whether its reward mapping was asked in this episode; the first value is dropped.
         acted: Whether an action of its user was used in the latest round.
         ended: Whether its episode has ended before the simulation's.
-        news: Whether the next info is to tell of ``rule_action``.
-        handed_out: The observation that a view has given away, and which is not to be given away again.
-        followed_up: Whether something is to be done when its decision is answered.
-        observation: Its latest observation, cast to its space; None before it was ever observed.
+        present: Whether its latest info comes from an observation; False where there was nothing to observe.
         reward: The reward of its action before, as of its latest decision or its end.
+        observation: Its latest observation, cast to its space; None before its first observation.
+        handed_out: The observation that a view has given away, and which is not to be given away again.
         info: The info of its latest decision, a dict of its own.
         mask, choices: The legal actions of its pending decision, where its point restricts them.
-        offered: The choices of its latest decision, where somebody wants to know which of them the rule has taken.
+        offered: The choices of its latest decision, where the rule's decision is to be found among them.
         rule_action: The action that its latest decision by the rule corresponds to; None if that is not known.
         memory: What differences remember for it.
+        plugins: The plugins of its environment; None if it has none.
+        now, answered_at: The time of its latest decision, and of the decision before.
+        entity, rest, kwargs: The arguments of its latest decision: see ``keep``.
+        told: Whether its next info tells of ``rule_action``.
+        group, notes: What a runner of many episodes keeps of it.
     """
 
     __slots__ = (
-        "_args", "_kwargs", "_now", "_time", "_weakly", "acted", "agent", "binding", "choices", "clock", "decided",
-        "ended", "followed_up", "handed_out", "info", "mask", "memory", "news", "observation", "offered", "policy",
-        "reward", "rule_action",
+        "acted", "answered_at", "choices", "clock", "decided", "deferred", "ended", "entity", "group",
+        "handed_out", "info", "kwargs", "mask", "memory", "name", "notes", "now", "observation", "offered",
+        "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again", "told",
     )  # fmt: skip
 
-    def __init__(self, agent: str, binding: Binding, policy: Any, clock: Callable[[], float] | None) -> None:
-        self.agent = agent
-        self.binding = binding
-        self.policy = policy
-        self.clock = clock
-        self.decided = self.acted = self.ended = False
-        self._time: float | None = None
-        self._now: float | None = None
-        self.followed_up = clock is not None or binding.definition.choices is not None
-        self.observation: Any = None
+    def __init__(
+        self, name: str, point: BoundPoint, policy: Any, clock: Callable[[], float] | None, plugins: Any
+    ) -> None:
+        self.name, self.point, self.policy, self.clock = name, point, policy, clock
+        self.settle = self.settle_again = point.settle
+        self.plugins = plugins
+        self.deferred = isinstance(policy, DeferredPolicy)
+        self.decided = self.acted = self.ended = self.present = self.told = False
         self.reward = 0.0
+        self.observation: Any = None
         self.handed_out: Any = None
         self.info: dict[str, Any] = {}
         self.mask: Any = None
         self.choices: Any = None
         self.offered: Any = None
         self.rule_action: Any = None
-        self.news = False
         self.memory: dict[Any, Any] = {}
-        self._args: tuple[Any, ...] | None = None
-        self._kwargs: dict[str, Any] = {}
-        self._weakly: Any = None
+        self.group: Any = None
+        self.notes: Any = None
+        self.now: float | None = None
+        self.answered_at: float | None = None
+        self.entity: Any = None
+        self.rest: tuple[Any, ...] | None = None
+        self.kwargs: dict[str, Any] = _NOTHING
 
-    def follow_up(self) -> None:
-        """See to what is to be done when its decision is answered, if ``followed_up``."""
-        self._time = self._now
-        if self.binding.ruled is not None:
-            self.offered = self.choices
-        self.choices = None
+    # -- the arguments of its decision ------------------------------------------------------------
 
-    def decided_by_rule(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Find out which action a decision of the rule corresponds to. The arguments are those of the call.
-
-        Raises:
-            InvalidActionError: That is no action.
-        """
-        offered, self.offered = self.offered, None
-        assert self.binding.ruled is not None
-        self.rule_action = self.binding.ruled.action(decision, args, kwargs, offered)
-        self.news = self.binding.definition.rule_action_mapping is not None and self.rule_action is not None
-
-    def arguments(self) -> tuple[tuple[Any, ...], dict[str, Any]] | None:
-        """The arguments of the latest decision; None where there are none any more."""
-        args = self._args
-        if args and self._weakly is not None and args[0] is self._weakly:
-            first = self._weakly()
-            return None if first is None else ((first, *args[1:]), self._kwargs)
-        return None if args is None else (args, self._kwargs)
-
-    def hold(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    def keep(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Keep the arguments of a decision.
 
-        The first one of an entity-level point is kept weakly where it can be, so that the model can let go of
-        the entity. While its decision is pending, the simulation holds it.
+        The first one of an entity-level point is kept weakly where it can be, so that the model can let go of the
+        entity. While its decision is pending, the simulation holds it.
         """
-        self._args, self._kwargs = args, kwargs
-        if args and self.binding.agent is None:
-            first, weakly = args[0], self._weakly
-            if weakly is None or weakly() is not first:
+        self.kwargs = kwargs
+        if args and self.point.agent is None:
+            entity = self.entity
+            if entity is None or entity() is not args[0]:
                 try:
-                    self._weakly = weakly = ref(first)
+                    self.entity = ref(args[0])
                 except TypeError:
-                    self._weakly = None
+                    self.entity, self.rest = None, args
                     return
-            self._args = (weakly,) if len(args) == 1 else (weakly, *args[1:])
-
-    def forget(self) -> None:
-        """Let go of the arguments; the agent has no more to observe."""
-        self._args = self._weakly = self._time = None
-        self._kwargs = {}
-
-    def settle(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
-        """Reward the agent's action before, then observe what it decides on now, or what it ended with.
-
-        Args:
-            args: The arguments of the call that is decided on.
-            kwargs: Those passed by keyword.
-            last: Whether this is the agent's end, and nothing is decided any more.
-
-        Raises:
-            RewardError: The reward is not one finite number.
-            ObservationError: The observation does not fit its space.
-            MaskError: The mask does not fit the action space.
-        """
-        if self.decided:
-            if DIFFERENCES:
-                EVALUATING[get_ident()] = self.memory
-            reward_mapping = self.binding.reward
-            reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-            if type(reward) is not float:
-                reward = number(reward)
-            if reward - reward != 0.0:
-                raise not_finite(self, reward)
-            self.reward = reward
-        elif not last:
-            self.join(args, kwargs)
-        self.observe(args, kwargs, last=last)
-
-    def join(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Ask for the first reward, which is dropped: nothing was done yet that could be rewarded."""
-        if DIFFERENCES:
-            EVALUATING[get_ident()] = self.memory
-        reward_mapping = self.binding.reward
-        reward_mapping(*args, **kwargs)
-        if DIFFERENCES:
-            EVALUATING.pop(get_ident(), None)
-        self.decided = True
-
-    def observe(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
-        """Find out the legal actions and the time, and observe. The arguments are those of ``settle``."""
-        binding = self.binding
-        if DIFFERENCES:
-            EVALUATING[get_ident()] = self.memory
-        if binding.legal is None and self.clock is None and not binding.tells:
-            cast, observe = binding.cast, binding.observe
-            self.observation = cast(observe(*args, **kwargs) if kwargs else observe(*args))
-            self.info = {}
+            self.rest = args[1:]
         else:
-            self.info = info = {}
-            self.restrict(args, kwargs, last=last)
-            if self.mask is not None:
-                info[_spaces.MASK] = _spaces.duplicate(self.mask)
-            if self.clock is not None:
-                info |= self._passed(self.clock())
-            if binding.padded:
-                info["present"] = True
-            if self.news:
-                info["rule_action"], self.news = _spaces.duplicate(self.rule_action), False
-            self.observation = binding.observation(args, kwargs, self.mask)
-        if DIFFERENCES:
-            EVALUATING.pop(get_ident(), None)
+            self.rest = args
 
-    def unseen(self) -> dict[str, Any]:
-        """Make the info of an agent that cannot be observed: that of any other of its point, with all actions legal."""
-        info: dict[str, Any] = {"present": False} if self.binding.padded else {}
-        if self.binding.legal is not None:
-            info[_spaces.MASK] = _spaces.open_mask(self.binding.definition.action_space)
-        return info if self.clock is None else info | self._passed(self.clock())
+    def arguments(self) -> tuple[Any, ...] | None:
+        """The positional arguments of the latest decision; None where there was none, or the entity is gone."""
+        if self.entity is None:
+            return self.rest
+        first = self.entity()
+        return None if first is None else (first, *self.rest)  # type: ignore[misc]
 
-    def arise(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Find out what must be known of a decision in mid-round. The arguments are those of ``settle``."""
-        self.restrict(args, kwargs)
-        if self.clock is not None:
-            self._now = float(self.clock())
+    def release(self) -> None:
+        """Let go of the arguments; the agent has no more to observe."""
+        self.entity = self.rest = self.answered_at = None
+        self.kwargs = _NOTHING
+
+    # -- what becomes of a decision ---------------------------------------------------------------
 
     def restrict(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
-        """Find out the legal actions. The arguments are those of ``settle``."""
-        if self.binding.legal is None:
+        """Find out the legal actions of a call.
+
+        Raises:
+            MaskError: The mask does not fit the action space.
+        """
+        if self.point.legal is None:
             return
         try:
-            self.mask, self.choices = self.binding.legal(args, kwargs)
+            self.mask, self.choices = self.point.legal(args, kwargs)
         except MaskError:
             if not last:
                 raise
-            # Nothing is asked any more, and so nothing needs to be legal.
-            self.mask, self.choices = _spaces.open_mask(self.binding.definition.action_space), None
+            # At its end an agent is asked nothing more, and so nothing needs to be legal.
+            self.mask, self.choices = self.point.open_mask(), None
 
-    def _passed(self, time: Any) -> dict[str, float]:
+    def read_clock(self) -> float | None:
+        """Note the time of a decision that has arisen."""
+        if self.clock is not None:
+            self.now = float(self.clock())
+        return self.now
+
+    def answer(self, action: Any) -> Any:
+        """Turn a checked action into the reply that the simulation gets; let go of what only the decision needed.
+
+        Args:
+            action: A legal action, as ``BoundPoint.checked`` returns it, or ``RULE``, which is its own reply.
+        """
+        self.answered_at = self.now
+        choices = self.choices
+        if choices is not None:
+            self.offered, self.choices = (choices if self.point.recorded else None), None
+            return action if action is RULE else [choices[action]]
+        if action is RULE:
+            return action
+        convert = self.point.convert  # fetched before it is called: calling it at its attribute is slower
+        return convert(action)
+
+    def learn_rule_action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Find out which action a decision of the rule corresponds to.
+
+        Raises:
+            InvalidActionError: It is said to correspond to an action that is not in the action space.
+        """
+        offered, self.offered = self.offered, None
+        self.rule_action = self.point.rule_action(decision, args, kwargs, offered)
+        self.told = self.point.tells and self.rule_action is not None
+
+    # -- infos ------------------------------------------------------------------------------------
+
+    def inform(self) -> dict[str, Any]:
+        """Make the info of an observation: the time, the mask, the rule's action."""
+        info: dict[str, Any] = {} if self.clock is None else self._tell_time()
+        if self.mask is not None:
+            info[MASK] = duplicate(self.mask)
+        if self.told:
+            info["rule_action"], self.told = duplicate(self.rule_action), False
+        return info
+
+    def unsee(self) -> None:
+        """Have nothing to observe: no reward, and the info of any other agent of its point with all actions legal."""
+        self.reward, self.present = 0.0, False
+        self.info = {} if self.clock is None else self._tell_time()
+        if self.point.legal is not None:
+            self.info[MASK] = self.point.open_mask()
+
+    def _tell_time(self) -> dict[str, Any]:
         """The simulation's time, and how much of it has gone by since the agent's decision before."""
-        self._now = now = float(time)
-        return {"time": now, "elapsed": 0.0 if self._time is None else now - self._time}
+        clock: Any = self.clock
+        time, before = clock(), self.answered_at
+        self.now = now = time if type(time) is float else float(time)
+        return {"time": now, "elapsed": 0.0 if before is None else now - before}
 
 
-def number(reward: Any) -> float:
+Settle = Callable[..., None]
+"""``settle(agent, args, kwargs, reward=True, observe=True, last=False)``: see ``settling``."""
+
+
+def settling(point: BoundPoint) -> tuple[Settle, Settle]:
+    """Make what rewards and observes the agents of a decision point.
+
+    Args:
+        point: The decision point.
+
+    Returns:
+        Two functions of the agent, and of the arguments of the call that is decided on: positional, and by keyword. The
+        first takes three flags besides: whether it rewards, whether it observes, and whether this is the agent's end.
+        The second is for agents that have decided before; it leaves out what the point does not need. Both raise
+        ``RewardError``, ``ObservationError`` and ``MaskError``.
+    """
+    reward_mapping, observation_mapping, cast = point.reward_mapping, point.observation_mapping, point.cast
+    restricted, masked = point.legal is not None, bool(point.masked_parts)
+    quiet = not (restricted or point.tells)
+
+    def settle(
+        agent: Agent,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        reward: bool = True,
+        observe: bool = True,
+        last: bool = False,
+    ) -> None:
+        here = getcurrent() if DIFFERENCES else None
+        if here is not None:
+            before, EVALUATING[here] = EVALUATING.get(here), agent
+        try:
+            if reward and agent.decided:
+                agent.reward = checked_reward(agent, reward_mapping(*args, **kwargs))
+            elif reward and not last:  # nothing was done yet that could be rewarded
+                reward_mapping(*args, **kwargs)
+                agent.decided, agent.settle_again = True, again
+            if observe:
+                agent.present = True
+                if restricted:
+                    agent.restrict(args, kwargs, last=last)
+                agent.info = {} if quiet and agent.clock is None else agent.inform()
+                if masked:
+                    agent.observation = point.observe(args, kwargs, agent.mask)
+                else:
+                    agent.observation = cast(observation_mapping(*args, **kwargs))
+        finally:
+            if here is not None:
+                _evaluated(here, before)
+
+    def settle_quietly(agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        here = getcurrent() if DIFFERENCES else None
+        if here is not None:
+            before, EVALUATING[here] = EVALUATING.get(here), agent
+        try:
+            reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
+            if type(reward) is not float or reward - reward != 0.0:
+                reward = checked_reward(agent, reward)
+            agent.reward = reward
+            agent.info = {} if agent.clock is None else agent.inform()
+            agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
+        finally:
+            if here is not None:
+                _evaluated(here, before)
+
+    again = settle_quietly if quiet and not masked else settle
+    return settle, again
+
+
+def _evaluated(here: greenlet, before: Any) -> None:
+    """Nothing is evaluated for an agent on a stack any more, but for the agent before it, if there was one."""
+    if before is None:
+        del EVALUATING[here]
+    else:
+        EVALUATING[here] = before
+
+
+def checked_reward(agent: Agent, reward: Any) -> float:
     """A reward as a python float.
 
     Raises:
-        RewardError: It is not one number.
+        RewardError: It is not one finite number.
     """
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):
         raise RewardError(f"the reward {reward!r} is not one number")
     try:
-        return float(value)
+        value = float(value)
     except OverflowError:
         raise RewardError(f"the reward {reward!r} is too large for a float") from None
-
-
-def not_finite(record: Record, reward: float) -> RewardError:
-    """The error that says whose reward is infinite or no number."""
-    return RewardError(f"the reward of {record.agent!r} is {reward}, which is not finite")
+    if not isfinite(value):
+        raise RewardError(f"the reward of {agent.name!r} is {value}, which is not finite")
+    return value

@@ -1,138 +1,92 @@
-"""What an environment's simulation finds around it whenever it is at work.
-
-An environment whose options ask for surroundings enters them before anything runs for it, and leaves them
-afterwards: for each turn, and not for each switch to the simulation. All others pay nothing for that.
-"""
+"""What an environment has around it whenever something runs for it on its user's side."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from functools import partial
-from typing import Any, Final
+import os
+from contextlib import suppress
+from threading import RLock
+from typing import Any
 
-from .episode import Episode
-from .plan import Plan
-from .rounds import Rounds
-from .switch import Surrounding, attended, unattended
-
-
-class Surroundings:
-    """The surroundings of one environment's simulation, from the outermost to the innermost."""
-
-    def __init__(self, surroundings: list[Surrounding]) -> None:
-        self._surroundings = surroundings
-
-    def __bool__(self) -> bool:
-        return bool(self._surroundings)
-
-    def entered(self) -> AbstractContextManager[None]:
-        """Keep what runs apart from whatever runs around it, and in these surroundings."""
-        return _Entered(self)
-
-    def begin(self, seed: int) -> None:
-        """An episode begins."""
-        for surrounding in self._surroundings:
-            surrounding.begin(seed)
-
-    def enter(self) -> None:
-        """Put them up."""
-        done = []
-        try:
-            for surrounding in self._surroundings:
-                surrounding.enter()
-                done.append(surrounding)
-        except BaseException:
-            for surrounding in reversed(done):
-                surrounding.leave()
-            raise
-
-    def leave(self) -> None:
-        """Take them down."""
-        for surrounding in reversed(self._surroundings):
-            surrounding.leave()
-
-    def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
-        """A simulation's main loop in these surroundings, in whatever thread it runs."""
-        for surrounding in reversed(self._surroundings):
-            run = surrounding.around(run)
-        return run
+from ..errors import ReentrancyError
+from ..hooks.stacks import Evaluation, outside_simulation
+from .rng import GlobalRandom
 
 
-class _Entered(unattended):
-    __slots__ = ("_surroundings",)
+class Claim:
+    """Makes sure that one thread at a time uses an environment that any thread may use."""
 
-    def __init__(self, surroundings: Surroundings) -> None:
-        self._surroundings = surroundings
+    def __init__(self) -> None:
+        self._lock, self._process = RLock(), os.getpid()
 
     def __enter__(self) -> None:
-        super().__enter__()
+        if self._process != os.getpid():  # a fork: the thread that may have held the lock is not in this process
+            self._lock, self._process = RLock(), os.getpid()
         try:
-            self._surroundings.enter()
+            claimed = self._lock.acquire(blocking=False)
+        except BaseException:  # an interrupt
+            with suppress(RuntimeError):
+                self._lock.release()
+            raise
+        if not claimed:
+            raise ReentrancyError(
+                "the environment was used from inside its own simulation, or while another thread was stepping,"
+                " resetting or closing it; any thread may use it, but one at a time"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._lock.release()
+
+
+class at_work(outside_simulation):  # noqa: N801 - it is used like a function
+    """Keep what runs for an environment apart from what runs around it, with the environment's plugins and generators.
+
+    Needed around all that runs for an environment on its user's side, but for steps in which ``getcurrent()``
+    is the driver's ``caller`` and ``EVALUATING`` is empty.
+    """
+
+    __slots__ = ("_claim", "_driver", "_rng")
+
+    def __init__(
+        self,
+        evaluation: Evaluation | None = None,
+        rng: GlobalRandom | None = None,
+        claim: Claim | None = None,
+        driver: Any = None,
+    ) -> None:
+        """Prepare it.
+
+        Args:
+            evaluation: The environment's plugins; None if it has none.
+            rng: Its own state of the global generators; None if it has none.
+            claim: What makes sure that one thread at a time uses it; None where only one thread can.
+            driver: The driver to enter, where the simulation is going to be resumed; None where it is not.
+        """
+        super().__init__(evaluation)
+        self._rng, self._claim, self._driver = rng, claim, driver
+
+    def __enter__(self) -> None:
+        if self._claim is not None:
+            self._claim.__enter__()
+        try:
+            super().__enter__()
+            try:
+                if self._driver is not None:
+                    self._driver.enter()
+                if self._rng is not None:
+                    self._rng.enter()
+            except BaseException:
+                super().__exit__()
+                raise
         except BaseException:
-            super().__exit__()
+            if self._claim is not None:
+                self._claim.__exit__()
             raise
 
     def __exit__(self, *error: object) -> None:
         try:
-            self._surroundings.leave()
+            if self._rng is not None:
+                self._rng.leave()
         finally:
             super().__exit__()
-
-
-class Surrounded(Episode):
-    """An episode of a simulation that has surroundings, played in turns or in rounds."""
-
-    def __init__(self, plan: Plan, simulation: Any, *others: Any, surroundings: Surroundings) -> None:
-        """Prepare an episode, as ``Episode`` does."""
-        self._surroundings = surroundings
-        super().__init__(plan, simulation, *others)
-        clock = self.clock
-        if clock is not None:
-            self.clock = lambda: self._tell(clock)
-
-    def _tell(self, clock: Callable[[], float]) -> float:
-        with self._surroundings.entered():
-            return clock()
-
-    def _main_loop(self) -> Callable[[], Any]:
-        return self._surroundings.around(super()._main_loop())
-
-    def _attended(self) -> bool:
-        return False  # it has been kept apart before it entered its surroundings
-
-    def _kept_apart(self) -> AbstractContextManager[None]:
-        return self._surroundings.entered()
-
-    def turn(self, action: Any) -> None:
-        """Answer the pending decision, as ``Episode.turn`` does."""
-        if attended():
-            with unattended():
-                self.turn(action)
-            return
-        surroundings = self._surroundings
-        surroundings.enter()
-        try:
-            super().turn(action)
-        finally:
-            surroundings.leave()
-
-
-class SurroundedRounds(Surrounded, Rounds):
-    """The same in rounds."""
-
-    def play(self, actions: Mapping[str, Any]) -> None:
-        """Answer the decisions of a round, as ``Rounds.play`` does."""
-        with self._surroundings.entered():
-            super().play(actions)
-
-
-def surrounded(kind: type[Episode], surroundings: Surroundings) -> Callable[..., Episode]:
-    """What prepares an episode that is played like those of a kind, in surroundings."""
-    if kind not in _SURROUNDED:
-        _SURROUNDED[kind] = type(f"Surrounded{kind.__name__}", (Surrounded, kind), {})
-    return partial(_SURROUNDED[kind], surroundings=surroundings)
-
-
-_SURROUNDED: Final[dict[type[Episode], type[Surrounded]]] = {Episode: Surrounded, Rounds: SurroundedRounds}
-"""By kind, the kind of episodes that are played like those, in surroundings. All but rounds are played in turns."""
+            if self._claim is not None:
+                self._claim.__exit__()

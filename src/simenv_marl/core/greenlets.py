@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextvars import copy_context
-from functools import partial
+from contextlib import suppress
+from contextvars import Context, copy_context
 from sys import modules
 from threading import get_ident, local
 from typing import Any, Final
 from weakref import ref
 
-from greenlet import getcurrent, greenlet
+from greenlet import GreenletExit, getcurrent, greenlet
 
 from ..errors import WrongThreadError
+from ..hooks.hook import Hook
+from ..hooks.stacks import STACKS, Taker
 from ..simulation import RULE
-from .switch import FINISHED, RUNNING, Ask, Bound, Event, Offspring, SimulationExit, Watchful
+from .switch import BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 LOOPS: Final = "asyncio.events"
 """What knows the event loop that runs in a thread, whichever stack it runs on: a simulation's and its user's are to be
-kept apart. Where nobody has imported it, nobody runs a loop."""
+kept apart. Where it was not imported, no loop runs."""
 
 
 class _Home:
@@ -36,96 +38,98 @@ def _home() -> _Home:
     return home
 
 
-class GreenletDriver(Watchful):
-    """Runs a simulation on a greenlet of the thread in which it is made."""
+class GreenletDriver(BaseDriver):
+    """Runs a simulation on a greenlet of the thread in which the first job is started."""
 
     __slots__ = (
-        "_ask", "_body", "_get_loop", "_home", "_inside", "_switch_out", "_thread", "_users_loop", "caller", "resume",
+        "_asker", "_body", "_direct", "_get_loop", "_here", "_home", "_switch_out", "_thread", "_users_loop", "resume",
     )  # fmt: skip
 
-    def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Bound], offspring: Offspring) -> None:
-        """Prepare a greenlet; the first ``resume`` starts it.
+    def __init__(self, *, plugins: Any = None, before: BaseDriver | None = None, direct: bool = True) -> None:
+        """Prepare a greenlet, as ``BaseDriver`` does.
 
         Args:
-            run: The simulation's main loop.
-            bindings: The decision points that are handed over; all others run their rule.
-            offspring: The threads that the simulation has started or is going to.
+            plugins: The plugins of the simulation's environment.
+            before: The driver that the simulation had before.
+            direct: Whether ``resume`` may be called without anything else; no: ``caller`` stays None.
         """
-        super().__init__(bindings, offspring)
-        self._ask: Ask | None = self.ask
+        super().__init__(plugins=plugins, before=before)
+        self._direct = direct
         self._thread = get_ident()
         self._home = ref(_home())
         self._get_loop: Any = None  # found where asyncio has been imported
         self._users_loop: Any = None
-        self._body = greenlet(self._run)
-        # A new greenlet has an empty context; a model expects the one that its user has set up.
-        self._body.gr_context = copy_context()
-        self._inside: Any = self._body
-        self.resume: Callable[[Any], Event] = partial(self._body.switch, run)
-        self.caller: Any = getcurrent()
-        self._switch_out = self.caller.switch
+        self._body: Any = greenlet(self._serve)
+        self._asker: greenlet | None = None  # the greenlet of the model's own that waits for an answer
+        self._here: Any = None
+        self._switch_out: Any = None
+        self.resume: Callable[[Any], Event] = self._body.switch
 
-    def _run(self, run: Callable[[], Any], _: Any) -> Event:
-        self._inside = None  # the first decision sets ``resume`` to what resumes it
-        try:
-            self._go_in(None)
-            return self._live(run)
-        finally:
-            self._go_out()
+    # -- on the simulation's side -----------------------------------------------------------------
 
-    def ask(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """In the simulation: decide a call of a decision point."""
-        binding = self._bindings.get(point)
-        if binding is None:
-            return point.rule(*args, **kwargs)
-        if getcurrent() is not self._inside:
-            self._come_back_here()
-        switch_out = self._switch_out
-        thread = self._thread
-        # What ``_go_out`` and ``_go_in`` do, without the calls.
-        loop = None
-        get_loop = self._get_loop
-        if get_loop is None and LOOPS in modules:
-            get_loop = self._get_loop = modules[LOOPS]._get_running_loop
-        if get_loop is not None:
-            loop = get_loop()
-            if loop is not None or self._users_loop is not None:
-                self._leave_loop()
-        try:
-            del RUNNING[thread]
-            reply = switch_out(binding, args, kwargs)
-            RUNNING[thread] = self._ask  # type: ignore[assignment]  # it is only forgotten when something is thrown
-        except BaseException:
-            self._go_in(loop)
-            raise
-        if get_loop is not None and (loop is not None or get_loop() is not None):
-            self._enter_loop(loop)
-        if reply is RULE:
-            if binding.by_rule is not None:
-                return binding.by_rule(point, args, kwargs)
-            return point.rule(*args, **kwargs) if kwargs else point.rule(*args)
-        deliver = binding.deliver
-        return reply if deliver is None else deliver(reply, *args, **kwargs)
+    def _serve(self, _: Any) -> None:
+        with suppress(GreenletExit):
+            self._begin()
+            while not self._ended:
+                self._go_in(None)
+                try:
+                    event = self._work()
+                finally:
+                    self._go_out()
+                if self._ended:
+                    return  # it was let go of, and has unwound by itself
+                self._body.gr_context = None
+                self._idle = True
+                self._switch_out(*event)
 
-    def _come_back_here(self) -> None:
-        """A model may switch stacks of its own: remember the one that asks."""
-        # The stack that asks must not refer to itself, which nobody could collect.
-        self._inside = getcurrent()
-        self.resume = self._inside.switch
+    def _decider(self, hook: Hook, event: Crossing, away: bool = False) -> Taker:
+        rule, deliver, driver = self._rule_of(hook, event, away), event.deliver, self
+
+        def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            if away:
+                driver._ask_from(getcurrent())
+            switch_out = driver._switch_out
+            get_loop = driver._get_loop
+            loop = None
+            if get_loop is None:
+                if LOOPS in modules:
+                    get_loop = driver._get_loop = modules[LOOPS]._get_running_loop
+                    loop = driver._leave_loop()
+            else:
+                loop = get_loop()
+                if loop is not None or driver._users_loop is not None:
+                    driver._leave_loop()
+            try:
+                reply = switch_out(event, args, kwargs)
+            except BaseException:
+                if away and not driver._ended:
+                    driver._ask_from(None)
+                driver._go_in(loop)
+                raise
+            if away:
+                driver._ask_from(None)
+            if get_loop is not None and (loop is not None or get_loop() is not None):
+                driver._enter_loop(loop)
+            if reply is RULE:
+                return rule(*args, **kwargs) if kwargs else rule(*args)
+            return reply if deliver is None else deliver(reply, *args, **kwargs)
+
+        return decide
+
+    def _ask_from(self, asker: greenlet | None) -> None:
+        """A model may switch stacks of its own: remember the one that asks for as long as it does."""
+        self._asker = asker
+        self.resume = (self._body if asker is None else asker).switch
 
     def _go_in(self, loop: Any) -> None:
         """The simulation goes on, in the event loop in which it was."""
-        if self._ask is not None:  # else it is forgotten, and unwinds without having been asked to
-            RUNNING[self._thread] = self._ask
-            if LOOPS in modules:
-                self._enter_loop(loop)
+        if not self._ended and LOOPS in modules:  # else it unwinds without having been asked to
+            self._enter_loop(loop)
 
     def _go_out(self) -> None:
         """The simulation's user goes on, in the event loop in which that was."""
-        if self._ask is not None:
-            RUNNING.pop(self._thread, None)  # an interrupt may have taken it out already
-            if LOOPS in modules:
-                self._leave_loop()
+        if not self._ended and LOOPS in modules:
+            self._leave_loop()
 
     def _leave_loop(self) -> Any:
         events = modules[LOOPS]
@@ -141,29 +145,43 @@ class GreenletDriver(Watchful):
         if loop is not None or self._users_loop is not None:
             events._set_running_loop(loop)
 
+    # -- on its user's ----------------------------------------------------------------------------
+
+    def prepare(
+        self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
+    ) -> None:
+        """Have the next ``resume`` begin to run something on the stack."""
+        self.enter()
+        self._prepare(job, decisions, None)
+        # A new greenlet has an empty context; a model expects the one that its user has set up.
+        self._body.gr_context = copy_context() if context is None else context
+
     def enter(self) -> None:
         """Make ready to be resumed from here.
 
         Raises:
             WrongThreadError: The simulation lives in another thread.
         """
-        caller = getcurrent()
-        if caller is self.caller:
+        here = getcurrent()
+        if here is self._here:
             return
-        if not self.reachable():
+        if self._body is None or not self.reachable():
             raise WrongThreadError(
                 "the simulation is suspended in another thread, the one that has begun the episode, and only there it"
                 ' can be stepped, closed and reset; made with driver="thread", an environment can be used from any'
             )
-        self.caller, self._switch_out = caller, caller.switch
-        self._body.parent = caller  # where the simulation's end arrives
+        self._here, self._switch_out = here, here.switch
+        self._body.parent = here  # where the stack's end arrives
+        # Inside another environment's simulation, that is to be masked before each step.
+        self.caller = here if self._direct and here not in STACKS else None
 
     def throw(self) -> Event:
         """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
         self.enter()
-        if not self._body:  # it has ended, or was interrupted before it began
-            return FINISHED, None, None
-        event: Event = self._inside.throw(SimulationExit())
+        if self._idle or not self._body:  # the job has ended, or was interrupted before it began
+            self._job = None
+            return nothing_to_end()
+        event: Event = (self._asker or self._body).throw(SimulationExit())
         return event
 
     def reachable(self) -> bool:
@@ -174,16 +192,31 @@ class GreenletDriver(Watchful):
         """Whether the thread has ended in which alone the simulation could be resumed."""
         return self._home() is None
 
-    def forget(self) -> None:
-        """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
-        self._ask = None
-        self._disown()
-        del self._body, self._inside, self._switch_out, self.caller, self.resume
+    @property
+    def usable(self) -> bool:
+        """Whether a job can be started from here."""
+        return super().usable and not self._body.dead
+
+    def end(self) -> None:
+        """End the stack."""
+        if self._ended:
+            return
+        self._forget_stack()
+        body, self._body = self._body, None
+        self._asker = self._here = self._switch_out = self.caller = self.resume = None  # type: ignore[assignment]
+        if self._idle and self.reachable() and body:
+            body.parent = getcurrent()
+            body.throw()
 
     def give_up(self) -> None:
-        """Leave a simulation that does not unwind where it is."""
-        self.offspring.driver = None
+        """Leave a job that does not unwind where it is."""
+        self._forget_stack()
         _given_up.append(self)
+
+    def forked(self) -> None:
+        """The process was forked, and this is the child, in which only one thread is left."""
+        if self._thread != get_ident():
+            self._forget_stack()
 
 
 _given_up: list[GreenletDriver] = []

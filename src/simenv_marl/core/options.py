@@ -27,7 +27,7 @@ class Options:
         possible_agents: The roster, where agents are named by a callable: their names, or a dict from
             decision point to names. Declared agents are there from ``reset`` on.
         undeclared: What a decision of an agent outside the roster becomes: "error", or "rule".
-        padded: Whether everybody of the roster stands in ``agents`` from the reset to the end of an episode: also those
+        padded: Whether all agents of the roster stand in ``agents`` from the reset to the end of an episode: also those
             who are yet to be born or whom the model has removed, as agents that do not decide.
         max_steps: After how many calls of ``step`` with an action an episode is truncated; None: never.
         policies: Who decides without being an agent of the environment: from the name of an agent, or from a

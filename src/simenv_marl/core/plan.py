@@ -20,14 +20,16 @@ from ..errors import (
     UnknownPointError,
     warn_user,
 )
-from ..hooks.hook import positional
-from ..hooks.plugins import Plugged, Plugins
-from ..simulation import RULE, make_simulation
-from .bindings import Binding, Policy, Removal
+from ..hooks.hook import Hook
+from ..hooks.plugins import Plugins
+from ..hooks.stacks import outside_simulation
+from ..simulation import RULE, positional
+from .agent import settling
+from .bound import BoundPoint, DeferredPolicy, Policy
+from .drivers import Spare
+from .events import Answered, Decision, Removed, Told
 from .options import Options
-from .points import NamedPoint, Site, find_point, find_points, have_instances, locate, owner_class, portable, stand_ins
-from .rng import GlobalRandom
-from .switch import Surrounding, unattended
+from .points import NamedPoint, find_point, find_points, have_instances, locate, owner_class, portable, stand_ins
 from .variant import Variant
 
 RENDER_MODES = ("ansi", "human", "rgb_array")
@@ -42,16 +44,18 @@ class Plan:
         variant: The variant that it is made of; None if it is of none.
         options: Its options.
         render_modes: What its simulation can be rendered as.
-        bindings: Of decision points that do not run their rule, all that is known (a ``Binding``); and what else the
-            user's side is told of: functions that remove agents (``Removal``), what rules have decided (``Ruled``).
-        policies: By name: who answers the decisions of agents that are no agents of the environment.
-        roster: By name: the agents that are known beforehand, in the order of the points.
+        points: The decision points that do not run their rule.
+        active: Those of them that the environment's user answers.
+        events: By decision point, what crosses from the simulation when it is called.
+        decisions: The same by the point's hook, for drivers.
+        policies: By name: the policies of agents that are no agents of the environment.
+        roster: By name: the points of the agents that are known beforehand, in the order of the points.
         complete: Whether no others may join.
         unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
-        asked: Of what kind are the policies whose agents are agents of the environment all the same, with rewards and
-            ends, because somebody else asks these policies; None: there are no such.
+        rewarded: Whether agents that deferred policies answer are agents of the environment all the same, with rewards
+            and ends.
         plugins: The handlers for its simulation alone; None if it has none.
-        sites: Where decision functions must be set while the environment is in use.
+        hooks: Of what must be set in the model while the environment is in use.
     """
 
     def __init__(
@@ -62,8 +66,8 @@ class Plan:
         render_modes: list[str],
         *,
         unanswered: bool = False,
-        asked: type | None = None,
-        spare: list[Any] | None = None,
+        rewarded: bool = False,
+        spare: list[Spare] | None = None,
         variant: Variant | None = None,
     ) -> None:
         self.source, self.options, self._named = source, options, named
@@ -74,42 +78,76 @@ class Plan:
             raise OptionValueError(
                 f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
             )
-        self.unanswered, self.asked = unanswered, asked
+        self.unanswered, self.rewarded = unanswered, rewarded
         agents = _name_agents(named)
         by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
         everything = [*named, *extra]
-        self.bindings: dict[Any, Any] = {}
-        active: list[Binding] = []
+        self.points: list[Any] = []
+        self.active: list[BoundPoint] = []
         for point, agent in zip(everything, _name_agents(everything), strict=True):
             policy = by_point.get(point.point)
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
-            if policy is RULE and not excepted:
-                continue  # nobody needs to be asked
-            binding = self.bindings[point.point] = Binding(
-                point, agent, policy, recorded=asked is not None, padded=options.padded
-            )
-            if self._is_asked(agent, policy) if asked is not None else policy is None and agent not in self.policies:
-                active.append(binding)
-        self.active = active
-        self.sites: list[Site] = [point.site for point in everything if point.site is not None]
-        for bound in list(self.bindings.values()):
+            if policy is not RULE or excepted:  # else its rule decides
+                self._bind(point, agent, policy)
+        self.hooks: list[Hook] = [point.point.hook for point in everything]
+        self.events: dict[Any, Any] = {}
+        for bound in self.points:
+            self.events[bound.point] = bound
+        for bound in self.points:
             for other in stand_ins(bound.point):
-                self.bindings.setdefault(other, bound)
+                self.events.setdefault(other, bound)
         self._find_removals()
-        for bound in list(self.bindings.values()):
-            if isinstance(bound, Binding) and bound.ruled is not None:
-                self.bindings[bound.ruled] = bound.ruled
+        self.decisions = {point.hook: event for point, event in self.events.items()}
         self.plugins = Plugins(options.plugins) if options.plugins else None
-        if not active and not unanswered:
+        if not self.active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
-        self.roster: dict[str, Binding] = {}
+        self.roster: dict[str, BoundPoint] = {}
         self.complete = False
-        if asked is not None:
-            self.roster = {binding.agent: binding for binding in active if binding.agent is not None}
+        if rewarded:
+            self.roster = {point.agent: point for point in self.active if point.agent is not None}
         else:
-            roster, self.complete = _call_the_roll(active, options.possible_agents)
+            roster, self.complete = _call_the_roll(self.active, options.possible_agents)
             if not unanswered:
-                self.roster = {name: binding for name, binding in roster.items() if name not in self.policies}
+                self.roster = {name: point for name, point in roster.items() if name not in self.policies}
+
+    def _bind(self, named: NamedPoint, agent: str | None, policy: Any) -> None:
+        """Bind a decision point that does not run its rule."""
+        policies = [policy, *self.policies.values()] if agent is None else [self.policies.get(agent, policy)]
+        if self.rewarded:
+            active = any(isinstance(policy, DeferredPolicy) for policy in policies)
+        else:
+            active = policy is None and agent not in self.policies
+        kind: Any = Answered if policy is not None and not active else Decision
+        bound = kind(named, agent, policy, recorded=self.rewarded)
+        bound.settle, _ = settling(bound)
+        bound.told = Told(bound) if bound.recorded else None
+        self.points.append(bound)
+        if active:
+            self.active.append(bound)
+
+    def policy_of(self, agent: str, point: BoundPoint) -> Any:
+        """The policy of an agent; None: the environment's user.
+
+        Raises:
+            AgentError: The agent is not declared, and the environment asks for that.
+        """
+        policy = self.policies.get(agent) or point.policy
+        if policy is not None:
+            return policy
+        if self.unanswered:
+            return RULE
+        if not self.complete or agent in self.roster:
+            return None
+        if self.options.undeclared == "rule":
+            return RULE
+        raise AgentError(
+            f"the agent {agent!r}, which decides at {point.point.name}, is not declared in possible_agents; declare"
+            ' it, or let its rule decide with undeclared="rule"'
+        )
+
+    def is_active(self, policy: Any) -> bool:
+        """Whether an agent with that policy is an agent of the environment."""
+        return policy is None or (self.rewarded and isinstance(policy, DeferredPolicy))
 
     @property
     def possible_agents(self) -> list[str] | None:
@@ -117,28 +155,16 @@ class Plan:
         return list(self.roster) if self.complete else None
 
     @property
-    def patches(self) -> list[Site | Plugins]:
+    def patches(self) -> list[Hook | Plugins]:
         """What must be set in the model while an environment is in use."""
-        return [*self.sites] if self.plugins is None else [*self.sites, self.plugins]
-
-    def surroundings(self) -> list[Surrounding]:
-        """What the simulation of one environment is to find around it, from the outermost to the innermost."""
-        found: list[Surrounding] = [GlobalRandom()] if self.options.global_rng else []
-        return found if self.plugins is None else [*found, Plugged(self.plugins)]
-
-    def _is_asked(self, agent: str | None, policy: Any) -> bool:
-        """Whether somebody else may ask a policy at a point of that agent (None: of many) and with that policy."""
-        assert self.asked is not None
-        policies = [self.policies.get(agent, policy)] if agent is not None else [policy, *self.policies.values()]
-        return any(isinstance(policy, self.asked) for policy in policies)
+        return [*self.hooks] if self.plugins is None else [*self.hooks, self.plugins]
 
     def _find_removals(self) -> None:
-        for binding in dict.fromkeys(self.bindings.values()):
-            assert isinstance(binding, Binding)
+        for binding in self.points:
             for name, agent in binding.definition.removed_by.items():
-                point, _, site = locate(name)
-                removal = self.bindings.setdefault(point, Removal(point))
-                if not isinstance(removal, Removal):
+                point, _ = locate(name)
+                removal = self.events.setdefault(point, Removed(point))
+                if not isinstance(removal, Removed):
                     raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
                 owner, remover = owner_class(binding.point), owner_class(point)
                 if agent is None and point.bound and owner and remover and not have_instances(owner, remover):
@@ -148,8 +174,8 @@ class Plan:
                         " of the call's arguments that names the agent"
                     )
                 removal.of.append((binding, agent, owner))
-                if site is not None and site not in self.sites:
-                    self.sites.append(site)
+                if point.hook not in self.hooks:
+                    self.hooks.append(point.hook)
 
     @classmethod
     def draw_up(
@@ -159,7 +185,7 @@ class Plan:
         options: Mapping[str, Any],
         *,
         unanswered: bool = False,
-        asked: type | None = None,
+        rewarded: bool = False,
     ) -> Plan:
         """Make a plan of what users say.
 
@@ -168,7 +194,7 @@ class Plan:
             points: The active decision points, as ``generate_env`` takes them.
             options: The options, by name.
             unanswered: Whether there is no environment's user.
-            asked: Of what kind are the policies whose agents are agents of the environment all the same.
+            rewarded: Whether agents that deferred policies answer are agents of the environment all the same.
 
         Raises:
             SimEnvError: Something in them cannot work; the leaf says what.
@@ -177,16 +203,18 @@ class Plan:
         if variant is not None:
             source, points, options = variant.applied(points, options)
         checked = Options().amended(options)
-        model, spare = source, []
+        model: Any = source
+        spare: list[Spare] = []
         plain_factory = not isinstance(source, type) and not hasattr(source, "run")
         if plain_factory or (points is None and getattr(source, "points", None) is None):
-            with unattended():
-                model = make_simulation(source)
-            spare.append(model)
+            with outside_simulation():
+                made = Spare(source, checked.driver)
+            spare.append(made)
+            model = made.simulation
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
         named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
         return cls(
-            source, named, checked, list(modes), unanswered=unanswered, asked=asked, spare=spare, variant=variant
+            source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded, spare=spare, variant=variant
         )
 
     def __deepcopy__(self, memory: Any) -> Plan:
@@ -201,25 +229,22 @@ class Plan:
         options["plugins"] = [] if self.plugins is None else self.plugins.portable
         return _remade, (self.source, points, options, self.variant, self.unanswered)
 
-    def make_simulation(self) -> Any:
-        """Make a simulation for one environment.
-
-        Raises:
-            SimulationError: The source makes none.
-        """
-        if self._spare and not (self.plugins or self.options.global_rng):  # which it was made without
-            try:
-                return self._spare.pop()
-            except IndexError:  # another thread was faster
-                pass
-        return make_simulation(self.source)
+    def spare(self) -> Spare | None:
+        """The simulation that was made to be looked at, with its stack, if it serves an environment of this plan."""
+        if self.plugins or self.options.global_rng:  # which it was made without
+            return None
+        try:
+            spare = self._spare.pop()
+        except IndexError:  # there is none, or another thread was faster
+            return None
+        return spare if spare.kind == self.options.driver else None
 
     def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
         """The same plan, with another definition of a point."""
         named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
         return self._like(named, self.options)
 
-    def declared(self, roster: Mapping[str, Binding]) -> Plan:
+    def declared(self, roster: Mapping[str, BoundPoint]) -> Plan:
         """The same plan, with a roster of agents that has been found out."""
         names: dict[str, list[str]] = {b.point.name: [] for b in self.active if b.agent is None}
         for agent, binding in roster.items():
@@ -230,7 +255,7 @@ class Plan:
     @property
     def stale(self) -> bool:
         """Whether a function that it patches has been replaced by another one since it was made."""
-        return any(site.stale for site in self.sites) or (self.plugins is not None and self.plugins.stale)
+        return any(hook.stale for hook in self.hooks) or (self.plugins is not None and self.plugins.stale)
 
     @property
     def name(self) -> str:
@@ -286,10 +311,10 @@ def _name_agents(named: list[NamedPoint]) -> list[str | None]:
     return names
 
 
-def _call_the_roll(active: list[Binding], declared: Any) -> tuple[dict[str, Binding], bool]:
+def _call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, BoundPoint], bool]:
     """Find out which agents are known beforehand, and whether these are all."""
     named = [binding for binding in active if binding.agent is None]
-    names: dict[Binding, list[Any]] = {}
+    names: dict[BoundPoint, list[Any]] = {}
     if isinstance(declared, Mapping):
         for key, value in declared.items():
             point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
@@ -307,7 +332,7 @@ def _call_the_roll(active: list[Binding], declared: Any) -> tuple[dict[str, Bind
                 f" {len(named)} points name their agents by a callable"
             )
         names = dict.fromkeys(named, others)
-    roster: dict[str, Binding] = {}
+    roster: dict[str, BoundPoint] = {}
     for binding in active:
         for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
             if not isinstance(name, str) or name in roster:
@@ -334,7 +359,7 @@ def _assign(
                 point = find_point(key)
             except SimEnvError as error:
                 if policy is RULE and isinstance(error, DefinitionError):
-                    continue  # nobody decides there anyway
+                    continue  # its rule decides there anyway
                 if isinstance(key, str) and isinstance(error, UnknownPointError) and None in agents:
                     by_agent[key] = policy  # an agent that a callable may name
                     continue

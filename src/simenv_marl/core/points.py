@@ -1,7 +1,7 @@
 """Finding decision points: what ``points=`` names.
 
-Where an environment names an undecorated function, a decision function is set at its place for as long as an
-environment needs it: a *site*. For everybody else it runs what it replaced.
+Where an environment names an undecorated function, the hook of that place is held for as long as the environment
+needs it: for all others the function stays what it was.
 """
 
 from __future__ import annotations
@@ -10,27 +10,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from sys import modules
 from types import FunctionType
-from typing import Any, ClassVar, Final
-from weakref import WeakValueDictionary
+from typing import Any, Final
 
-from ..decision import DecisionPoint, Definition, point_of, registered, registered_names, unbind, unwrapped
+from ..decision import DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
 from ..errors import DefinitionError, PatchError, UnknownPointError
-from ..hooks.hook import beneath, exposure
+from ..hooks.attached import title
+from ..hooks.hook import Hook, beneath, hook_of
 from ..hooks.places import (
-    DECIDED,
-    Place,
     Purpose,
     all_classes,
     found_at,
     held_at,
+    hook_at,
     leads_there,
     owner_at_hand,
     plain,
     resolve,
-    title,
+    unbind,
 )
 
-POINT: Final = Purpose("decision point", UnknownPointError, registered_names)
+POINT: Final = Purpose("decision point", UnknownPointError, decision_points)
 
 
 @dataclass(frozen=True)
@@ -40,12 +39,10 @@ class NamedPoint:
     Attributes:
         point: What is asked.
         definition: How the environment decides it.
-        site: Where it is to be patched in; None for a decorated function, which needs no patching.
     """
 
     point: DecisionPoint
     definition: Definition
-    site: Site | None
 
     @property
     def key(self) -> Any:
@@ -55,14 +52,14 @@ class NamedPoint:
     @property
     def own_definition(self) -> Definition | None:
         """Its definition; None where that is the one which it was decorated with, and which comes along with it."""
-        return None if self.site is None and self.definition is self.point.definition else self.definition
+        return None if self.definition is self.point.definition else self.definition
 
 
 def portable(key: Any, name: str | None = None) -> Any:
     """What names a function in another process: its dotted name, if that is sure to lead to it there.
 
     Args:
-        key: A function, or whatever somebody has named.
+        key: A function, or what a user has named.
         name: Its dotted name, if that is known.
     """
     function = unwrapped(key)
@@ -79,7 +76,7 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
         points: A dotted name, a function, a list of these, or a dict from these to definitions. None: the
             attribute ``points`` of the simulation, else all decorated points.
         simulation: The simulation.
-        required: Whether all decorated points are meant where nobody names any, and not none.
+        required: Whether all decorated points are meant where none is named, and not none.
 
     Returns:
         The points, in the order in which they were named.
@@ -124,24 +121,24 @@ def find_point(key: Any, definition: Any = None) -> NamedPoint:
     """
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {definition!r}")
-    point, own, site = locate(key)
+    point, own = locate(key)
     definition = definition or own or point.definition
     if definition is None:
         raise DefinitionError(
             f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="
             f"{{{point.name!r}: make_step(...)}}"
         )
-    return NamedPoint(point, definition, site)
+    return NamedPoint(point, definition)
 
 
-def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
+def locate(key: Any) -> tuple[DecisionPoint, Definition | None]:
     """Find the point of a function, whether it has a definition or not.
 
     Args:
         key: A dotted name, or a function.
 
     Returns:
-        The point; the definition that the function itself was decorated with; its site, if it needs one.
+        The point; the definition that the function itself was decorated with.
 
     Raises:
         UnknownPointError: The name leads to nothing.
@@ -149,22 +146,17 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
     """
     if isinstance(key, str):
         return _locate_name(key)
-    given, _ = unbind(key)
-    place = getattr(exposure(given), "place", None)
-    if place is not None:  # fetched while handlers were set in front of it
-        return _locate_name(place.name) if place.stale else _look_at(place.name, place.owner, place.attribute)
-    function = beneath(given)
-    known = point_of(function)
-    if known is not None:
-        site = Site.of(known[0])
-        if site is None and known[0].definition is None:  # of a patch that is no longer there
-            return _locate_name(known[0].name)
-        return (*known, site)
+    function, _ = unbind(key)
+    hook = hook_of(function)
+    if hook is not None:
+        if not hook.for_good and hook.stale:  # fetched while it was set for a while
+            return _locate_name(hook.name)
+        return point_of(function) or _point_at(hook)
     name = f"{function.__module__}.{function.__qualname__}"
     owner: Any
     try:
         owner, attribute = resolve(name, POINT)
-        found = unwrapped(held_at(owner, attribute)) is function
+        found = beneath(plain(held_at(owner, attribute))) is function
     except (UnknownPointError, PatchError):
         found = False
     if not found:  # the function is at hand, though not by its name
@@ -172,34 +164,36 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None, Site | None]:
     return _look_at(name, owner, attribute)
 
 
-def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
+def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None]:
     point = registered(name)
     try:
         owner, attribute = resolve(name, POINT)
     except (UnknownPointError, PatchError):
         if point is None:
             raise
-        return point, None, Site.of(point)  # decorated inside a function, or not yet where it will be found
-    found = _look_at(name, owner, attribute) if point is None or _is_decided(owner, attribute) else None
-    if found is None or found[0] is point:
-        assert point is not None
-        return point, None, Site.of(point)
-    return found[0], found[0].definition or found[1], found[2]
+        return point, None  # decorated inside a function, or not yet where it will be found
+    if point is not None and point_of(plain(held_at(owner, attribute))) is None:
+        return point, None
+    found, own = _look_at(name, owner, attribute)
+    return (found, None) if found is point else (found, found.definition or own)
 
 
-def _is_decided(owner: Any, attribute: str) -> bool:
-    held = held_at(owner, attribute)
-    return point_of(plain(held)) is not None
-
-
-def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None, Site | None]:
-    held = held_at(owner, attribute)
-    known = point_of(plain(held))
+def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None]:
+    known = point_of(plain(held_at(owner, attribute)))
     if known is not None and attribute in vars(owner):
-        return (*known, Site.of(known[0]))
-    site = Site.at(name, owner, attribute)
+        if not known[0].hook.for_good and known[0].hook.place.passes_on:
+            own = point_of(plain(found_at(owner, attribute)))
+            return known[0], (own[1] or own[0].definition) if own else None
+        return known
+    hook = hook_at(name, owner, attribute, POINT)
     known = known or point_of(plain(found_at(owner, attribute)))
-    return site.point, (known[1] or known[0].definition) if known else None, site  # decorated in a base class
+    return _point_at(hook)[0], (known[1] or known[0].definition) if known else None  # decorated in a base class
+
+
+def _point_at(hook: Hook) -> tuple[DecisionPoint, None]:
+    if not isinstance(hook.function, FunctionType):
+        raise PatchError(f"{hook.name} cannot be a decision point: what it exposes is no function written in Python")
+    return point_for(hook), None
 
 
 def stand_ins(point: DecisionPoint) -> list[DecisionPoint]:
@@ -221,7 +215,7 @@ def _decorated_places(point: DecisionPoint) -> set[Any]:
     """The classes and modules that have a decision function of the point under the function's own name."""
     name, wrappers = point.rule.__name__, set(point.wrappers)
     owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
-    found = ((owner, beneath(plain(vars(owner).get(name)))) for owner in owners)
+    found = ((owner, plain(vars(owner).get(name))) for owner in owners)
     return {owner for owner, function in found if isinstance(function, FunctionType) and function in wrappers}
 
 
@@ -240,7 +234,7 @@ def owner_class(point: DecisionPoint) -> type | None:
 
 
 def _all_registered() -> list[str]:
-    names = registered_names()
+    names = decision_points()
     packages = sorted({name.partition(".")[0] for name in names})
     if not names:
         raise UnknownPointError("there is no decision point: decorate a function with make_step or name points=")
@@ -250,56 +244,3 @@ def _all_registered() -> list[str]:
             " meant with points=, or with an attribute points of the simulation"
         )
     return names
-
-
-class Site:
-    """A place at which a decision function is set while an environment needs it.
-
-    There is one for each place, shared by all environments, however long any of them needs it.
-    """
-
-    _all: ClassVar[WeakValueDictionary[Place, Site]] = WeakValueDictionary()
-
-    def __init__(self, place: Place) -> None:
-        if not isinstance(place.function, FunctionType):
-            raise PatchError(
-                f"{place.name} cannot be a decision point: what it exposes is no function written in Python"
-            )
-        self._place = place
-        self.point = DecisionPoint(place.rule, place.name, bound=place.binding is not staticmethod, like=place.function)
-        self._wrapper = self.point.wrap(None)
-
-    @classmethod
-    def at(cls, name: str, owner: Any, attribute: str) -> Site:
-        """The site of an attribute of a class or module.
-
-        Raises:
-            PatchError: What stands there cannot be patched.
-        """
-        place = Place.at(name, owner, attribute, POINT)
-        site = cls._all.get(place)
-        if site is None:
-            site = cls._all[place] = cls(place)
-        return site
-
-    @classmethod
-    def of(cls, point: DecisionPoint) -> Site | None:
-        """The site at which a point is patched in; None for a decorated point."""
-        return next((site for site in cls._all.values() if site.point is point), None)
-
-    @property
-    def stale(self) -> bool:
-        """Whether something else has been set there, while nothing of ours was."""
-        return self._place.stale
-
-    def hold(self) -> None:
-        """Have the decision function set until as many calls of ``let_go``.
-
-        Raises:
-            PatchError: The place refuses, or something else has been set there meanwhile.
-        """
-        self._place.hold(DECIDED, lambda _: self._wrapper)
-
-    def let_go(self) -> None:
-        """Undo one ``hold``; the last one takes the decision function away."""
-        self._place.let_go(DECIDED)

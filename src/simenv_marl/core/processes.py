@@ -23,8 +23,7 @@ import cloudpickle
 
 from ..decision import DecisionPoint, Definition, point_of, unwrapped
 from ..errors import WorkerError, annotate
-from ..hooks.hook import DECISION, EXPOSED, stands_in
-from ..hooks.plugins import expose_to_plugins
+from ..hooks.hook import Hook, hook_of, made_with
 
 
 def pack(thing: Any) -> bytes:
@@ -127,12 +126,8 @@ def _reduced(thing: Any) -> tuple[Any, ...] | None:
         return _found_at, (thing.__module__, thing.__qualname__)
     if there is not None and unwrapped(there) is thing:
         return _rule_at, (thing.__module__, thing.__qualname__)
-    if stands_in(thing, DECISION):
-        point, definition = point_of(thing)  # type: ignore[misc]
-        return _restore_decision, (_token(thing), point, definition)
-    if stands_in(thing, EXPOSED):
-        return _restore_exposed, (_token(thing), thing.__globals__["rule"])
-    return None
+    hook = hook_of(thing)
+    return None if hook is None else (_restore_stand_in, (_token(thing), hook, made_with(thing)))
 
 
 def _found_at(module: str, path: str, *, bound: bool = False) -> Any:
@@ -177,9 +172,5 @@ def _restored(token: str, make: Callable[[], Any]) -> Any:
     return thing
 
 
-def _restore_decision(token: str, point: DecisionPoint, definition: Definition | None) -> Any:
-    return _restored(token, lambda: point.wrap(definition))
-
-
-def _restore_exposed(token: str, function: Any) -> Any:
-    return _restored(token, lambda: expose_to_plugins(function))
+def _restore_stand_in(token: str, hook: Hook, definition: Definition | None) -> Any:
+    return _restored(token, lambda: hook.stand_in(definition))

@@ -58,7 +58,7 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
         if option.name not in ("plugins", "policies") and getattr(plan.options, option.name) != option.default
     }
     policies = plan.options.policies or {}
-    points = {binding.point.name: binding.agent for binding in plan.active}
+    points = {point.point.name: point.agent for point in plan.active}
     packages = sorted({dotted.partition(".")[0] for dotted in (name, *points)})
     return {
         "simulation": name,

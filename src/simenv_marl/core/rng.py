@@ -1,8 +1,8 @@
 """A state of Python's and NumPy's global generators for each environment that asks for one.
 
-Models that draw from ``random`` and ``numpy.random`` share one state with everybody in the process. With
+Models that draw from ``random`` and ``numpy.random`` share one state with all else in the process. With
 ``global_rng=True`` an environment's simulation finds a state of its own there whenever it is at work, and its user
-finds theirs again afterwards. Whoever's state is in place *owns* the generators; there is always one owner.
+finds theirs again afterwards. The one whose state is in place *owns* the generators; there is always one owner.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class State(Protocol):
         """Put it in place."""
 
     def separate(self) -> None:
-        """Share it with nobody any more, who might go on drawing from it."""
+        """Share it with nothing that might go on drawing from it."""
 
 
 class PortableState:
@@ -54,7 +54,7 @@ class PortableState:
         np.random.set_state(self._numpy)
 
     def separate(self) -> None:
-        """Share it with nobody any more."""
+        """Share it no more."""
         self._generator = _copied(self._generator)
 
 
@@ -79,7 +79,7 @@ class SwiftState:
         memmove(id(_numpy) + self.gauss_at, self._gauss, 16)
 
     def separate(self) -> None:
-        """Share it with nobody any more."""
+        """Share it no more."""
         self._generator = _copied(self._generator)
 
 
@@ -130,7 +130,7 @@ _State: Final[Callable[[], State]] = SwiftState if _is_swift() else PortableStat
 
 
 class _Owner:
-    """Somebody whose state of the global generators is kept apart from all others'.
+    """An owner of the global generators, whose state is kept apart from all others'.
 
     Attributes:
         state: It, while it is not in place.
@@ -184,7 +184,7 @@ class GlobalRandom:
             self._owner.threads.clear()
 
     def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
-        """The simulation's main loop. The state is in place, whatever thread it runs in, while its user waits."""
+        """What the simulation's stack runs. The state is in place, whatever thread that is, while its user waits."""
         threads = self._owner.threads
 
         def run_and_tell() -> Any:

@@ -6,30 +6,27 @@ is abandoned in mid-episode goes at once and takes its session along.
 
 from __future__ import annotations
 
-from collections import deque
-from contextlib import AbstractContextManager
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
+from contextvars import Context, copy_context
+from functools import partial
+from typing import Any
 from zlib import crc32
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import seeding
 
-from ..errors import (
-    BranchError,
-    ClosedError,
-    NotResetError,
-    OptionValueError,
-    ReentrancyError,
-    annotate,
-    warn_user,
-)
-from ..simulation import resetter
-from .contexts import Surroundings, surrounded
-from .episode import LOST, MOST_TAKEN, Episode
+from ..errors import BranchError, OptionValueError, annotate, warn_user
+from ..simulation import make_simulation, resetter
+from .contexts import Claim, at_work
+from .drivers import DRIVERS, run_job
+from .ending import refusal
+from .episode import LONGEST_TAPE, LOST, Episode, When
 from .plan import Plan
-from .switch import Offspring, preparing, unattended
-
-AnyEpisode = TypeVar("AnyEpisode", bound=Episode)
+from .rng import GlobalRandom
+from .spaces import same
+from .switch import BaseDriver
 
 
 class Session:
@@ -40,7 +37,8 @@ class Session:
         simulation: The simulation.
         seed: The seed of the latest episode.
         options: What the latest ``reset`` of the environment was given.
-        kind: How the latest episode was played.
+        episode: The episode that goes on, or was the latest; None before the first one, and once it was closed.
+        np_random_seed: What ``np_random`` was seeded with; -1 where it was set.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -53,79 +51,143 @@ class Session:
         self.plan = plan
         self.seed: int | None = None
         self.options: dict[str, Any] | None = None
-        self.kind: type[Episode] = Episode
-        self._episode: Episode | None = None
+        self.episode: Episode | None = None
+        self.np_random_seed: int | None = None
+        self._np_random: np.random.Generator | None = None
         self._closed = False
         self._starting = False
         self._held: list[Any] = []  # what is set, and is to be put back
-        self._surroundings = Surroundings(plan.surroundings())
-        self._offspring = Offspring()
+        self._rng = GlobalRandom() if plan.options.global_rng else None
+        self._claim = Claim() if plan.options.driver == "thread" else None
+        self._driver: BaseDriver | None = None
+        self.simulation: Any = None
         self._hold_patches()
         try:
-            with self.at_work(), preparing(self._offspring):
-                self.simulation = plan.make_simulation()
+            spare = plan.spare()
+            if spare is None:
+                self._make_simulation()
+            else:
+                self._driver, self.simulation = spare.taken()
                 self._reset = resetter(self.simulation)
         except BaseException:
+            self._end_stack()
             self._let_go_of_patches()
             raise
+
+    # -- the simulation's stack -------------------------------------------------------------------
+
+    def _make_simulation(self) -> None:
+        with self.at_work():
+            self.simulation = self._run(lambda: make_simulation(self.plan.source))
+        self._reset = resetter(self.simulation)
+
+    def _run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
+        """Run something on the simulation's stack, in which nothing is decided."""
+        return run_job(self._usable_driver(), job if self._rng is None else self._rng.around(job), context)
+
+    def _usable_driver(self) -> BaseDriver:
+        """The simulation's stack, or a new one where that has ended or is another thread's."""
+        before = self._driver
+        if before is None or not before.usable:
+            make = DRIVERS[self.plan.options.driver]
+            # Generators of the simulation's own must be put in place around each step.
+            self._driver = make(plugins=self.plan.plugins, before=before, direct=self._rng is None)
+            if before is not None:
+                before.end()
+        assert self._driver is not None
+        return self._driver
+
+    def _end_stack(self) -> None:
+        if self._driver is not None:
+            self._driver.end()
+
+    def at_work(self) -> AbstractContextManager[None]:
+        """Keep what runs for the environment apart from what runs around it."""
+        return at_work(self.plan.plugins, self._rng, self._claim)
+
+    def _claimed(self) -> AbstractContextManager[None]:
+        return nullcontext() if self._claim is None else self._claim
+
+    # -- episodes ---------------------------------------------------------------------------------
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator that the last given seed has seeded, and from which other seeds are drawn."""
+        if self._np_random is None:
+            self._np_random, self.np_random_seed = seeding.np_random(self.np_random_seed)
+        return self._np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self._np_random, self.np_random_seed = generator, -1
 
     def start(
         self,
         seed: int | None,
         options: dict[str, Any] | None,
-        generator: np.random.Generator,
-        kind: type[AnyEpisode],
-    ) -> AnyEpisode:
+        when: When,
+        script: Iterable[Any] = (),
+    ) -> Episode:
         """End the episode that runs, reset the simulation, and run it to its first decision.
 
         Args:
             seed: The seed to reset it with; None: one is drawn.
             options: What the environment's ``reset`` was given.
-            generator: What a seed is drawn from.
-            kind: How the episode is played: in turns or in rounds.
+            when: When agents are settled.
+            script: The tape of another episode, which is to be replayed.
 
         Raises:
             NoDecisionError: The simulation ended without one.
             BaseException: What the model raises.
         """
-        self.end()
-        try:
-            self._closed, self._starting = False, True
-            return self._begin(seed, options, generator, kind)
-        finally:
-            self._starting = False
+        with self._claimed():
+            self.end()
+            try:
+                self._closed, self._starting = False, True
+                return self._begin(seed, options, when, script)
+            finally:
+                self._starting = False
 
     def _begin(
         self,
         seed: int | None,
         options: dict[str, Any] | None,
-        generator: np.random.Generator,
-        kind: type[AnyEpisode],
-        foretold: deque[Any] | None = None,
-    ) -> AnyEpisode:
+        when: When,
+        script: Iterable[Any],
+    ) -> Episode:
         self._hold_patches()
-        self.options, self.kind = options, kind
-        self.seed = int(generator.integers(2**31)) if seed is None else seed
+        self.options = options
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        else:
+            self._np_random, self.np_random_seed = None, seed  # made when a seed is drawn from it
+        self.seed = seed
+        if self._driver is not None and self._driver.given_up is not None:
+            self._make_simulation()  # what was given up may still be using the one before
+        context = copy_context()
         try:
-            with self.at_work(), preparing(self._offspring):
-                self._surroundings.begin(self.seed)
-                self._reset(self.seed, options)
+            with self.at_work():
+                if self._rng is not None:
+                    self._rng.begin(seed)
+                self._run(partial(self._reset, seed, options), context)
         except BaseException as error:
-            annotate(error, f"simenv_marl: while the simulation was reset; seed {self.seed}")
+            annotate(error, f"simenv_marl: while the simulation was reset; seed {seed}")
             raise
-        prepare: Any = surrounded(kind, self._surroundings) if self._surroundings else kind
-        episode: AnyEpisode = prepare(self.plan, self.simulation, self.seed, self._offspring, foretold)
+        driver = self._usable_driver()
+        run = self.simulation.run if self._rng is None else self._rng.around(self.simulation.run)
+        driver.prepare(run, self.plan.decisions, context)
+        episode = Episode(self.plan, self.simulation, driver, seed, when, (self._rng, self._claim), script)
         try:
-            self._episode = episode  # whenever an interrupt comes from now on, its end is seen to
+            self.episode = episode  # whenever an interrupt comes from now on, its end is seen to
             episode.begin()
         except BaseException:
             episode.over = True  # it may have been interrupted before it could say so
             if episode.unwound:
-                self._episode = None
+                self.episode = None
             raise
         return episode
 
-    def replay(self, other: Session) -> Any:
+    def replay(self, other: Session) -> Episode:
         """Bring the simulation to where another session's, of the same plan, stands in mid-episode.
 
         Returns:
@@ -135,19 +197,21 @@ class Session:
             BranchError: It cannot be brought there.
             BaseException: What the model raises.
         """
-        episode = other._episode
+        episode = other.episode
         if episode is None or episode.pending is None:
-            raise other.not_running() if episode is None else episode.nothing_pending()
-        if episode.taken is LOST or episode.consulted is LOST:
+            raise other.refusal()
+        if episode.tape is LOST:
             raise BranchError(
-                f"the episode has had more than {MOST_TAKEN:,} decisions, and its actions were not kept; use"
+                f"the episode has had more than {LONGEST_TAPE:,} decisions, and its actions were not kept; use"
                 ' method="fork"'
             )
-        self.end()
-        self._closed = False
-        again = self._begin(other.seed, other.options, np.random.default_rng(), other.kind, deque(episode.consulted))
-        again.replay(episode.taken)
-        if again.pending is None or not again.stands_as(episode):
+        generator = self.kept()
+        again = self.start(other.seed, other.options, episode.when, episode.tape)
+        vars(self).update(generator)  # the seed of the episode was given to the other long ago
+        answer = again.play if again.when is When.RETURN else again.step
+        while again.script:
+            answer(again.script.popleft())
+        if not _stand_alike(again, episode):
             again.close()
             raise BranchError(
                 f"{type(self.simulation).__name__} does not come to the same decision again when it is reset with the"
@@ -156,9 +220,15 @@ class Session:
             )
         return again
 
-    def at_work(self) -> AbstractContextManager[None]:
-        """Keep what the simulation does apart from whatever runs around it, and in its surroundings."""
-        return self._surroundings.entered() if self._surroundings else unattended()
+    def kept(self) -> dict[str, Any]:
+        """What a copy takes over: the latest seed, and the generator."""
+        return {"seed": self.seed, "np_random_seed": self.np_random_seed, "_np_random": self._np_random}
+
+    def refusal(self) -> Exception:
+        """The error that says why no action can be taken now."""
+        if self.episode is not None:
+            return self.episode.refusal()
+        return refusal("closed" if self._closed else "new")
 
     def end(self) -> None:
         """End the episode that runs, if one does.
@@ -168,24 +238,19 @@ class Session:
             BaseException: What the simulation raises while it unwinds.
         """
         if self._starting:
-            raise ReentrancyError("the environment was used from inside its own reset")
-        if self._episode is not None:
+            raise refusal("resetting")
+        if self.episode is not None:
             try:
-                self._episode.close()
+                with self._claimed():
+                    self.episode.close()
             finally:
-                if self._episode.unwound:
-                    self._episode = None
+                if self.episode.unwound:
+                    self.episode = None
 
     @property
     def idle(self) -> bool:
         """Whether there is nothing to end."""
-        return self._episode is None
-
-    def not_running(self) -> Exception:
-        """The error that says why there is no episode."""
-        if self._closed:
-            return ClosedError("the environment is closed; call reset() to use it again")
-        return NotResetError("there is no episode yet; call reset() first")
+        return self.episode is None
 
     def render(self) -> Any:
         """Render the simulation in the environment's render mode; None, with a warning, where it has none."""
@@ -206,16 +271,18 @@ class Session:
         try:
             self.end()
         finally:
-            if self._episode is None and not self._starting:
+            if self.episode is None and not self._starting:
                 self._closed = True
+                self._end_stack()
                 self._let_go_of_patches()
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
         try:
-            if self._episode is not None:
-                self._episode.abandon()
+            if self.episode is not None:
+                self.episode.abandon()
         finally:
+            self._end_stack()
             self._let_go_of_patches()
 
     def _hold_patches(self) -> None:
@@ -235,6 +302,19 @@ class Session:
                 self._held[-1].let_go()
             finally:
                 self._held.pop()
+
+
+def _stand_alike(one: Episode, other: Episode) -> bool:
+    """Whether the pending decisions of two episodes look just the same."""
+    mine, theirs = one.pending, other.pending
+    return (
+        mine is not None
+        and theirs is not None
+        and mine.name == theirs.name
+        and list(one.agents) == list(other.agents)
+        and same(mine.observation, theirs.observation)
+        and same(mine.mask, theirs.mask)
+    )
 
 
 def checked_seed(seed: Any) -> int | None:

@@ -23,7 +23,7 @@ ILLEGAL: Final = Sentinel("ILLEGAL")
 """What an action check answers for an action outside its space."""
 
 Cast = Callable[[Any], Any]
-"""Takes an observation, returns it cast to its space's dtype and shared with nobody."""
+"""Takes an observation, returns it cast to its space's dtype and not shared."""
 
 Check = Callable[[Any], Any]
 """Takes an action, returns it as its mapping is to receive it, or ``ILLEGAL``."""
@@ -69,7 +69,7 @@ def _array_cast(space: spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete) -
 
     def cast(value: Any) -> NDArray[Any]:
         if type(value) is ndarray and value.dtype is dtype and value.shape == shape:
-            # An array that nobody else holds needs no copy to be shared with nobody.
+            # An array that is held only here needs no copy in order not to be shared.
             if value.base is None and getrefcount(value) <= fresh:
                 return value
             return value.copy()
@@ -146,7 +146,7 @@ _UNCHANGING: Final = (np.generic, int, float, str, Sentinel)
 
 
 def duplicate(observation: Any) -> Any:
-    """Copy an observation, so that whoever gets it may change it."""
+    """Copy an observation, so that its receiver may change it."""
     if type(observation) is np.ndarray:
         return observation.copy()
     if isinstance(observation, _UNCHANGING):

@@ -8,50 +8,85 @@ objects.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from math import prod
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-Stacker = Callable[[Sequence[Any]], Any]
-"""Stacks what lies in a space; the stack shares nothing with what is stacked."""
+Stacker = Callable[..., Any]
+"""``stack(items, out=None)`` stacks what lies in a space, into a stack of that size where one is given."""
+
+SMALL: Final = 1024
+"""How many bytes an observation may have to be copied once more, which takes less time than it saves."""
 
 
-def stacker(space: spaces.Space[Any]) -> Stacker:
-    """Make the function that stacks what lies in a space, cast to its dtype."""
+def stacker(space: spaces.Space[Any], *, cast: bool = False, other: Stacker | None = None) -> Stacker:
+    """Make the function that stacks what lies in a space.
+
+    Args:
+        space: The space.
+        cast: Whether all that is stacked has the space's dtype and shape, as observations have; else it is cast.
+        other: Stacks what lies in spaces without a shape; None: arrays of objects.
+
+    Returns:
+        A function of the items, and of the stack to write them into. The stack shares nothing with the items.
+    """
     if isinstance(space, spaces.Dict):
-        parts = {key: stacker(part) for key, part in space.spaces.items()}
-        return lambda items: {key: part([item[key] for item in items]) for key, part in parts.items()}
+        parts = {key: stacker(part, cast=cast, other=other) for key, part in space.spaces.items()}
+
+        def stack_dicts(items: Sequence[Any], out: Any = None) -> Any:
+            return {
+                key: part([item[key] for item in items], None if out is None else out[key])
+                for key, part in parts.items()
+            }
+
+        return stack_dicts
     if isinstance(space, spaces.Tuple):
-        places = tuple(stacker(part) for part in space.spaces)
-        return lambda items: tuple(part([item[place] for item in items]) for place, part in enumerate(places))
+        places = tuple(stacker(part, cast=cast, other=other) for part in space.spaces)
+
+        def stack_tuples(items: Sequence[Any], out: Any = None) -> Any:
+            return tuple(
+                part([item[place] for item in items], None if out is None else out[place])
+                for place, part in enumerate(places)
+            )
+
+        return stack_tuples
     if isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)):
-        return _array_stacker(space.dtype, space.shape or ())
-    return _stack_objects
+        return _array_stacker(space.dtype, space.shape or (), cast=cast)
+    if other is None:
+        return _stack_objects
+    return lambda items, out=None: other(space, items, out)
 
 
-def _array_stacker(dtype: Any, shape: tuple[int, ...]) -> Stacker:
-    if not shape:
-        return lambda items: np.array(items, dtype)
-    concatenate, ndarray = np.concatenate, np.ndarray
+def _array_stacker(dtype: Any, shape: tuple[int, ...], *, cast: bool) -> Stacker:
+    small = bool(shape) and np.dtype(dtype).itemsize * prod(shape) <= SMALL
 
-    def stack(items: Sequence[Any]) -> NDArray[Any]:
-        first = items[0] if items else None
-        if type(first) is ndarray and first.shape == shape and first.dtype == dtype:
-            try:
-                # Twice as fast as to make an array of a list of arrays.
-                joined: NDArray[Any] = concatenate(items)
-                if joined.dtype == dtype:
-                    return joined.reshape(len(items), *shape)
-            except ValueError:  # not all of them have that shape
-                pass
-        return np.array([np.reshape(item, shape) for item in items], dtype).reshape(len(items), *shape)
+    def stack(items: Sequence[Any], out: Any = None) -> Any:
+        if out is None:
+            out = np.empty((len(items), *shape), dtype)
+        if not items or not out.size:
+            return out
+        if not shape:
+            out[:] = items
+        elif not cast:
+            out[:] = [np.reshape(item, shape) for item in items]
+        else:
+            if small:
+                try:
+                    # A third of what concatenate costs, which costs a third of stack.
+                    memoryview(out.reshape(-1).view(np.uint8))[:] = b"".join(items)
+                    return out
+                except TypeError:  # one of them is laid out otherwise in memory
+                    pass
+            np.concatenate(items, out=out.reshape(-1, *shape[1:]))
+        return out
 
     return stack
 
 
-def _stack_objects(items: Sequence[Any]) -> NDArray[Any]:
+def _stack_objects(items: Sequence[Any], out: Any = None) -> NDArray[Any]:
     stacked = np.empty(len(items), object)
     for place, item in enumerate(items):
         stacked[place] = item

@@ -1,119 +1,137 @@
 """Between a simulation's stack and its user's: who runs, and how a decision crosses over.
 
-On the user's side a driver has two moves: ``resume`` hands a reply to the simulation and returns what comes
-from it next, and ``throw`` raises ``SimulationExit`` in it instead. On the simulation's side its ``ask`` is
-what decision functions call: it hands the call over and carries out the reply. What crosses from the
-simulation is an *event*, a tuple of three: a decision (its binding, args, kwargs), or ``FINISHED`` or
-``FAILED`` (with what ``run`` has returned or raised, and None).
+A *driver* keeps one stack for a simulation, on which *jobs* run one after the other: the making of the simulation, its
+``reset`` and its ``run``, episode after episode. On the user's side ``prepare`` readies a job, ``resume`` begins it,
+and then hands replies to the simulation; ``throw`` raises ``SimulationExit`` in it. Each returns the *event* that comes
+from the simulation next, a tuple of three: a decision (what the plan has for it, and the call's args and kwargs), or
+the end of the job: ``FINISHED`` or ``FAILED``, with a list that holds the result or the error, and None. The list is
+to be emptied: the stack waits for the next job with it in its hands.
 
-While a simulation runs, ``RUNNING`` holds the ``ask`` of its driver for its thread. A thread that a simulation
-has started has an entry of its own, its ``Offspring``, which refuses to decide. Else ``RUNNING`` is empty, so
-that a decision function which is called outside any environment finds that out by one test.
+On the simulation's side a driver enters its stack in the hooks of the functions that are decided, with a function that
+hands a call over and carries out the reply.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
-from functools import wraps
-from threading import Thread, get_ident
+from contextvars import Context
+from types import MappingProxyType
 from typing import Any, Final, Protocol
 
+from greenlet import getcurrent, greenlet
+
 from ..errors import WrongThreadError, annotate
+from ..hooks.hook import Hook
+from ..hooks.stacks import STACKS, Taker
 from ..simulation import Sentinel
-
-Ask = Callable[[Any, tuple[Any, ...], dict[str, Any]], Any]
-"""Decides a call of a decision point: of the point, and of the call's arguments."""
-
-
-class _Running(dict[int, Ask]):
-    """There is one in a process: decision functions that are pickled by value find that of their new process."""
-
-    def __reduce__(self) -> str:
-        return "RUNNING"
-
-
-RUNNING: Final = _Running()
-"""By thread: whom decision functions ask there. Touched by drivers and by this module alone."""
-
-EVALUATING: dict[int, dict[Any, Any]] = {}
-"""By thread: what differences remember for the agent whose mapping is being evaluated there."""
-
-
-PLUGGED: dict[int, Any] = {}
-"""By thread: the plugins of the environment that is at work there, if it has any."""
-
-
-class Surrounding(Protocol):
-    """Something that an environment's simulation is to find around it whenever it is at work.
-
-    The environment's user enters it before anything runs for the environment, and leaves it afterwards. That may
-    be nested, and ``unattended`` may lie in between.
-    """
-
-    def begin(self, seed: int) -> None:
-        """An episode begins, with that seed. Called between ``enter`` and ``leave``."""
-
-    def enter(self) -> None:
-        """Put it up."""
-
-    def leave(self) -> None:
-        """Take it down: what was there before is there again."""
-
-    def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
-        """The simulation's main loop with this around it, in whatever thread that runs.
-
-        Where it runs in its user's thread, ``enter`` has already been called whenever it is resumed.
-        """
+from .children import ChildThreads, unwatch_threads, watch_threads
+from .events import FAILED, FINISHED, REFUSED
 
 
 class SimulationExit(SystemExit):
     """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught.
 
     A ``SystemExit``, because event loops pass that on at once, where they would keep any other exception for
-    whoever awaits the task and let the other tasks go on.
+    what awaits the task and let the other tasks go on.
     """
 
 
-class Bound(Protocol):
-    """What a driver needs of a function under an environment's definition."""
+class Crossing(Protocol):
+    """What a driver needs of what the plan has for a decided function."""
 
     @property
     def deliver(self) -> Callable[..., Any] | None:
         """Turns a reply and the call's arguments into what the call returns; None: the reply is that."""
 
     @property
-    def by_rule(self) -> Callable[..., Any] | None:
-        """Has the rule of a point decide a call; None: nobody wants to know what comes of it."""
+    def told(self) -> Crossing | None:
+        """What crosses, with the decision, args and kwargs, once the rule has decided a call; None: nothing."""
 
 
-class Refused:
-    """Stands for the binding of every decision once one was refused; the event tells the user."""
-
-    deliver = by_rule = None
-
-
-FINISHED: Final = Sentinel("FINISHED")
-FAILED: Final = Sentinel("FAILED")
 STUCK: Final = Sentinel("STUCK")
 """What ``throw`` returns, with for how many seconds it has waited, where nothing comes from the simulation."""
-REFUSED: Final = Refused()
-
 Event = tuple[Any, Any, Any]
 
+NO_DECISIONS: Final[Mapping[Hook, Crossing]] = MappingProxyType({})
+"""What crosses while a simulation is made, reset or closed: nothing."""
 
-class Driver(Protocol):
-    """What an episode needs of a driver.
+UNWINDING_TRIES: Final = 1000
+"""How often a simulation that is to be unwound may decide or swallow before it is given up. A SimPy model loses one of
+its processes at each try."""
+
+
+def is_exit(error: BaseException | None) -> bool:
+    """Whether an error is the exit that was raised in a simulation, passed on in whatever guise."""
+    seen = set()  # causes may go in circles
+    while error is not None and not isinstance(error, SimulationExit) and id(error) not in seen:
+        if isinstance(error, BaseExceptionGroup) and all(is_exit(member) for member in error.exceptions):
+            return True
+        seen.add(id(error))
+        error = error.__cause__
+    return isinstance(error, SimulationExit)
+
+
+def nothing_to_end() -> Event:
+    """What ``throw`` returns where no job is under way."""
+    return FINISHED, [None], None
+
+
+class BaseDriver:
+    """What all drivers have in common.
 
     Attributes:
-        caller: On whose stack ``resume`` may be called without ``enter`` before.
+        stack: The simulation's stack; None before the first job, and after the end.
+        caller: The greenlet from which ``resume`` may be called directly; None: ``enter`` is to be called before.
+        resume: Lets the simulation go on with a reply; returns the event that comes from it next. To be fetched anew
+            before each call.
+        plugins: The plugins of the simulation's environment; None if it has none.
+        given_up: Why a job was left where it is; None as long as none was.
     """
 
-    caller: Any
+    __slots__ = (
+        "__weakref__", "_children", "_context", "_ended", "_events", "_idle", "_job", "_refused", "caller", "given_up",
+        "plugins", "stack",
+    )  # fmt: skip
 
-    @property
-    def resume(self) -> Callable[[Any], Event]:
-        """Lets the simulation go on with a reply; returns the event that comes from it next."""
+    resume: Any
+
+    def __init__(self, *, plugins: Any = None, before: BaseDriver | None = None) -> None:
+        """Prepare a stack; the first ``start`` makes it.
+
+        Args:
+            plugins: The plugins of the simulation's environment, which take part in all that runs on the stack.
+            before: The driver that the simulation had before, whose threads it may still have.
+        """
+        self.plugins = plugins
+        self.stack: greenlet | None = None
+        self.caller: greenlet | None = None
+        self.given_up: str | None = None
+        self._ended, self._idle = False, True
+        self._job: Callable[[], Any] | None = None
+        self._context: Context | None = None
+        self._events: Mapping[Hook, Crossing] = NO_DECISIONS
+        self._refused: WrongThreadError | None = None
+        self._children: ChildThreads | None = None
+        if before is not None and before._children is not None:
+            self._children = before._children
+            self._children.driver = self
+
+    # -- the user's side, for each kind of driver to see to ---------------------------------------
+
+    def prepare(
+        self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
+    ) -> None:
+        """Have the next ``resume`` begin to run something on the stack.
+
+        Args:
+            job: What is run.
+            decisions: By hook: what crosses where it is called. All others run their rule. Never changed here.
+            context: The context variables that it sees; None: a copy of the user's.
+
+        Raises:
+            WrongThreadError: The stack cannot be resumed from here.
+        """
+        raise NotImplementedError
 
     def enter(self) -> None:
         """Make ready to be resumed from here.
@@ -121,228 +139,246 @@ class Driver(Protocol):
         Raises:
             WrongThreadError: The simulation cannot be resumed from here.
         """
+        raise NotImplementedError
 
     def throw(self) -> Event:
         """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
+        raise NotImplementedError
 
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from here."""
+        raise NotImplementedError
 
     def lost(self) -> bool:
         """Whether the simulation cannot be resumed from anywhere any more."""
-
-    def forget(self) -> None:
-        """Let go of all references to the simulation. Should it still be suspended, it unwinds by itself."""
+        raise NotImplementedError
 
     def give_up(self) -> None:
-        """Leave a simulation that does not unwind where it is."""
+        """Leave a job that does not unwind where it is; nothing else can be started."""
+        raise NotImplementedError
 
-    def refusal(self) -> WrongThreadError:
-        """The error that tells the user of a decision that was refused to a thread of the simulation's."""
+    def end(self) -> None:
+        """End the stack. Should a job be under way that cannot be reached from here, it unwinds by itself."""
+        raise NotImplementedError
 
+    def unwind(self) -> list[BaseException]:
+        """Raise ``SimulationExit`` in the job that is under way until it has ended. Returns what else it raised.
 
-class Watchful:
-    """What all drivers do about the threads that their simulation starts."""
+        Where it does not end it is given up.
+        """
+        problems: list[BaseException] = []
+        for _ in range(UNWINDING_TRIES):
+            kind, box, _ = self.throw()
+            if kind is STUCK:
+                self.given_up = (
+                    f"has neither decided anything nor ended for {box} s; it is left running in its thread until it"
+                    " decides again"
+                )
+                break
+            if kind is FINISHED or kind is FAILED:
+                value = box.pop()
+                if kind is FAILED and not is_exit(value):
+                    problems.append(value)
+                return problems
+        if self.given_up is None:
+            self.given_up = (
+                f"refuses to end: it went on after {UNWINDING_TRIES} times SimulationExit was raised in it; it is left"
+                " suspended. Let it re-raise what it does not know"
+            )
+        self.give_up()
+        return problems
 
-    __slots__ = ("_bindings", "_refused", "offspring")
+    @property
+    def usable(self) -> bool:
+        """Whether a job can be started from here."""
+        return not self._ended and self._idle and self.reachable()
 
-    def __init__(self, bindings: Mapping[Any, Bound], offspring: Offspring) -> None:
-        self._bindings = bindings
-        self._refused: WrongThreadError | None = None
-        self.offspring = offspring
-        offspring.driver = self
+    @property
+    def children(self) -> ChildThreads:
+        """The threads that the simulation has started, over all its episodes."""
+        if self._children is None:
+            self._children = ChildThreads()
+            self._children.driver = self
+        return self._children
 
-    def decides(self, point: Any) -> bool:
-        """Whether calls of a decision point are handed over."""
-        return point in self._bindings
+    # -- jobs -------------------------------------------------------------------------------------
 
-    def refuse(self, point: Any) -> WrongThreadError:
+    def _prepare(
+        self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None, context: Context | None
+    ) -> None:
+        self._refused = None
+        self._events = NO_DECISIONS if decisions is None else decisions
+        self._context, self._job = context, job
+
+    def _begin(self) -> None:
+        """On the stack: it is one of a simulation's from now on."""
+        self.stack = stack = getcurrent()
+        STACKS[stack] = self
+        watch_threads()
+        self.show()
+
+    def _work(self) -> Event:
+        """On the stack: do a job; return the event that its end is."""
+        # No frame here holds the stack, which would refer to itself then, and could not be collected.
+        self._idle = False
+        job, self._job = self._job, None
+        try:
+            self.show()
+            return self._live(job)
+        finally:
+            job = None
+            events, self._events = self._events, NO_DECISIONS
+            for hook in events:
+                if self._ended:
+                    hook.leave(getcurrent())
+                else:
+                    hook.enter(getcurrent(), None, self.plugins)
+
+    def _live(self, job: Any) -> Event:
+        try:
+            result = job()
+        except BaseException as error:
+            if self._refused is not None and self._refused is not error:
+                if isinstance(error, SimulationExit):
+                    return FAILED, [self.refusal()], None
+                annotate(error, f"simenv_marl: and before that a decision was refused: {self._refused}")
+            return FAILED, [error], None
+        return (FINISHED, [result], None) if self._refused is None else (FAILED, [self.refusal()], None)
+
+    def _forget_stack(self) -> None:
+        """Take no part in anything any more."""
+        self._ended = True
+        self.hide()
+        self._events = NO_DECISIONS
+        stack, self.stack = self.stack, None
+        if stack is not None:
+            STACKS.pop(stack, None)
+        if self._children is not None and self._children.driver is self:
+            self._children.driver = None
+        unwatch_threads()
+
+    # -- decisions --------------------------------------------------------------------------------
+
+    def _decider(self, hook: Hook, event: Crossing, away: bool = False) -> Taker:
+        """Make what decides the calls of a hook.
+
+        Args:
+            hook: The hook.
+            event: What crosses.
+            away: Whether the calls arise in greenlets of the model's own, and not on the stack itself.
+        """
+        raise NotImplementedError
+
+    def _rule_of(self, hook: Hook, event: Crossing, away: bool) -> Callable[..., Any]:
+        """The rule of a hook, which tells the user's side what it has decided if that is to be told."""
+        if event.told is None:
+            rule: Callable[..., Any] = hook.rule
+            return rule
+        tell, events = self._decider(hook, event.told, away), self._events
+
+        def told(decision: Any, args: Any, kwargs: Any) -> Any:
+            if self._events is events:  # else the job is over
+                tell((decision, args, kwargs), {})
+            return decision
+
+        return _TELLING[hook.kind](hook.rule, told)
+
+    def decides(self, hook: Hook) -> bool:
+        """Whether calls of a hook are handed over by the job that is under way."""
+        return hook in self._events
+
+    def taker(self, hook: Hook, here: greenlet) -> Taker | None:
+        """Who decides a call in a greenlet of the simulation's; None: the rule."""
+        event = self._events.get(hook)
+        return None if event is None else self._decider(hook, event, away=True)
+
+    def hide(self) -> None:
+        """Take no part in calls on the stack until ``show``."""
+        if self.stack is not None:
+            for hook in self._hooks():
+                hook.leave(self.stack)
+
+    def show(self) -> None:
+        """Take part again."""
+        stack = self.stack
+        if stack is not None:
+            for hook in self._hooks():
+                event = self._events.get(hook)
+                hook.enter(stack, None if event is None else self._decider(hook, event), self.plugins)
+
+    def _hooks(self) -> list[Hook]:
+        return [*self._events, *(() if self.plugins is None else self.plugins.hooks)]
+
+    # -- refusals ---------------------------------------------------------------------------------
+
+    def refusal_of(self, hook: Hook, where: str) -> Taker | None:
+        """What refuses a decision that was asked for where the simulation cannot wait; None where it is none."""
+        if not self.decides(hook):
+            return None
+
+        def refuse(args: Any, kwargs: Any) -> Any:
+            raise self._refuse(hook, where)
+
+        return refuse
+
+    def _refuse(self, hook: Hook, where: str) -> WrongThreadError:
         """Refuse a decision, for the user to be told at the simulation's next event; return the error for the caller.
 
-        Called in whichever thread has asked.
+        Called wherever that has been asked for, in other threads too.
         """
         error = WrongThreadError(
-            f"{point.name} was called in a thread that the simulation has started, where nobody can be asked: the"
-            " simulation itself goes on meanwhile. Call it where run() runs, and have the thread wait for the answer"
+            f"{hook.name} was called in {where}, where no user can be asked. Call it where run() runs, and have others"
+            " wait for the answer"
         )
         if self._refused is None:
             self._refused = error
-            self._bindings = dict.fromkeys(self._bindings, REFUSED)
+            self._events = dict.fromkeys(self._events, REFUSED)
+            self.show()
         return error
 
+    def _refuse_all(self, where: str) -> None:
+        """Refuse all decisions on the stack itself, for the model alone to be told."""
+        for hook in self._events:
+            refuse = self.refusal_of(hook, where)
+            if self.stack is not None:
+                hook.enter(self.stack, refuse, self.plugins)
+
     def refusal(self) -> WrongThreadError:
-        """The error that tells the user of a decision that was refused to a thread of the simulation's."""
+        """The error that tells the user of a decision that was refused."""
         refused, self._refused = self._refused, None
         error = WrongThreadError(*(() if refused is None else refused.args))
         error.__cause__ = refused
         return error
 
-    def _live(self, run: Callable[[], Any]) -> Event:
-        """In the simulation: run it to its end; return the event that this is."""
-        try:
-            result = run()
-        except BaseException as error:
-            if self._refused is not None and self._refused is not error:
-                if isinstance(error, SimulationExit):
-                    return FAILED, self.refusal(), None
-                annotate(error, f"simenv_marl: and before that a decision was refused: {self._refused}")
-            return FAILED, error, None
-        return (FINISHED, result, None) if self._refused is None else (FAILED, self.refusal(), None)
+    def forked(self) -> None:
+        """The process was forked, and this is the child."""
+        raise NotImplementedError
 
-    def _disown(self) -> None:
-        """Have nothing to do any more with threads that the simulation has started."""
-        self._bindings = {}
-        if self.offspring.driver is self:
-            self.offspring.driver = None
+    def forked_worker(self) -> None:
+        """The simulation has begun a worker of ``multiprocessing`` by a fork, and this is the worker."""
+        self._refuse_all("a process that the simulation has forked as a worker")
 
 
-# -- threads that simulations start ---------------------------------------------------------------
+def _telling(rule: Any, told: Any) -> Any:
+    return lambda *args, **kwargs: told(rule(*args, **kwargs), args, kwargs)
 
 
-class Offspring:
-    """The threads that one simulation has started, over all its episodes. As an ``Ask``, it is theirs.
+def _telling_generator(rule: Any, told: Any) -> Any:
+    def tell(*args: Any, **kwargs: Any) -> Any:
+        return told((yield from rule(*args, **kwargs)), args, kwargs)
 
-    Attributes:
-        driver: Of the episode that is going on; None between episodes, when decision functions run their rule.
-    """
-
-    __slots__ = ("driver",)
-
-    def __init__(self) -> None:
-        watch_threads()
-        self.driver: Watchful | None = None
-
-    def __call__(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Refuse a decision that the environment would have to make.
-
-        Raises:
-            WrongThreadError: It is one.
-        """
-        driver = self.driver
-        if driver is not None and driver.decides(point):
-            raise driver.refuse(point)
-        return point.rule(*args, **kwargs)
+    return tell
 
 
-def watch_threads() -> None:
-    """Find out, from now on, which threads are started by simulations.
+def _telling_coroutine(rule: Any, told: Any) -> Any:
+    async def tell(*args: Any, **kwargs: Any) -> Any:
+        return told(await rule(*args, **kwargs), args, kwargs)
 
-    Threads do not know by whom they were started, and inherit nothing that would tell.
-    """
-    if _watching:
-        return
-    _watching.append(True)
-    original = Thread.start
-
-    @wraps(original)
-    def start(self: Thread) -> None:
-        ask: Any = RUNNING.get(get_ident()) if RUNNING else None
-        if ask is None:
-            original(self)
-            return
-        disown = _adopt(self, ask if type(ask) is Offspring else ask.__self__.offspring)
-        try:
-            original(self)
-        except BaseException:
-            disown()
-            raise
-
-    Thread.start = start  # type: ignore[method-assign]
+    return tell
 
 
-_watching: list[bool] = []
-
-
-def _adopt(thread: Thread, offspring: Offspring) -> Callable[[], None]:
-    """Enter a thread that is about to be started as one of a simulation's. Returns what undoes that."""
-    run, own = thread.run, vars(thread).get("run")
-
-    def adopted() -> None:
-        disown()
-        ident = get_ident()
-        RUNNING[ident] = offspring
-        try:
-            run()
-        finally:
-            RUNNING.pop(ident, None)
-
-    def disown() -> None:
-        if vars(thread).get("run") is adopted:
-            del thread.run
-            if own is not None:
-                thread.run = own  # type: ignore[method-assign]
-
-    thread.run = adopted  # type: ignore[method-assign]
-    return disown
-
-
-def _alone() -> None:
-    """In the child of a fork, where no other thread is."""
-    thread = get_ident()
-    for book in (RUNNING, EVALUATING):
-        for other in [other for other in book if other != thread]:
-            del book[other]
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_alone)
-
-
-# -- what runs around us --------------------------------------------------------------------------
-
-
-def attended() -> bool:
-    """Whether a simulation, or a mapping, runs around us in this thread."""
-    thread = get_ident()
-    return thread in RUNNING or thread in EVALUATING or thread in PLUGGED
-
-
-def interrupted() -> None:
-    """An episode was ended by an error, on its user's side: in this thread nothing of it runs any more."""
-    thread = get_ident()
-    RUNNING.pop(thread, None)
-    EVALUATING.pop(thread, None)
-
-
-class unattended:  # noqa: N801 - it is used like a function
-    """Keep apart what runs in this thread from the simulation or mapping that runs around it.
-
-    Decision functions run their rule, differences are asked for nobody, and there are no plugins but those of the
-    whole process, until an episode says otherwise. This and its like are classes, because a context manager made of
-    a generator cannot pass on errors that refuse to be changed, as frozen dataclasses do.
-    """
-
-    __slots__ = ("_around",)
-
-    def __enter__(self) -> None:
-        thread = get_ident()
-        self._around: tuple[Any, ...] = (
-            RUNNING.pop(thread, None),
-            EVALUATING.pop(thread, None),
-            PLUGGED.pop(thread, None),
-        )
-
-    def __exit__(self, *error: object) -> None:
-        thread = get_ident()
-        books: tuple[dict[int, Any], ...] = (RUNNING, EVALUATING, PLUGGED)
-        for book, before in zip(books, self._around, strict=True):
-            if before is not None:
-                book[thread] = before
-            else:
-                book.pop(thread, None)
-
-
-class preparing:  # noqa: N801
-    """Make or reset a simulation, ``unattended``: nothing is decided, but threads that are started are its own."""
-
-    __slots__ = ("_offspring",)
-
-    def __init__(self, offspring: Offspring) -> None:
-        self._offspring = offspring
-
-    def __enter__(self) -> None:
-        self._offspring.driver = None  # also where an interrupt has kept the episode before from ending
-        RUNNING[get_ident()] = self._offspring
-
-    def __exit__(self, *error: object) -> None:
-        RUNNING.pop(get_ident(), None)
+_TELLING: Final[Mapping[str, Callable[[Any, Any], Callable[..., Any]]]] = {
+    "function": _telling,
+    "generator": _telling_generator,
+    "coroutine": _telling_coroutine,
+}

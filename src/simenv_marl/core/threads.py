@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextvars import copy_context
+from contextvars import Context, copy_context
 from os import getpid
 from threading import Lock, Thread, current_thread, get_ident
 from time import monotonic
 from typing import Any, Final
 
 from ..errors import WrongThreadError, warn_user
+from ..hooks.hook import Hook
+from ..hooks.stacks import Taker
 from ..simulation import RULE, Sentinel
-from .switch import FAILED, FINISHED, RUNNING, STUCK, Bound, Event, Offspring, SimulationExit, Watchful
+from .events import FAILED
+from .switch import STUCK, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 SECONDS_TO_UNWIND: Final = 5.0
 """How long a simulation that is to be unwound may take to its next decision or to its end."""
@@ -21,113 +24,121 @@ _A_WHILE: Final = 1.0
 
 _NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
+_JOB: Final = Sentinel("JOB")
+_END: Final = Sentinel("END")
 
 
-class ThreadDriver(Watchful):
-    """Runs a simulation in a thread of its own, which the first ``resume`` starts and ``forget`` joins.
+class ThreadDriver(BaseDriver):
+    """Runs a simulation in a thread of its own, which the first ``start`` starts and ``end`` joins.
 
     Only one of the two threads runs at a time: what one hands over to the other lies in ``_reply`` and
-    ``_event``, and a lock for each wakes whoever waits for it. What counts is what lies there, and not how often
-    a lock was released, so that a wait may be interrupted anywhere (by Ctrl-C, for instance) and nothing gets out
-    of step.
+    ``_event``, and a lock for each wakes the thread that waits for it. What counts is what lies there, and not how
+    often a lock was released, so that a wait may be interrupted anywhere (by Ctrl-C, for instance) and nothing gets
+    out of step.
     """
 
-    __slots__ = ("_arrived", "_body", "_end", "_event", "_process", "_reply", "_resumed", "_thread")
+    __slots__ = ("_arrived", "_end", "_event", "_ident", "_process", "_reply", "_resumed", "_thread")
 
-    caller: Any = None
-    """The process may have been forked since, so ``enter`` is always to be called."""
-
-    def __init__(self, run: Callable[[], Any], bindings: Mapping[Any, Bound], offspring: Offspring) -> None:
-        """Prepare a thread; the first ``resume`` starts it.
-
-        Args:
-            run: The simulation's main loop.
-            bindings: The decision points that are handed over; all others run their rule.
-            offspring: The threads that the simulation has started or is going to.
-        """
-        super().__init__(bindings, offspring)
+    def __init__(self, *, plugins: Any = None, before: BaseDriver | None = None, direct: bool = True) -> None:
+        """Prepare a thread, as ``BaseDriver`` does; ``caller`` is always None."""
+        super().__init__(plugins=plugins, before=before)
         self._process = getpid()
         self._resumed, self._arrived = Lock(), Lock()
         self._event: Event | None = None
         self._end: Event | None = None
         self._reply: Any = _NOTHING
-        # A new thread has an empty context; a model expects the one that its user has set up.
-        self._body: Any = (copy_context(), run)
         self._thread: Thread | None = None
+        self._ident: int | None = None
 
     # -- in the simulation's thread ---------------------------------------------------------------
 
-    def _run(self) -> None:
-        (context, run), self._body = self._body, None
-        thread = get_ident()
-        RUNNING[thread] = self.ask
+    def _serve(self) -> None:
+        self._ident = get_ident()
+        self._begin()
         try:
-            self._end = context.run(self._live, run)  # not in this frame too, to which the frames of an error lead back
+            while not self._ended and (reply := self._wait()) is not _END:
+                if reply is _JOB:
+                    self._do()
+                reply = None
+        finally:
+            self._forget_stack()
+
+    def _do(self) -> None:
+        context: Any = self._context
+        self._context = None
+        try:
+            end: Event = context.run(self._work)
         except BaseException as error:  # thrown into this thread from elsewhere; without an end its user would wait on
-            self._end = FAILED, error, None
-        RUNNING.pop(thread, None)
-        if isinstance(self._end[1], SimulationExit):
-            # Nobody is going to read it, and what its frames hold must go while this thread is there: greenlets of
+            end = FAILED, [error], None
+        context = None
+        if isinstance(end[1][0], SimulationExit):
+            # It is not going to be read, and what its frames hold must go while this thread is there: greenlets of
             # the model's own can unwind nowhere else.
-            self._end[1].__traceback__ = self._end[1].__context__ = None
-        if self._end[0] is FAILED and self.lost():
-            raise self._end[1]  # the model has forked, and in this process there is nobody else to be told
-        self._event = self._end
+            end[1][0].__traceback__ = end[1][0].__context__ = None
+        if self.lost():
+            self._ended = True
+            if end[0] is FAILED:
+                raise end[1].pop()  # the model has forked, and in this process its user is not there to be told
+            return
+        self._idle = True
+        self._event = self._end = end
         _wake(self._arrived)
 
-    def ask(self, point: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """In the simulation: decide a call of a decision point.
-
-        Raises:
-            WrongThreadError: The simulation has forked its process, and this is the child.
-        """
-        binding = self._bindings.get(point)
-        if binding is None:
-            return point.rule(*args, **kwargs)
-        if getpid() != self._process:
-            raise WrongThreadError(
-                f"{point.name} was called in a process that the simulation has forked; the environment's user is in"
-                ' another thread, and so has stayed behind in the parent. With driver="greenlet" it comes along'
-            )
-        thread, deliver = get_ident(), binding.deliver
-        del RUNNING[thread]
-        self._event = (binding, args, kwargs)
-        _wake(self._arrived)
+    def _wait(self) -> Any:
         resumed = self._resumed
         while self._reply is _NOTHING:
             resumed.acquire()
         reply, self._reply = self._reply, _NOTHING
-        RUNNING[thread] = self.ask
-        if reply is RULE:
-            return point.rule(*args, **kwargs) if binding.by_rule is None else binding.by_rule(point, args, kwargs)
-        if reply is _EXIT:
-            raise SimulationExit
-        return reply if deliver is None else deliver(reply, *args, **kwargs)
+        return reply
+
+    def _decider(self, hook: Hook, event: Crossing, away: bool = False) -> Taker:
+        rule, deliver = self._rule_of(hook, event, away), event.deliver
+
+        def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            self._event = (event, args, kwargs)
+            _wake(self._arrived)
+            reply = self._wait()
+            if reply is RULE:
+                return rule(*args, **kwargs)
+            if reply is _EXIT:
+                raise SimulationExit
+            return reply if deliver is None else deliver(reply, *args, **kwargs)
+
+        return decide
 
     # -- in its user's ----------------------------------------------------------------------------
 
-    def resume(self, reply: Any) -> Event:
-        """Let the simulation go on with a reply; return the event that comes from it next."""
+    def prepare(
+        self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
+    ) -> None:
+        """Have the next ``resume`` begin to run something on the stack."""
+        self.enter()
+        self._prepare(job, decisions, copy_context() if context is None else context)
+        self._event = self._end = None
         if self._thread is None:
             self._start()
-        else:
-            self._reply = reply
-            _wake(self._resumed)
-        arrived = self._arrived
-        while (event := self._event) is None:
-            arrived.acquire(True, _A_WHILE)
-        self._event = None
-        return event
 
     def _start(self) -> None:
         self._resumed.acquire()
         self._arrived.acquire()
-        self._thread = thread = Thread(target=self._run, name="simulation", daemon=True)
+        self._thread = thread = Thread(target=self._serve, name="simulation", daemon=True)
         try:
             thread.start()
         except Exception:  # there are too many threads
             self._thread = None
+            self._resumed.release()
+            self._arrived.release()
             raise
+
+    def resume(self, reply: Any) -> Event:
+        """Let the simulation go on with a reply; return the event that comes from it next."""
+        self._reply = reply if self._job is None else _JOB
+        _wake(self._resumed)
+        arrived = self._arrived
+        while (event := self._event) is None:
+            arrived.acquire(True, _A_WHILE)
+        self._event = self._end = None
+        return event
 
     def throw(self) -> Event:
         """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next.
@@ -136,19 +147,20 @@ class ThreadDriver(Watchful):
         decision.
         """
         self.enter()
-        if self._thread is None:
-            return FINISHED, None, None
+        if self._thread is None or (self._idle and self._end is None and self._reply is not _JOB):
+            return nothing_to_end()
         patience = monotonic() + SECONDS_TO_UNWIND
         self._event = None
-        self._reply = _EXIT
-        _wake(self._resumed)
+        if not (self._idle and self._reply is _JOB):  # else the job begins, and is told at its first decision
+            self._reply = _EXIT
+            _wake(self._resumed)
         # An end is looked for where it stays, whenever it came.
         while (event := self._end or self._event) is None:
             left = patience - monotonic()
             if left <= 0:
                 return STUCK, SECONDS_TO_UNWIND, None
             self._arrived.acquire(timeout=left)
-        self._event = None
+        self._event = self._end = None
         return event
 
     def enter(self) -> None:
@@ -171,13 +183,17 @@ class ThreadDriver(Watchful):
         """Whether this process was forked, which no other thread survives."""
         return getpid() != self._process
 
-    def forget(self) -> None:
-        """Let go of all references to the simulation, which has ended or is lost; wait for its thread to be gone."""
-        self._disown()
-        thread, self._thread = self._thread, None
-        self._body = self._event = self._end = None
-        if thread is None or thread is current_thread() or self.lost():
+    def end(self) -> None:
+        """End the stack, whose job has ended or is lost; wait for its thread to be gone."""
+        if self._ended:
             return
+        self._forget_stack()
+        thread, self._thread = self._thread, None
+        self._event = self._end = None
+        if thread is None or thread is current_thread() or self.lost() or not self._idle:
+            return
+        self._reply = _END
+        _wake(self._resumed)
         thread.join(SECONDS_TO_UNWIND)
         if thread.is_alive():
             warn_user(
@@ -185,11 +201,22 @@ class ThreadDriver(Watchful):
             )
 
     def give_up(self) -> None:
-        """Leave a simulation that does not unwind where it is; at its next decision it gets another chance."""
-        self.offspring.driver = None
+        """Leave a job that does not unwind where it is; at its next decision it gets another chance."""
+        self._ended = True
+        self.children.driver = None  # threads that it has started run their rule
+
+    def forked(self) -> None:
+        """The process was forked, and this is the child: in the simulation's own thread, or without it."""
+        if self._ident == get_ident():
+            self._refuse_all(
+                "a process that the simulation has forked, while the environment's user is in another thread and has"
+                ' stayed behind in the parent (with driver="greenlet" it comes along)'
+            )
+        else:
+            self._forget_stack()
 
 
 def _wake(lock: Any) -> None:
-    """Have whoever waits for a lock, or is going to, look again."""
+    """Have the thread that waits for a lock, or is going to, look again."""
     if lock.locked():
         lock.release()

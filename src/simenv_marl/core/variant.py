@@ -56,7 +56,7 @@ class Variant:
             value = getattr(self, name)
             if not isinstance(value, Mapping):
                 raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {value!r}")
-            # Nobody else can change it: what is frozen is the variant and all that it names.
+            # It cannot be changed from outside: what is frozen is the variant and all that it names.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         twice = [name for name in ("plugins", "policies") if name in self.options]
         if twice:

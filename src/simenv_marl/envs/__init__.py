@@ -15,7 +15,7 @@ from .joint import SimulationJointEnv
 from .parallel import SimulationParallelEnv
 from .single import SimulationEnv, single_view
 from .vector import SimulationVectorEnv
-from .workers import Recipe
+from .worker import Recipe
 
 __all__ = [
     "VIEWS",

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from pettingzoo import AECEnv
 
-from ..core.agent import Record
-from ..core.episode import Episode
+from ..core.agent import Agent
+from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..errors import InvalidActionError
 from ..simulation import RULE
-from .base import AgentsView
+from .padded import presence
+from .pettingzoo_base import AgentsView
 
 
 class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
@@ -60,8 +61,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = episode = self._start(seed, options, Episode)
-        self._enter(episode)
+        self._enter(self._start(seed, options, When.DECISION))
         if self._shows:
             self.render()
 
@@ -76,29 +76,28 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        episode = self._episode
+        episode = self._session.episode
         if episode is None:
-            raise self._session.not_running()
+            raise self._session.refusal()
         if self._leaving or episode.over:
-            self._take_leave(episode, action)
+            self._dead_step(action)
             return
-        agent = self.agent_selection
         try:
-            episode.turn(action)
+            episode.step(action)
         except BaseException:
             if episode.over:  # an error has ended it
                 self._clear()
-                self._episode = episode
             raise
-        # The selected agent is the only one that the latest step has rewarded.
-        self.rewards[agent] = self._cumulative_rewards[agent] = 0.0
+        # The selected agent is the only one that the latest step has rewarded, as a rule.
+        selected = self.agent_selection
+        self.rewards[selected] = self._cumulative_rewards[selected] = 0.0
         if self._rewarded:
-            self._rest()
-        record = episode.pending
-        if record is None or episode.parting:
+            self._take_back_rewards()
+        agent = episode.pending
+        if agent is None or episode.just_ended:
             self._enter(episode)
         else:
-            self._select(record)
+            self._select(agent)
         if self._shows:
             self.render()
 
@@ -114,24 +113,24 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         Raises:
             ResetNeededError: There is no episode, or all agents have taken leave of it.
         """
-        episode = self._episode
+        episode = self._session.episode
         if episode is None:
-            raise self._session.not_running()
-        agent = self.agent_selection
-        if agent not in self.rewards:
-            raise episode.nothing_pending()
-        observation = None
+            raise self._session.refusal()
+        name, observation = self.agent_selection, None
         if observe:
-            record = episode.agents.get(agent)
-            observation = None if record is None else record.observation
-            observation = observation.copy() if type(observation) is np.ndarray else self.observe(agent)
-        return (
-            observation,
-            self._cumulative_rewards[agent],
-            self.terminations[agent],
-            self.truncations[agent],
-            self.infos[agent],
-        )
+            agent = episode.pending
+            observation = None if agent is None or agent.name != name else agent.observation
+            observation = observation.copy() if type(observation) is np.ndarray else self.observe(name)
+        try:
+            return (
+                observation,
+                self._cumulative_rewards[name],
+                self.terminations[name],
+                self.truncations[name],
+                self.infos[name],
+            )
+        except KeyError:
+            raise episode.refusal() from None
 
     def observe(self, agent: str) -> Any:
         """The latest observation of an agent, as a copy of the caller's own.
@@ -143,120 +142,113 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             UnknownAgentError: There is no such agent.
             ResetNeededError: There is no episode.
         """
-        if self._episode is None:
-            raise self._session.not_running()
-        return self._observation(self._episode, agent)
+        return self._observation(self._running(), agent)
 
     # -- PettingZoo's books -----------------------------------------------------------------------
 
-    def _go_on(self, episode: Any) -> None:
-        super()._go_on(episode)
-        episode.parting = []  # who has ended is in the books already
+    def _resume_from_replay(self) -> None:
+        episode = self._running()
+        episode.just_ended = []  # they are in the books already
 
     def _in_mid_episode(self) -> bool:
-        return super()._in_mid_episode() or bool(self._leaving)  # who has ended is yet to take leave
+        return super()._in_mid_episode() or bool(self._leaving)  # ended agents are yet to take their None steps
 
     def _clear(self) -> None:
         super()._clear()
         self.agents = []
         self._places: dict[str, int] = {}  # of the agents, in the list of agents
-        self._leaving: list[str] = []  # whose episode has ended, the next one last
-        self._rewarded: list[str] = []  # whom the latest step has rewarded, if not just the selected one
+        self._leaving: list[str] = []  # agents that have ended, and whose None step is to come, the next one last
+        self._rewarded: list[str] = []  # agents that the latest step has rewarded
         self.rewards: dict[str, float] = {}
         self._cumulative_rewards: dict[str, float] = {}
         self.terminations: dict[str, bool] = {}
         self.truncations: dict[str, bool] = {}
         self.infos: dict[str, dict[str, Any]] = {}
 
-    def _join(self, agent: str) -> None:
-        self._places[agent] = len(self.agents)
-        self.agents.append(agent)
-        self.rewards[agent] = self._cumulative_rewards[agent] = 0.0
-        self.terminations[agent] = self.truncations[agent] = False
-        self.infos[agent] = {}
+    def _join(self, name: str) -> None:
+        self._places[name] = len(self.agents)
+        self.agents.append(name)
+        self.rewards[name] = self._cumulative_rewards[name] = 0.0
+        self.terminations[name] = self.truncations[name] = False
+        self.infos[name] = {}
 
-    def _select(self, record: Record) -> None:
+    def _select(self, agent: Agent) -> None:
         """Enter a decision that has arisen."""
-        agent, reward = record.agent, record.reward
-        try:
-            self._cumulative_rewards[agent] += reward
-        except KeyError:
-            self._join(agent)
-        self.rewards[agent] = reward
-        self.infos[agent] = record.info
-        self.agent_selection = agent
+        name = self.agent_selection = agent.name
+        if name not in self.rewards:
+            self._join(name)
+        self.rewards[name] = reward = agent.reward
+        self._cumulative_rewards[name] += reward
+        self.infos[name] = presence(agent) if self._padded else agent.info
+
+    def _enter_reward(self, agent: Agent) -> None:
+        """Enter the reward and the info of an agent that is not selected for its decision."""
+        name, reward = agent.name, agent.reward
+        self.rewards[name] = reward
+        self._cumulative_rewards[name] += reward
+        self._rewarded.append(name)
+        self.infos[name] = presence(agent) if self._padded else agent.info
 
     def _enter(self, episode: Episode) -> None:
-        """Enter what a reset or a turn has brought besides a decision: births and ends."""
+        """Enter what a reset or a step has brought besides a decision: births and ends."""
         if not self.agents:
-            for agent, record in episode.agents.items():
-                self._join(agent)
-                self.infos[agent] = record.info
-        for record in episode.parting:
-            if self._padded:
-                self._pad(record)
-            else:
-                self._part(record, terminated=True, truncated=False)
+            for name, agent in episode.agents.items():
+                self._join(name)
+                self.infos[name] = presence(agent) if self._padded else agent.info
+        for agent in episode.just_ended:
+            if agent.name not in self.rewards:
+                self._join(agent.name)
+            self._enter_reward(agent)
+            if not self._padded:
+                self._dismiss(agent.name, terminated=True, truncated=False)
         if episode.over:
+            flags = {"terminated": episode.terminated, "truncated": episode.truncated}
             if self._padded:
-                for agent in episode.gone:
-                    self._dismiss(agent, terminated=episode.terminated, truncated=episode.truncated)
+                for name in episode.ended:
+                    self._dismiss(name, **flags)
             # Those that have never decided come last.
-            for record in sorted(episode.agents.values(), key=lambda record: not record.decided):
-                self._part(record, terminated=episode.terminated, truncated=episode.truncated)
+            for agent in sorted(episode.agents.values(), key=lambda agent: not agent.decided):
+                if agent.name not in self.rewards:
+                    self._join(agent.name)
+                self._enter_reward(agent)
+                self._dismiss(agent.name, **flags)
         self._leaving.reverse()
         if episode.pending is not None:
             self._select(episode.pending)
-            self._rewarded.append(episode.pending.agent)
+            self._rewarded.append(episode.pending.name)
         if self._leaving:
             self.agent_selection = self._leaving[-1]
-        episode.parting = []
+        episode.just_ended = []
 
-    def _part(self, record: Record, *, terminated: bool, truncated: bool) -> None:
-        """Enter the end of an agent: last reward, flags; its ``None`` step is to come."""
-        if record.agent not in self.rewards:
-            self._join(record.agent)
-        self._reward(record)
-        self.infos[record.agent] = record.info
-        self._dismiss(record.agent, terminated=terminated, truncated=truncated)
+    def _dismiss(self, name: str, *, terminated: bool, truncated: bool) -> None:
+        """Enter the end of an agent, whose ``None`` step is to come."""
+        self.terminations[name], self.truncations[name] = terminated, truncated
+        self._leaving.append(name)
 
-    def _pad(self, record: Record) -> None:
-        """Enter that an agent was removed, and stays among the others all the same."""
-        self._reward(record)
-        self.infos[record.agent] = record.unseen()
-
-    def _reward(self, record: Record) -> None:
-        self.rewards[record.agent] = record.reward
-        self._cumulative_rewards[record.agent] += record.reward
-        self._rewarded.append(record.agent)
-
-    def _dismiss(self, agent: str, *, terminated: bool, truncated: bool) -> None:
-        self.terminations[agent], self.truncations[agent] = terminated, truncated
-        self._leaving.append(agent)
-
-    def _rest(self) -> None:
+    def _take_back_rewards(self) -> None:
         """Take back what is only to be seen of the step before: the rewards of others than the selected agent."""
-        for agent in self._rewarded:
-            self.rewards[agent] = 0.0
+        for name in self._rewarded:
+            self.rewards[name] = 0.0
         self._rewarded = []
 
-    def _take_leave(self, episode: Episode, action: Any) -> None:
-        """The step of an agent whose episode has ended."""
+    def _dead_step(self, action: Any) -> None:
+        """The step of an agent that has ended."""
+        episode = self._running()
         if not self._leaving:
-            raise episode.nothing_pending()
+            raise episode.refusal()
         if action is not None and action is not RULE:
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {action!r}"
             )
-        self._rest()
-        agent = self._leaving.pop()
+        self._take_back_rewards()
+        name = self._leaving.pop()
         for book in (self.rewards, self._cumulative_rewards, self.terminations, self.truncations, self.infos):
-            del book[agent]
-        # The last agent takes its place in the list, which so takes the same time for any number of agents.
-        place, mover = self._places.pop(agent), self.agents.pop()
-        if mover != agent:
+            del book[name]
+        # The last agent takes its place in the list, so that this takes the same time for any number of agents.
+        place, mover = self._places.pop(name), self.agents.pop()
+        if mover != name:
             self.agents[place], self._places[mover] = mover, place
         if self._leaving:
             self.agent_selection = self._leaving[-1]
         elif episode.pending is not None:
-            self.agent_selection = episode.pending.agent
+            self.agent_selection = episode.pending.name

@@ -9,19 +9,125 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from ..core.episode import Episode
+from ..core.bound import BoundPoint
+from ..core.episode import Episode, When
 from ..core.plan import Plan
-from ..core.rounds import Rounds
-from ..core.spaces import duplicate, open_mask
+from ..core.session import Session
+from ..core.spaces import duplicate
 from ..errors import InvalidActionError, ViewError
 from ..simulation import RULE
-from .base import OneAgentView
+from .gymnasium_base import OneAgentView
+
+
+class Joint:
+    """How the agents of a roster are read as one.
+
+    Attributes:
+        roster: By name, the points of the agents.
+        observation_space, action_space: The spaces of all of them: see ``SimulationJointEnv``.
+    """
+
+    def __init__(self, roster: Mapping[str, BoundPoint], *, flatten: bool) -> None:
+        """Find out the spaces.
+
+        Raises:
+            ViewError: The spaces cannot be flattened.
+        """
+        self.roster, self._flatten = dict(roster), flatten
+        observations = {name: deepcopy(point.definition.observation_space) for name, point in roster.items()}
+        actions = {name: deepcopy(point.definition.action_space) for name, point in roster.items()}
+        self.observation_space: spaces.Space[Any]
+        self.action_space: spaces.Space[Any]
+        if flatten:
+            self.observation_space, self.action_space = _concatenate(observations), _concatenate_actions(actions)
+            self._places = _places(actions)
+        else:
+            self.observation_space, self.action_space = spaces.Dict(observations), spaces.Dict(actions)
+
+    def actions(self, episode: Episode, action: Any) -> dict[str, Any]:
+        """Take a joint action apart.
+
+        Returns:
+            The actions of the agents that live.
+
+        Raises:
+            InvalidActionError: It is no joint action, or lacks an agent.
+        """
+        actions: Mapping[str, Any]
+        if action is RULE:
+            actions = dict.fromkeys(self.roster, RULE)
+        elif self._flatten:
+            if not isinstance(action, np.ndarray) or action.shape != self.action_space.shape:
+                raise InvalidActionError(f"the joint action {action!r} is not in {self.action_space}")
+            actions = {name: action[place] for name, place in self._places.items()}
+        elif not isinstance(action, Mapping) or set(action) != set(self.roster):
+            given = list(action) if isinstance(action, Mapping) else action
+            raise InvalidActionError(
+                f"a joint action is a dict with an action for each of {', '.join(self.roster)}; given: {given!r}"
+            )
+        else:
+            actions = action
+        return {name: actions[name] for name in self.roster if name in episode.agents}
+
+    def check(self, episode: Episode, action: Any) -> None:
+        """Check the joint action of a vector environment, as far as it can be checked before anything moves.
+
+        Raises:
+            InvalidActionError: It is not legal, or has ``RULE`` in it.
+        """
+        actions = self.actions(episode, action)
+        if any(part is RULE for part in actions.values()):
+            raise InvalidActionError("RULE is no action in vector environments; use joint_env, or policies=")
+        episode.check(actions)
+
+    def observe(self, episode: Episode) -> Any:
+        """What all agents observe; one that has ended keeps its last observation."""
+        observations = {}
+        for name, point in self.roster.items():
+            agent = episode.agent(name)
+            if agent is None or agent.observation is None:
+                observations[name] = point.blank()
+            else:
+                observations[name] = duplicate(agent.observation)
+        if self._flatten:
+            return np.concatenate(list(observations.values())).astype(self.observation_space.dtype)
+        return observations
+
+    def reward(self, episode: Episode) -> float:
+        """The sum of the rewards that a step has brought."""
+        reward = 0.0
+        for agent in (*episode.just_ended, *episode.agents.values()):
+            reward += agent.reward
+        return reward
+
+    def inform(self, episode: Episode) -> dict[str, Any]:
+        """The info of a step or a reset, which tells how much time has gone by since the one before."""
+        agents = {name: episode.agent(name) for name in self.roster}
+        info: dict[str, Any] = {
+            "deciding": episode.pending.name if episode.pending is not None else "",
+            "acted": {name: agent is not None and agent.acted for name, agent in agents.items()},
+        }
+        masks = {name: duplicate(agent.mask) for name, agent in agents.items() if agent and agent.mask is not None}
+        if masks:
+            info["action_mask"] = masks
+        if episode.clock is not None:
+            before, episode.last_time = episode.last_time, float(episode.clock())
+            info["time"], info["elapsed"] = (
+                episode.last_time,
+                episode.last_time - (episode.last_time if before is None else before),
+            )
+        return info
+
+    def masks(self, episode: Episode) -> list[Any]:
+        """The masks of all agents."""
+        agents = [(point, episode.agent(name)) for name, point in self.roster.items()]
+        return [point.open_mask() if agent is None or agent.mask is None else agent.mask for point, agent in agents]
 
 
 class SimulationJointEnv(OneAgentView):
     """A simulation as a Gymnasium environment whose one agent takes all decisions. Made by ``joint_env``.
 
-    A step is a round of the parallel view with an action for everybody; the reward is the sum. The agents are
+    A step is a round of the parallel view with an action for each agent; the reward is the sum. The agents are
     those that are known when it is made: those with names of their own, those in ``possible_agents``, and
     those that the simulation's ``expected_calls`` names after a reset.
 
@@ -31,38 +137,34 @@ class SimulationJointEnv(OneAgentView):
             ``Discrete`` and one-dimensional ``MultiDiscrete`` spaces come to a ``MultiDiscrete``.
     """
 
-    _episode: Rounds | None
     _agent = "joint"
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the environment of a plan.
+
+        Args:
+            plan: The plan.
+            session: The simulation that it reads; None: one of its own.
 
         Raises:
             ViewError: No agent is known beforehand, or their spaces cannot be flattened.
             SimEnvError: Something else in the plan cannot work.
         """
-        super().__init__(plan)
-        roster = dict(plan.roster)
+        super().__init__(plan, session)
         if not plan.complete:
-            with_seed = self._session.start(0, None, np.random.default_rng(0), Rounds)
-            roster = {agent: record.binding for agent, record in with_seed.agents.items()}
+            with_seed = self._session.start(0, None, When.RETURN)
+            roster = {name: agent.point for name, agent in with_seed.agents.items()}
             self._session.close()
+            self._session.np_random_seed = None
             self._plan = self._made_of = self._session.plan = plan.declared(roster)
-        self._agents = list(roster)
-        observations = {agent: deepcopy(binding.definition.observation_space) for agent, binding in roster.items()}
-        actions = {agent: deepcopy(binding.definition.action_space) for agent, binding in roster.items()}
-        self._time: float | None = None
-        self._flatten = plan.options.flatten
-        if self._flatten:
-            self.observation_space: spaces.Space[Any] = _concatenate(observations)
-            self.action_space: spaces.Space[Any] = _concatenate_actions(actions)
-            self._places = _places(actions)
-        else:
-            self.observation_space, self.action_space = spaces.Dict(observations), spaces.Dict(actions)
+        self.joint = Joint(self._plan.roster, flatten=plan.options.flatten)
 
     @staticmethod
     def check(plan: Plan) -> None:
         """Make sure that a plan allows this view; every plan does."""
+
+    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        return deepcopy((self.joint.observation_space, self.joint.action_space))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the simulation and run it to its first decision.
@@ -79,14 +181,13 @@ class SimulationJointEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = self._begin(seed, options, Rounds)
-        self._time = None
+        episode = self._begin(seed, options, When.RETURN)
         if self._shows:
             self.render()
-        return self._observe(), self._info()
+        return self.joint.observe(episode), self.joint.inform(episode)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Play a round with an action for everybody.
+        """Play a round with an action for each agent.
 
         Args:
             action: In the action space: an action for each agent (those of agents that have ended are not
@@ -103,76 +204,18 @@ class SimulationJointEnv(OneAgentView):
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        episode = self._episode
-        if episode is None:
-            raise self._session.not_running()
-        actions = self._split(action)
-        episode.play({agent: actions[agent] for agent in self._agents if agent in episode.agents})
-        reward = 0.0
-        for record in (*episode.parting, *episode.agents.values()):
-            reward += record.reward
+        episode, joint = self._running(), self.joint
+        episode.play(joint.actions(episode, action))
         if self._shows:
             self.render()
-        return self._observe(), reward, episode.terminated, episode.truncated, self._info()
+        info = joint.inform(episode)
+        return joint.observe(episode), joint.reward(episode), episode.terminated, episode.truncated, info
 
     def _seen(self, episode: Episode) -> tuple[Any, ...]:
-        return (self._observe(),)
+        return (self.joint.observe(episode),)
 
     def _legal(self, episode: Episode) -> list[Any]:
-        masks = []
-        for agent in self._agents:
-            record = episode.record(agent)
-            mask = None if record is None else record.mask
-            masks.append(open_mask(self._plan.roster[agent].definition.action_space) if mask is None else mask)
-        return masks
-
-    def _split(self, action: Any) -> Mapping[str, Any]:
-        """The actions of the agents in a joint action."""
-        if action is RULE:
-            return dict.fromkeys(self._agents, RULE)
-        if self._flatten:
-            if not isinstance(action, np.ndarray) or action.shape != self.action_space.shape:
-                raise InvalidActionError(f"the joint action {action!r} is not in {self.action_space}")
-            return {agent: action[place] for agent, place in self._places.items()}
-        if not isinstance(action, Mapping) or set(action) != set(self._agents):
-            given = list(action) if isinstance(action, Mapping) else action
-            raise InvalidActionError(
-                f"a joint action is a dict with an action for each of {', '.join(self._agents)}; given: {given!r}"
-            )
-        return action
-
-    def _observe(self) -> Any:
-        episode = self._episode
-        assert episode is not None
-        observations = {}
-        for agent in self._agents:
-            record = episode.record(agent)
-            if record is None or record.observation is None:
-                observations[agent] = self._plan.roster[agent].blank()
-            else:
-                observations[agent] = duplicate(record.observation)
-        if self._flatten:
-            return np.concatenate(list(observations.values())).astype(self.observation_space.dtype)
-        return observations
-
-    def _info(self) -> dict[str, Any]:
-        episode = self._episode
-        assert episode is not None
-        records = {agent: episode.record(agent) for agent in self._agents}
-        info: dict[str, Any] = {
-            "deciding": episode.pending.agent if episode.pending is not None else "",
-            "acted": {agent: record is not None and record.acted for agent, record in records.items()},
-        }
-        masks = {
-            agent: duplicate(record.mask) for agent, record in records.items() if record and record.mask is not None
-        }
-        if masks:
-            info["action_mask"] = masks
-        if episode.clock is not None:
-            now = float(episode.clock())
-            info["time"], info["elapsed"] = now, now - (now if self._time is None else self._time)
-            self._time = now
-        return info
+        return self.joint.masks(episode)
 
 
 def _length(space: spaces.Space[Any]) -> int:

@@ -7,14 +7,13 @@ from typing import Any
 
 from pettingzoo import ParallelEnv
 
-from ..core.agent import Record
+from ..core.agent import Agent
+from ..core.episode import Episode, When
 from ..core.plan import Plan
-from ..core.rounds import Rounds
 from ..core.spaces import duplicate
 from ..simulation import Sentinel
-from .base import AgentsView
-
-Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
+from .padded import Results, of_present_agents, pad
+from .pettingzoo_base import AgentsView
 
 
 class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
@@ -30,8 +29,6 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     Attributes:
         agents: The live agents.
     """
-
-    _episode: Rounds | None
 
     def __init__(self, plan: Plan) -> None:
         """Make the environment of a plan.
@@ -59,17 +56,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = episode = self._start(seed, options, Rounds)
+        episode = self._start(seed, options, When.RETURN)
         self.agents = list(episode.agents)
         if self._shows:
             self.render()
-        records = episode.agents.values()
-        observations = {record.agent: self._hand_out(record) for record in records}
-        infos = {
-            record.agent: {**record.info, "deciding": record is episode.pending, "acted": False} for record in records
-        }
-        if self._padded:
-            self._pad(episode, (observations, {}, {}, {}, infos))
+        observations, _, _, _, infos = self._results(episode)
         return observations, infos
 
     def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
@@ -85,92 +76,64 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             agent's action was used. Agents that have ended are among them for the last time.
 
         Raises:
-            UnknownAgentError: An action is for nobody who lives. The environment stands where it stood.
+            UnknownAgentError: An action is for no live agent. The environment stands where it stood.
             InvalidActionError: An action is not legal. The environment stands where it stood.
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        episode = self._episode
+        episode = self._session.episode
         if episode is None:
-            raise self._session.not_running()
+            raise self._session.refusal()
         if isinstance(actions, Sentinel):
             actions = dict.fromkeys(episode.agents, actions)
         elif self._padded and isinstance(actions, Mapping):
-            actions = self._of_those_present(episode, actions)
+            actions = of_present_agents(episode, self._plan.roster, actions)
         try:
             episode.play(actions)
         except BaseException:
             if episode.over:  # an error has ended it
                 self.agents = []
             raise
-        results: Results = {}, {}, {}, {}, {}
-        observations, rewards, terminations, truncations, infos = results
-        terminated, truncated, pending = episode.terminated, episode.truncated, episode.pending
-        for record in episode.parting:
-            agent = record.agent
-            observations[agent] = self._hand_out(record)
-            rewards[agent] = record.reward
-            terminations[agent], truncations[agent] = True, False
-            infos[agent] = info = record.info
-            info["deciding"], info["acted"] = False, record.acted
-        for agent, record in episode.agents.items():
-            observation, info = record.observation, record.info
-            if observation is None or record.handed_out is observation:
-                observation = self._hand_out(record)
-            else:
-                record.handed_out = observation
-            observations[agent] = observation
-            rewards[agent] = record.reward
-            terminations[agent], truncations[agent] = terminated, truncated
-            info["deciding"], info["acted"] = False, record.acted
-            infos[agent] = info
-        if pending is not None:
-            pending.info["deciding"] = True
         self.agents = [] if episode.over else list(episode.agents)
-        if self._padded:
-            self._pad(episode, results)
+        results = self._results(episode)
         if self._shows:
             self.render()
+        return results
+
+    def _results(self, episode: Episode) -> Results:
+        """What the agents have come to, by agent."""
+        results: Results = {}, {}, {}, {}, {}
+        observations, rewards, terminations, truncations, infos = results
+        terminated, truncated = episode.terminated, episode.truncated
+        for agent in episode.just_ended:
+            name = agent.name
+            observations[name], rewards[name] = self._hand_out(agent), agent.reward
+            terminations[name], truncations[name] = True, False
+            infos[name] = info = agent.info
+            info["deciding"], info["acted"] = False, agent.acted
+        for name, agent in episode.agents.items():
+            observations[name], rewards[name] = self._hand_out(agent), agent.reward
+            terminations[name], truncations[name] = terminated, truncated
+            infos[name] = info = agent.info
+            info["deciding"], info["acted"] = False, agent.acted
+        if episode.pending is not None:
+            episode.pending.info["deciding"] = True
+        if self._padded:
+            pad(episode, self.possible_agents, results)
+            if not episode.over:
+                self.agents = list(self.possible_agents)
         return results
 
     def _clear(self) -> None:
         super()._clear()
         self.agents = []
 
-    def _of_those_present(self, episode: Rounds, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Take out the actions of agents of the roster that have not been seen yet or are gone."""
-        roster, agents = self._plan.roster, episode.agents
-        return {
-            agent: action
-            for agent, action in actions.items()
-            if agent not in roster or (agent in agents and agents[agent].info.get("present"))
-        }
-
-    def _pad(self, episode: Rounds, results: Results) -> None:
-        """Have everybody of the roster be there, and end together."""
-        observations, rewards, terminations, truncations, infos = results
-        for agent in self.possible_agents:
-            record = episode.record(agent)
-            assert record is not None
-            if agent in episode.gone or not record.info["present"]:
-                acted = agent in infos and infos[agent]["acted"]
-                observations[agent] = record.binding.blank()
-                infos[agent] = {**record.unseen(), "deciding": False, "acted": acted}
-                rewards.setdefault(agent, 0.0)
-            terminations[agent], truncations[agent] = episode.terminated, episode.truncated
-            part: Any
-            for part in results:
-                if agent in part:  # to stand in the order of the roster
-                    part[agent] = part.pop(agent)
-        if not episode.over:
-            self.agents = list(self.possible_agents)
-
-    def _hand_out(self, record: Record) -> Any:
-        """The observation of an agent, which nobody else gets to see: each return makes its own."""
-        observation = record.observation
+    def _hand_out(self, agent: Agent) -> Any:
+        """The observation of an agent, for the caller alone: each return makes its own."""
+        observation = agent.observation
         if observation is None:
-            return record.binding.blank()
-        if record.handed_out is observation:  # it could not be observed anew
+            return agent.point.blank()
+        if agent.handed_out is observation:  # it could not be observed anew
             return duplicate(observation)
-        record.handed_out = observation
+        agent.handed_out = observation
         return observation

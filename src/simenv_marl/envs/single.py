@@ -10,13 +10,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.agent import Record
-from ..core.episode import Episode
+from ..core.agent import Agent
+from ..core.episode import Episode, When
 from ..core.plan import Plan
+from ..core.session import Session
 from ..core.spaces import open_mask
 from ..decision import Definition
 from ..errors import ViewError
-from .base import OneAgentView, View
+from .base import View
+from .gymnasium_base import OneAgentView
 
 
 class SimulationEnv(OneAgentView):
@@ -26,19 +28,27 @@ class SimulationEnv(OneAgentView):
         observation_space, action_space: The agent's spaces, of this environment alone.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    _own: Any = None  # its agent, while there is an episode
+
+    def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the environment of a plan.
+
+        Args:
+            plan: The plan.
+            session: The simulation that it reads; None: one of its own.
 
         Raises:
             ViewError: Not just one agent is active, or its name is only known when it decides.
             SimEnvError: Something else in the plan cannot work.
         """
-        super().__init__(plan)
-        definition = plan.active[0].definition
+        super().__init__(plan, session)
         self._agent = str(plan.active[0].agent)
-        self.observation_space = copy.deepcopy(definition.observation_space)
-        self.action_space = copy.deepcopy(definition.action_space)
-        self._record: Any
+        if self._session.episode is not None:
+            self._own = self._session.episode.agent(self._agent)
+
+    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        definition = self._plan.active[0].definition
+        return copy.deepcopy((definition.observation_space, definition.action_space))
 
     @staticmethod
     def check(plan: Plan) -> None:
@@ -70,11 +80,11 @@ class SimulationEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._episode = episode = self._begin(seed, options, Episode)
-        self._record = record = episode.agents[self._agent]
+        episode = self._begin(seed, options, When.DECISION)
+        self._own = own = episode.agents[self._agent]
         if self._shows:
             self.render()
-        return record.observation, record.info
+        return own.observation, own.info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision and run to the next one.
@@ -90,35 +100,30 @@ class SimulationEnv(OneAgentView):
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        episode = self._episode
+        episode = self._session.episode
         if episode is None:
-            raise self._session.not_running()
-        episode.turn(action)
+            raise self._session.refusal()
+        episode.step(action)
         if self._shows:
             self.render()
-        record: Record = self._record
-        return (
-            record.observation,
-            record.reward,
-            episode.terminated or record.ended,
-            episode.truncated and not record.ended,
-            record.info,
-        )
+        own: Agent = self._own
+        if own.ended:
+            return own.observation, own.reward, True, False, own.info
+        return own.observation, own.reward, episode.terminated, episode.truncated, own.info
 
     def _legal(self, episode: Episode) -> list[Any]:
-        mask = self._record.mask
+        mask = self._own.mask
         return [open_mask(self.action_space) if mask is None else mask]
 
     def _seen(self, episode: Episode) -> tuple[Any, ...]:
-        return (self._record.observation,)
+        return (self._own.observation,)
 
-    def _go_on(self, episode: Any) -> None:
-        super()._go_on(episode)
-        self._record = episode.agents[self._agent]
+    def _resume_from_replay(self) -> None:
+        self._own = self._running().agents[self._agent]
 
     def _clear(self) -> None:
         super()._clear()
-        self._record = None
+        self._own = None
 
 
 class SimulationGoalEnv(SimulationEnv):
@@ -128,7 +133,7 @@ class SimulationGoalEnv(SimulationEnv):
     ``achieved_goal`` and ``desired_goal``.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the environment of a plan.
 
         Raises:
@@ -136,7 +141,7 @@ class SimulationGoalEnv(SimulationEnv):
         """
         self.check(plan)
         self._definition = plan.active[0].definition
-        super().__init__(with_goals(plan))
+        super().__init__(with_goals(plan), session)
         self._made_of = plan
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:

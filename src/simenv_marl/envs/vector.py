@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from ..errors import (
     OptionValueError,
     ReentrancyError,
 )
-from .base import one_at_a_time
-from .rows import Actions, Batch, Row, Seat, Seating, Told
-from .workers import Recipe, Workers
+from .batches import Actions, Batch
+from .gymnasium_base import OneAgentView
+from .rows import Row, SubEnvironments, Told
+from .worker import Recipe
+from .workers import Workers
 
 
 class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
@@ -62,25 +65,25 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         self._mode = _mode(autoreset_mode)
         self._copy = bool(copy)
         plan = recipe.plan()
-        seating = Seating(plan, recipe.view)
+        common = SubEnvironments(plan, recipe.view)
         self.render_mode = plan.options.render_mode
-        self.metadata = {**seating.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space = seating.single_observation_space
-        self.single_action_space = seating.single_action_space
+        self.metadata = {**common.metadata, "autoreset_mode": self._mode}
+        self.single_observation_space = common.single_observation_space
+        self.single_action_space = common.single_action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._actions = Actions(seating, self.num_envs)
-        self._begun = self._moving = False
+        point = common.plan.active[0] if common.single else None
+        self._actions = Actions(self.single_action_space, self.num_envs, point)
+        self._begun = False
+        self._moving = Lock()
         self._crew: Row | Workers
         if workers:
-            self._crew = Workers(recipe, seating, self._mode, self.num_envs, workers, context)
+            self._crew = Workers(recipe, common, self._mode, self.num_envs, workers, context)
         else:
             batch = Batch(create_empty_array(self.single_observation_space, self.num_envs), self.num_envs)
-            self._crew = Row(seating, batch, self._mode, self.num_envs)
+            self._crew = Row(common, batch, self._mode, self.num_envs)
         self._batch = self._crew.batch
         self._finalizer = weakref.finalize(self, self._crew.abandon)
-        if workers or plan.options.driver == "thread":
-            one_at_a_time(self)
         self.closed = False
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -112,7 +115,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             told = self._crew.reset(seeds, options, chosen)
             self._begun = True
         finally:
-            self._moving = False
+            self._moving.release()
         observations = self._batch.observations
         return duplicate(observations) if self._copy else observations, _merged(told, self.num_envs)
 
@@ -152,7 +155,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 crew.check(parts)
             told = crew.step(parts)
         finally:
-            self._moving = False
+            self._moving.release()
         batch = self._batch
         observations = batch.observations
         return (
@@ -164,11 +167,13 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         )
 
     def _enter(self) -> None:
-        if self._moving:
-            raise ReentrancyError("the environment was used from inside its own simulations or mappings")
         if self.closed:
             raise ClosedError("the environment is closed; make another one")
-        self._moving = True
+        if not self._moving.acquire(blocking=False):
+            raise ReentrancyError(
+                "the environment was used from inside its own simulations or mappings, or while another thread was"
+                " stepping, resetting or closing it"
+            )
 
     def _seeds(self, seed: Any) -> list[int | None]:
         if seed is None or isinstance(seed, (int, np.integer)):
@@ -181,27 +186,27 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _chosen(self, options: dict[str, Any] | None) -> tuple[list[int], dict[str, Any] | None]:
         """Which simulations are to be reset, and with which options."""
-        everybody = list(range(self.num_envs))
+        numbers = list(range(self.num_envs))
         if options is None or "reset_mask" not in options:
-            return everybody, options
+            return numbers, options
         mask = options["reset_mask"]
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
             raise OptionValueError(f"reset_mask must be a bool array of shape ({self.num_envs},), not {mask!r}")
         chosen: list[int] = np.flatnonzero(mask).tolist()
         if not chosen:
             raise OptionValueError("reset_mask names no simulation that is to be reset")
-        if chosen != everybody and not self._begun:
+        if chosen != numbers and not self._begun:
             raise NotResetError("there are no episodes yet; call reset() without a reset_mask first")
-        if chosen != everybody and self._crew.failed:
+        if chosen != numbers and self._crew.failed:
             raise EpisodeOverError("an error has ended the episodes; call reset() without a reset_mask")
         return chosen, {name: value for name, value in options.items() if name != "reset_mask"}
 
     # -- the simulations --------------------------------------------------------------------------
 
     @property
-    def envs(self) -> list[Seat]:
+    def envs(self) -> list[OneAgentView]:
         """The Gymnasium environments of the simulations, in their order."""
-        return list(self._crew.seats)
+        return list(self._crew.views)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each sub-environment, or get its attribute.
@@ -222,7 +227,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             return tuple(self._crew.call(name, args, kwargs))
         finally:
-            self._moving = False
+            self._moving.release()
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """The attribute of that name of each sub-environment."""
@@ -246,7 +251,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             self._crew.set_attr(name, values)
         finally:
-            self._moving = False
+            self._moving.release()
 
     @property  # type: ignore[misc]  # one generator for each cannot be set as one
     def np_random(self) -> Any:
@@ -275,7 +280,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             self._crew.close()
         finally:
-            self._moving = False
+            self._moving.release()
             self.closed = not self._crew.suspended
             if self.closed:
                 self._finalizer.detach()

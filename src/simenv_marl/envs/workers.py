@@ -1,11 +1,8 @@
-"""Rows of simulations in processes of their own, which share arrays with the process of their user.
+"""Rows of simulations in processes of their own: how their user starts them, asks them, and brings them to an end.
 
-Between the two goes one message for all the simulations of a worker, and one back. Observations, rewards and flags
-lie in memory that both see; observations of a kind that has no array go along with the message.
-
-Nothing here can wait for ever: whoever waits for a worker also waits for its death, and a worker whose user is gone
-finds its pipe closed. The memory has no name and there are no semaphores, so that nothing is left behind even by a
-process that is killed.
+Nothing here can wait for ever: a wait for a worker also is one for its death, and a worker whose user is gone finds its
+pipe closed. The memory has no name and there are no semaphores, so that nothing is left behind even by a process that
+is killed.
 """
 
 from __future__ import annotations
@@ -13,187 +10,23 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
-import signal
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from math import prod
 from multiprocessing.connection import Connection, wait
 from time import monotonic
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import concatenate, create_empty_array
-from numpy.typing import NDArray
+from gymnasium.vector.utils import concatenate
 
-from ..core.plan import Plan
-from ..core.processes import pack_error, pack_plainly, unpack_error
-from ..decision import registered_names
+from ..core.processes import pack_plainly, unpack_error
 from ..errors import OptionValueError, WorkerError, annotate, warn_user
-from .rows import Batch, Row, Seating, Told
+from .rows import SubEnvironments, Told
+from .worker import EXIT, Recipe, is_shareable, share_memory, shared_batch, work
 
 SECONDS_TO_CLOSE: Final = 10.0
 """How long a worker may take to unwind its simulations and to end."""
-
-EXIT: Final = b""
-"""The message that asks a worker to end."""
-
-_ALIGNMENT: Final = 64
-
-
-# -- shared arrays --------------------------------------------------------------------------------
-
-
-def shareable(space: spaces.Space[Any]) -> bool:
-    """Whether batches of a space are arrays of one size, and nothing else."""
-    if isinstance(space, spaces.Dict):
-        return all(map(shareable, space.spaces.values()))
-    if isinstance(space, spaces.Tuple):
-        return all(map(shareable, space.spaces))
-    return isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
-
-
-class Measure:
-    """Adds up the size of arrays, where they are made one behind the other."""
-
-    def __init__(self) -> None:
-        self.size = 0
-
-    def __call__(self, shape: Any, dtype: Any) -> NDArray[Any]:
-        """Have room for an array."""
-        self.size += _padded(shape, dtype)
-        return np.zeros(shape, dtype)
-
-
-class Arena(Measure):
-    """Makes arrays one behind the other in memory that processes share."""
-
-    def __init__(self, memory: Any) -> None:
-        super().__init__()
-        self._memory = memory
-
-    def __call__(self, shape: Any, dtype: Any) -> NDArray[Any]:
-        """Make an array of what lies there."""
-        array = np.frombuffer(self._memory, dtype, prod(shape), self.size).reshape(shape)
-        self.size += _padded(shape, dtype)
-        return array
-
-
-def _padded(shape: Any, dtype: Any) -> int:
-    size: int = prod(shape) * np.dtype(dtype).itemsize
-    return -(-size // _ALIGNMENT) * _ALIGNMENT
-
-
-def _batch(space: spaces.Space[Any], number: int, make: Callable[..., NDArray[Any]]) -> Batch:
-    """A batch whose arrays are made so, in an order that is always the same."""
-    shared = shareable(space)
-    observations = create_empty_array(space, number, make) if shared else create_empty_array(space, number)
-    return Batch(observations, number, make)
-
-
-def _part(batch: Any, share: slice) -> Any:
-    """Some of the rows of batched observations, as views."""
-    if isinstance(batch, dict):
-        return {key: _part(value, share) for key, value in batch.items()}
-    if isinstance(batch, tuple):
-        return tuple(_part(value, share) for value in batch)
-    return batch[share]
-
-
-# -- what goes to a worker ------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """What the simulations of a worker are made of, as it was given to ``vector_env``."""
-
-    simulation: Any
-    points: Any
-    options: Mapping[str, Any]
-    view: str | None
-
-    def plan(self) -> Plan:
-        """Draw up a plan of it."""
-        return Plan.draw_up(self.simulation, self.points, self.options)
-
-    def spelt_out(self, seating: Seating) -> Recipe:
-        """The same, with what only this process could find out: which points are registered, which agents there are."""
-        points, options = self.points, dict(self.options)
-        named = [named.point for named in seating.plan._named]
-        if points is None and [point.name for point in named] == registered_names():
-            points = registered_names()
-        if not seating.single:
-            options["possible_agents"] = seating.plan.options.possible_agents
-        return Recipe(self.simulation, points, options, "single" if seating.single else "joint")
-
-
-# -- in a worker ----------------------------------------------------------------------------------
-
-
-def work(pipe: Connection, others: Iterable[Connection], recipe: Any, memory: Any, setup: dict[str, Any]) -> None:
-    """The main function of a worker.
-
-    Args:
-        pipe: To its user.
-        others: Ends of pipes that it has inherited and that are not its own.
-        recipe: A pickled recipe.
-        memory: What both share.
-        setup: ``number`` of all simulations, ``first`` and ``end`` of the worker's own, ``mode``.
-    """
-    with suppress(ValueError):  # not in a main thread
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for its user, who then says what to do
-    for other in others:
-        other.close()
-    row: Row | None = None
-    try:
-        try:
-            row, sends_rows = _seated(pickle.loads(recipe), memory, **setup)
-        except BaseException as error:
-            _send(pipe, 0, error=error)
-            return
-        _send(pipe, 0)
-        while (message := pipe.recv_bytes()) != EXIT:
-            _serve(pipe, row, sends_rows, message)
-    except (EOFError, OSError):  # its user is gone
-        pass
-    finally:
-        if row is not None:
-            row.abandon()
-
-
-def _seated(recipe: Recipe, memory: Any, number: int, first: int, end: int, mode: AutoresetMode) -> tuple[Row, bool]:
-    seating = Seating(recipe.plan(), recipe.view)
-    space = seating.single_observation_space
-    whole, share = _batch(space, number, Arena(memory)), slice(first, end)
-    shared = shareable(space)
-    observations = _part(whole.observations, share) if shared else create_empty_array(space, end - first)
-    part = Batch(observations, end - first)
-    part.rewards, part.terminations = whole.rewards[share], whole.terminations[share]
-    part.truncations = whole.truncations[share]
-    return Row(seating, part, mode, end - first, first), not shared
-
-
-def _serve(pipe: Connection, row: Row, sends_rows: bool, message: bytes) -> None:
-    identity = 0
-    try:
-        identity, method, arguments = pickle.loads(message)
-        result = getattr(row, method)(*arguments)
-        if method in ("reset", "step"):
-            result = result, row.observed if sends_rows else None
-        answer = pack_plainly((identity, True, result))
-    except BaseException as error:
-        _send(pipe, identity, error=error)
-        return
-    pipe.send_bytes(answer)
-
-
-def _send(pipe: Connection, identity: int, *, error: BaseException | None = None) -> None:
-    pipe.send_bytes(pickle.dumps((identity, error is None, None if error is None else pack_error(error)), 5))
-
-
-# -- in the process of its user -------------------------------------------------------------------
 
 
 class Worker:
@@ -224,7 +57,8 @@ class Worker:
         forked = context.get_start_method() == "fork"
         self._process = context.Process(
             target=work,
-            args=(theirs, [*inherited, ours] if forked else [], recipe, memory, setup),
+            args=(theirs, [*inherited, ours] if forked else [], recipe, memory),
+            kwargs=setup,
             name=f"simenv_marl {self.name}",
             daemon=True,
         )
@@ -326,7 +160,7 @@ class Workers:
     """
 
     def __init__(
-        self, recipe: Recipe, seating: Seating, mode: AutoresetMode, number: int, workers: int, context: Any
+        self, recipe: Recipe, common: SubEnvironments, mode: AutoresetMode, number: int, workers: int, context: Any
     ) -> None:
         """Start the workers.
 
@@ -336,20 +170,18 @@ class Workers:
             BaseException: What making a simulation raises.
         """
         self._context = _context(context)
-        self._space, self._mode, self._number = seating.single_observation_space, mode, number
+        self._space, self._mode, self._number = common.single_observation_space, mode, number
         try:
-            self._recipe = pack_plainly(recipe.spelt_out(seating))
+            self._recipe = pack_plainly(recipe.spelt_out(common))
         except Exception as error:
             raise OptionValueError(
                 f"what the simulations are made of cannot be sent to another process ({type(error).__name__}: {error});"
                 " give a class or a factory that a module holds, or workers=0"
             ) from error
-        measure = Measure()
-        _batch(self._space, number, measure)
-        self._memory = self._context.RawArray("b", max(measure.size, 1))
-        self.batch = _batch(self._space, number, Arena(self._memory))
+        self._memory = share_memory(self._space, number, self._context)
+        self.batch = shared_batch(self._space, number, self._memory)
         self._rows: list[Any] = [None] * number
-        self._shared = shareable(self._space)
+        self._shared = is_shareable(self._space)
         self.failed = False
         self._identity = 0
         self._process = os.getpid()
@@ -457,7 +289,7 @@ class Workers:
         return set(np.flatnonzero(batch.terminations | batch.truncations).tolist())
 
     @property
-    def seats(self) -> list[Any]:
+    def views(self) -> list[Any]:
         """The environments of the simulations, which are not here."""
         raise AttributeError("the sub-environments are in other processes; use call(), get_attr() and set_attr()")
 

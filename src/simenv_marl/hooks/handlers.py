@@ -1,8 +1,8 @@
 """Handlers, and the calls in which they take part.
 
-A *target* is what handlers are attached to: a function of a model, an iterable, or a class whose instances
-iterate. Its *slot* holds the handlers that its calls are to run, made ready by whose they are: ``None`` for
-everybody, or the plugins of an environment, with everybody's before them. Empty, it costs one test.
+A *target* is what handlers are attached to: a function of a model (a ``Hook``), an iterable, or a class whose
+instances iterate. Its *slot* holds the handlers that its calls are to run, made ready by whose they are: ``None``
+for the whole process, or the plugins of an environment, with those of the whole process before them.
 
 A call runs the handlers that were there when it began. Items are looked at one by one.
 """
@@ -10,199 +10,21 @@ A call runs the handlers that were there when it began. Items are looked at one 
 from __future__ import annotations
 
 import inspect
-import reprlib
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass, field
-from functools import update_wrapper
 from itertools import count
-from threading import get_ident
-from types import FunctionType
 from typing import Any, Final
 from weakref import WeakSet
 
-from ..core.switch import PLUGGED
-from ..decision import point_of
-from ..errors import HandlerError, annotate
-from ..simulation import takes
-from .hook import EXPOSED, generate, is_alone, is_method, kind_of
-from .places import Place, title
-
-CALLS: Final = ("before", "after", "instead")
-ITEMS: Final = ("before_next", "after_next", "instead_next")
+from .attached import CALLS, ITEMS, Attached, Call, ChangedArgs, ChangedResult, short
+from .stacks import Taker, plugins_at_work
 
 Slot = dict[Any, "Handlers"]
 """By whose they are: the handlers of a target."""
 
-Record = Callable[[str, tuple[Any, ...], dict[str, Any]], "Call"]
+Record = Callable[[str, tuple[Any, ...], dict[str, Any]], Call]
 """Makes the entry of a call that begins."""
 
-_MOST: Final = 12
-"""Arguments beyond these a handler of a function that takes any number need not be able to take."""
-
-_NOTHING: Final = object()
-
 _NUMBERS: Final = count()
-
-_repr = reprlib.Repr()
-_repr.maxother = _repr.maxstring = 60
-
-
-class ChangedArgs:
-    """What a ``before`` handler returns to replace all arguments of the call.
-
-    Later handlers, the function itself and the ``after`` handlers receive these.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.args, self.kwargs = args, kwargs
-
-    def __repr__(self) -> str:
-        given = [repr(value) for value in self.args] + [f"{name}={value!r}" for name, value in self.kwargs.items()]
-        return f"ChangedArgs({', '.join(given)})"
-
-
-class ChangedResult:
-    """What an ``after`` handler returns to replace the result of the call."""
-
-    def __init__(self, value: Any) -> None:
-        self.value = value
-
-    def __repr__(self) -> str:
-        return f"ChangedResult({self.value!r})"
-
-
-@dataclass
-class Call:
-    """One call, as ``trace`` has recorded it.
-
-    Attributes:
-        target: The dotted name of the function.
-        arguments: What it was called with, in short.
-        result: What it has returned, in short; "raised ..." with an error; None while it runs.
-    """
-
-    target: str
-    arguments: str
-    result: str | None = field(default=None)
-
-    @classmethod
-    def of(cls, target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
-        """The entry of a call that begins."""
-        given = [_repr.repr(value) for value in args] + [
-            f"{name}={_repr.repr(value)}" for name, value in kwargs.items()
-        ]
-        return cls(target, ", ".join(given))
-
-
-# -- handlers -------------------------------------------------------------------------------------
-
-
-class Attached:
-    """A handler at a position of a target, made ready to be called.
-
-    Attributes:
-        handler: The handler.
-        target: What it is attached to.
-        position: Where.
-    """
-
-    __slots__ = ("_moved", "_wants_result", "handler", "position", "target")
-
-    def __init__(self, handler: Any, target: Target, position: str) -> None:
-        """Make sure that a handler fits.
-
-        Raises:
-            HandlerError: It does not, or there is no such position here.
-        """
-        if position not in target.positions:
-            known = position in CALLS + ITEMS
-            why = f"{target.name} {target.nature}" if known else "there is no such position"
-            raise HandlerError(
-                f"no handler can be attached {position!r} {target.name}: {why}; its positions are"
-                f" {', '.join(target.positions)}"
-            )
-        if not callable(handler):
-            raise HandlerError(f"the handler of {target.name} must be callable, not {handler!r}")
-        self.handler, self.target, self.position = handler, target, position
-        self._wants_result = position.startswith("after") and takes(handler, "_result")
-        self._moved = self._fit(target.signature)
-
-    def _fit(self, signature: inspect.Signature | None) -> frozenset[str]:
-        """Make sure that the handler can be called whenever the target can.
-
-        Returns:
-            What may be passed to the target by keyword, and to the handler only by position.
-        """
-        try:
-            own = inspect.signature(self.handler)
-        except (TypeError, ValueError):
-            return frozenset()  # nothing is known of it
-        if signature is None:
-            return frozenset()
-        parameters = list(signature.parameters.values())
-        positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-        keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY]
-        least = sum(p.default is p.empty for p in positional)
-        shapes = [
-            (number, [p for p in keywords if p.default is p.empty]) for number in range(least, len(positional) + 1)
-        ]
-        shapes.append((len(positional), keywords))
-        if any(p.kind is p.VAR_POSITIONAL for p in parameters):
-            shapes.append((len(positional) + _MOST, keywords))
-        extra = ["any_other_keyword"] if any(p.kind is p.VAR_KEYWORD for p in parameters) else []
-        result = ["_result"] if self._wants_result else []
-        try:
-            for number, named in shapes:
-                own.bind(*[None] * number, **dict.fromkeys([*(p.name for p in named), *extra, *result]))
-        except TypeError as error:
-            raise HandlerError(
-                f"the handler {title(self.handler)}{own} cannot be attached {self.position} {self.target.name}: it"
-                f" cannot be called with all arguments that {signature} takes ({error})"
-            ) from None
-        return frozenset(
-            p.name
-            for number, p in enumerate(positional)
-            if not _binds(own, number, [q.name for q in positional[number:] if q is p or q.default is q.empty] + result)
-        )
-
-    def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any], result: Any = _NOTHING) -> Any:
-        """Call the handler as the target was called."""
-        if kwargs and not self._moved.isdisjoint(kwargs):
-            args, kwargs = self._by_position(args, kwargs)
-        if self._wants_result:
-            kwargs = {**kwargs, "_result": result}
-        try:
-            return self.handler(*args, **kwargs)
-        except Exception as error:
-            self.annotate(error)
-            raise
-
-    def _by_position(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        signature = self.target.signature
-        assert signature is not None
-        left, names = dict(kwargs), list(signature.parameters)
-        last = max(names.index(name) for name in self._moved if name in kwargs)
-        filled = list(args)
-        for name in names[len(args) : last + 1]:
-            filled.append(left.pop(name, signature.parameters[name].default))
-        return tuple(filled), left
-
-    def annotate(self, error: Exception) -> None:
-        """Say in an error's notes which handler it came from."""
-        if isinstance(error, StopIteration) and self.position == "instead_next":
-            return  # that is how items end
-        note = f"simenv_marl: in the handler {title(self.handler)}, attached {self.position} {self.target.name}"
-        if note not in getattr(error, "__notes__", ()):
-            annotate(error, note)
-
-
-def _binds(signature: inspect.Signature, number: int, keywords: list[str]) -> bool:
-    """Whether so many arguments and these keywords can be passed."""
-    try:
-        signature.bind(*[None] * number, **dict.fromkeys(keywords))
-    except TypeError:
-        return False
-    return True
 
 
 class Handlers:
@@ -216,15 +38,15 @@ class Handlers:
         self.before, self.after = self._positions["before"], self._positions["after"]
         self.instead = self._positions["instead"][-1] if self._positions["instead"] else None
 
-    def call(self, rule: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Run a call of a plain function."""
+    def call(self, inner: Taker, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Run a call of a plain function, of which ``inner`` is what lies inside all handlers."""
         if self.instead is not None:
             return self.instead(args, kwargs)
         for attached in self.before:
             changed = attached(args, kwargs)
             if isinstance(changed, ChangedArgs):
                 args, kwargs = changed.args, changed.kwargs
-        result = rule(*args, **kwargs)
+        result = inner(args, kwargs)
         for attached in self.after:
             changed = attached(args, kwargs, result)
             if isinstance(changed, ChangedResult):
@@ -232,7 +54,7 @@ class Handlers:
         return result
 
     def iterate(
-        self, slot: Slot, rule: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
+        self, slot: Slot, inner: Taker, args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> Generator[Any, Any, Any]:
         """Run a call of a generator function."""
         if self.instead is not None:
@@ -249,16 +71,16 @@ class Handlers:
             if isinstance(changed, ChangedArgs):
                 args, kwargs = changed.args, changed.kwargs
         if any(self._positions[position] for position in ITEMS):
-            result = yield from _each(slot, rule(*args, **kwargs), args, kwargs)
+            result = yield from _each(slot, inner(args, kwargs), args, kwargs)
         else:
-            result = yield from rule(*args, **kwargs)
+            result = yield from inner(args, kwargs)
         for attached in self.after:
             changed = attached(args, kwargs, result)
             if isinstance(changed, ChangedResult):
                 result = changed.value
         return result
 
-    async def wait(self, rule: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    async def wait(self, inner: Taker, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Run a call of a coroutine function, whose handlers may be coroutine functions, too."""
         if self.instead is not None:
             return await _awaited(self.instead, self.instead(args, kwargs))
@@ -266,7 +88,7 @@ class Handlers:
             changed = await _awaited(attached, attached(args, kwargs))
             if isinstance(changed, ChangedArgs):
                 args, kwargs = changed.args, changed.kwargs
-        result = await rule(*args, **kwargs)
+        result = await inner(args, kwargs)
         for attached in self.after:
             changed = await _awaited(attached, attached(args, kwargs, result))
             if isinstance(changed, ChangedResult):
@@ -304,7 +126,7 @@ class _Recording:
         return self._results
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        result = _repr.repr(self._results[0]) if error is None else f"raised {_repr.repr(error)}"
+        result = short(self._results[0]) if error is None else f"raised {short(error)}"
         for call in self._calls:
             call.result = result
 
@@ -375,41 +197,38 @@ def next_item(slot: Slot, fetch: Callable[[], Any], iterable: Any) -> Any:
     return fetch() if found is None else found.next(fetch, (iterable,), {})
 
 
+def _find(slot: Slot) -> Handlers | None:
+    """The handlers for what is at work here."""
+    return slot.get(plugins_at_work()) or slot.get(None)
+
+
 # -- calls ----------------------------------------------------------------------------------------
 
 
-def _find(slot: Slot) -> Handlers | None:
-    """The handlers for what is at work in this thread."""
-    return slot.get(PLUGGED.get(get_ident())) or slot.get(None)
-
-
-_NONE_HERE: Final = "(found := SLOT.get(PLUGGED.get(get_ident())) or SLOT.get(None)) is None"
-"""What ``_find`` finds out, without the call."""
-
-
-def _call(found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+def _call(found: Handlers, slot: Slot, inner: Taker, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     if not found.recorders:
-        return found.call(rule, args, kwargs)
+        return found.call(inner, args, kwargs)
     with found.recording(args, kwargs) as results:
-        results.append(found.call(rule, args, kwargs))
+        results.append(found.call(inner, args, kwargs))
     return results[0]
 
 
 def _iterate(
-    found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+    found: Handlers, slot: Slot, inner: Taker, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Generator[Any, Any, Any]:
     with found.recording(args, kwargs) as results:
-        results.append((yield from found.iterate(slot, rule, args, kwargs)))
+        results.append((yield from found.iterate(slot, inner, args, kwargs)))
     return results[0]
 
 
-async def _wait(found: Handlers, slot: Slot, rule: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+async def _wait(found: Handlers, slot: Slot, inner: Taker, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     with found.recording(args, kwargs) as results:
-        results.append(await found.wait(rule, args, kwargs))
+        results.append(await found.wait(inner, args, kwargs))
     return results[0]
 
 
-_HANDLED: Final = {"function": _call, "generator": _iterate, "coroutine": _wait}
+AROUND: Final = {"function": _call, "generator": _iterate, "coroutine": _wait}
+"""By what a call returns: how handlers lie around what is inside them."""
 
 
 # -- targets --------------------------------------------------------------------------------------
@@ -425,8 +244,8 @@ class Target:
         signature: What it can be called with, and so what handlers are; None where that is not known.
         slot: Its handlers, by whose they are. Empty while it has none.
         number: How many targets there were before it.
-        place: Where it has to be set as long as it has handlers; None where it is there for good.
-        attached: The handlers for everybody, in the order in which they were attached.
+        exposed: Whether it was exposed to plugins, and is there for good.
+        attached: The handlers for the whole process, in the order in which they were attached.
     """
 
     all: Final[WeakSet[Target]] = WeakSet()
@@ -435,8 +254,7 @@ class Target:
         self.name, self.positions, self.nature, self.signature = name, positions, nature, signature
         self.number = next(_NUMBERS)
         self.slot: Slot = {}
-        self.place: Place | None = None
-        self.patches: list[tuple[Place, int, Callable[[Any], Any]]] = []
+        self.exposed = False
         self.attached: list[Attached] = []
         self._of_environments: dict[Any, list[Attached]] = {}
         self._recorders: list[Record] = []
@@ -444,7 +262,12 @@ class Target:
         Target.all.add(self)
 
     def __repr__(self) -> str:
-        return f"<Target {self.name}>"
+        return f"<{type(self).__name__} {self.name}>"
+
+    @property
+    def stale(self) -> bool:
+        """Whether something else has been set in its place, while nothing was set there for it."""
+        return False
 
     def hold(self) -> None:
         """Be set where it has to be, until as many calls of ``let_go``.
@@ -452,23 +275,12 @@ class Target:
         Raises:
             PatchError: A place refuses.
         """
-        done = []
-        try:
-            for place, level, wrap in self.patches:
-                place.hold(level, wrap)
-                done.append((place, level))
-        except BaseException:
-            for place, level in done:
-                place.let_go(level)
-            raise
 
     def let_go(self) -> None:
         """Undo one ``hold``."""
-        for place, level, _ in self.patches:
-            place.let_go(level)
 
     def add(self, attached: Attached | Record, plugins: Any = None) -> None:
-        """Attach a handler, for everybody or for an environment's plugins; or have all calls recorded.
+        """Attach a handler, for the whole process or for an environment's plugins; or have all calls recorded.
 
         Raises:
             PatchError: What it has to be set in front of cannot be patched.
@@ -510,88 +322,7 @@ class Target:
             for plugins in list(self.slot):
                 if plugins not in slot:
                     self.slot.pop(plugins, None)
+            self._changed()
 
-
-class FunctionTarget(Target):
-    """A function, whatever its calls return, with an exposed function in front of it."""
-
-    def __init__(self, function: Any, name: str, *, like: Any = None, bound: bool = True) -> None:
-        """Make the target of a function.
-
-        Args:
-            function: The function.
-            name: Its dotted name.
-            like: A function that tells what calls return, where the function only passes them on to it.
-            bound: Whether, in a class, its first argument is what it is called on.
-
-        Raises:
-            PatchError: An async generator function, to which no position applies.
-        """
-        like = function if like is None else like
-        self._kind = kind_of(like, name)
-        known = point_of(like)
-        self._own: inspect.Signature | None = None
-        signature: inspect.Signature | None = None
-        try:
-            # A decision function's own parameters are made such that all calls can be told apart.
-            self._own = inspect.signature(known[0].rule if known else function, follow_wrapped=False)
-            signature = inspect.signature(function)
-        except (TypeError, ValueError):
-            self._own = None  # nothing is known of it
-        self._alone = self._own is not None and is_alone(self._own, bound=bound and is_method(function, name))
-        iterates = self._kind == "generator"
-        super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is no generator function", signature)
-
-    def wrap(self, rule: Any) -> FunctionType:
-        """Make an exposed function of this target.
-
-        Args:
-            rule: What stands behind it: the function, or what is set in its place for a while.
-        """
-        return generate(
-            rule,
-            self._own,
-            what=EXPOSED,
-            name=self.name,
-            kind=self._kind,
-            alone=self._alone,
-            guard="SLOT",
-            ask="handled(found, SLOT, rule, {}, {})",
-            unless=_NONE_HERE,
-            namespace={
-                "SLOT": self.slot,
-                "PLUGGED": PLUGGED,
-                "get_ident": get_ident,
-                "target": self,
-                "handled": _HANDLED[self._kind],
-            },
-        )
-
-
-_ONE = inspect.Signature([inspect.Parameter("iterable", inspect.Parameter.POSITIONAL_ONLY)])
-
-
-class IterableTarget(Target):
-    """An iterable, or a class whose instances are."""
-
-    def __init__(self, name: str, nature: str = "is not called: it is iterated over") -> None:
-        super().__init__(name, ITEMS, nature, _ONE)
-
-    def wrap_iter(self, rule: Any) -> Any:
-        """Make the ``__iter__`` of a class whose instances' items have handlers."""
-        slot = self.slot
-
-        def __iter__(iterable: Any) -> Any:  # noqa: N807
-            iterator = rule(iterable)
-            return iterator if iterator is iterable else Items(iterator, slot, iterable)
-
-        return update_wrapper(__iter__, rule)
-
-    def wrap_next(self, rule: Any) -> Any:
-        """Make its ``__next__``."""
-        slot = self.slot
-
-        def __next__(iterable: Any) -> Any:  # noqa: N807
-            return next_item(slot, lambda: rule(iterable), iterable)
-
-        return update_wrapper(__next__, rule)
+    def _changed(self) -> None:
+        """Its handlers are others than before."""

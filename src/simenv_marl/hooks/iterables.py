@@ -8,7 +8,8 @@ from typing import Any, Final
 
 import wrapt
 
-from .handlers import Items, IterableTarget, Slot, next_item
+from .handlers import Items, Slot, next_item
+from .targets import IterableTarget
 
 
 class ExposedIterable(wrapt.ObjectProxy):  # type: ignore[type-arg]
@@ -57,4 +58,6 @@ KINDS: Final = (ExposedIterable, ExposedIterator)
 
 def expose(iterable: Any) -> Any:
     """Make an iterable to which handlers can be attached."""
-    return proxy(iterable, IterableTarget(f"an iterable {type(iterable).__name__}"))
+    target = IterableTarget(f"an iterable {type(iterable).__name__}")
+    target.exposed = True
+    return proxy(iterable, target)

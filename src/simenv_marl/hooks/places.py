@@ -1,9 +1,7 @@
-"""Places in a model, and what is to stand there: patches for what no one has decorated or exposed.
+"""Places in a model: where a function is found by its dotted name, set, and put back.
 
-A *place* is where a function is found: an attribute of a class, or of a module, and then under all names
-that loaded modules have for it. Others hold it at one of its *levels* for as long as they need something in
-front of the function, or in its stead; what stands there is composed of the levels that are held, and when
-nobody holds it any more it is what stood there before.
+A *place* is an attribute of a class; or a function of a module, under all names that loaded modules have for it.
+While a hook is held whose function was neither decorated nor exposed, a stand-in is set at its place.
 """
 
 from __future__ import annotations
@@ -15,30 +13,19 @@ from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from sys import modules
-from types import FunctionType, ModuleType
-from typing import Any, ClassVar, Final
+from types import FunctionType, MethodType, ModuleType
+from typing import Any, Final
 from weakref import WeakValueDictionary
 
-from ..decision import point_of, unwrapped
 from ..errors import PatchError
-from .hook import beneath, exposure
-
-DECIDED: Final = 0
-"""The level of decision functions, which are in the place of the function."""
-
-ITERATED: Final = 1
-"""The level of what hands out the items of a class's instances."""
-
-HANDLED: Final = 2
-"""The level of exposed functions: handlers lie outside everything else."""
-
-Wrap = Callable[[Any], Any]
-"""Makes what stands in front of a function."""
+from .attached import title
+from .hook import Hook, beneath, hook_of
+from .stacks import LOCK
 
 
 @dataclass(frozen=True)
 class Purpose:
-    """What somebody looks a name up for, so that errors can say so.
+    """What a name is looked up for, so that errors can say so.
 
     Attributes:
         noun: What is looked for.
@@ -103,14 +90,45 @@ def _longest_module(parts: list[str]) -> tuple[ModuleType | None, list[str]]:
     return module, parts[-1:]
 
 
+def unbind(function: Any) -> tuple[FunctionType, type | None]:
+    """Find the plain function under a binding.
+
+    Args:
+        function: A function, staticmethod or classmethod, or one of these as an attribute of its class.
+
+    Returns:
+        The function, and ``staticmethod`` or ``classmethod`` where it was bound so.
+
+    Raises:
+        PatchError: It is something else.
+    """
+    if isinstance(function, (staticmethod, classmethod)):
+        inner, binding = function.__func__, type(function)
+        if isinstance(inner, FunctionType):
+            return inner, binding
+    elif isinstance(function, MethodType):
+        if isinstance(function.__self__, type) and isinstance(function.__func__, FunctionType):
+            return function.__func__, classmethod
+        raise PatchError(
+            f"{function!r} is bound to one object; name the function of its class,"
+            f" {type(function.__self__).__name__}.{function.__name__}"
+        )
+    elif isinstance(function, FunctionType):
+        # A staticmethod that was fetched from its class is a plain function: see how the class holds it.
+        owner: Any = modules.get(function.__module__)
+        path = function.__qualname__.split(".")
+        for name in path[:-1]:
+            owner = getattr(owner, name, None)
+        held = vars(owner).get(path[-1]) if isinstance(owner, type) else None
+        if isinstance(held, staticmethod) and held.__func__ is function:
+            return function, staticmethod
+        return function, None
+    raise PatchError(f"{function!r} is no function written in Python")
+
+
 def leads_there(name: str) -> bool:
     """Whether a dotted name is sure to lead to the same in another process."""
     return "<" not in name and not name.startswith("__main__.")
-
-
-def title(key: Any) -> str:
-    """What to call whatever somebody has named."""
-    return key if isinstance(key, str) else getattr(key, "__qualname__", repr(key))
 
 
 def owner_at_hand(function: FunctionType) -> type:
@@ -120,8 +138,7 @@ def owner_at_hand(function: FunctionType) -> type:
         PatchError: There is none.
     """
     for owner in all_classes():
-        held = beneath(plain(vars(owner).get(function.__name__)))
-        if held is function or unwrapped(held) is function:
+        if beneath(plain(vars(owner).get(function.__name__))) is function:
             return owner
     raise PatchError(
         f"{function.__module__}.{function.__qualname__} is not what is found under that name, nor in any class;"
@@ -155,40 +172,37 @@ def held_at(owner: Any, attribute: str) -> Any:
 
 
 def found_at(owner: Any, attribute: str) -> Any:
-    """What a class holds or inherits under a name, apart from what is set there for a while."""
-    place = Place.known(owner, attribute)
-    return held_at(owner, attribute) if place is None else place.held
-
-
-def lasting(function: Any) -> Any:
-    """A function without its handlers, and without the decision function that is set there for a while."""
-    function = beneath(function)
-    known = point_of(function)
-    return unwrapped(function) if known is not None and known[1] is None else function
+    """What a class holds or inherits under a name, apart from what is set for a while in front of the inherited."""
+    for place in owner.__mro__ if isinstance(owner, type) else (owner,):
+        held = vars(place).get(attribute)
+        hook = hook_of(plain(held))
+        if held is not None and not (hook is not None and hook.place is not None and hook.place.passes_on):
+            return held
+    return getattr(owner, attribute, None)
 
 
 # -- places ---------------------------------------------------------------------------------------
 
 
 class Place:
-    """A place at which a function is found. There is one for each, shared by all who need it.
+    """A place at which a function is found.
 
     Attributes:
         owner: The class or module.
         attribute: The function's name there.
-        name: Its dotted name.
-        function: The function, without its binding and its handlers; where it is inherited, the base class's.
         held: What stood there, as it stood there.
-        rule: What runs when nobody has set anything: the function, or what finds the inherited one.
+        function: The function, without its binding; where it is inherited, the base class's.
         binding: ``staticmethod``, ``classmethod`` or None.
-        exposure: The target of handlers that it has of its own, in front of it for good; None if it has none.
-        target, items: The targets of handlers that come and go with them, of calls and of a class's items; None as
-            long as nobody has asked for them.
+        inherited: Whether the class only inherits it.
+        passes_on: Whether the rule finds the inherited function, and so stands in front of the base class's.
     """
 
-    _all: ClassVar[WeakValueDictionary[tuple[Any, str], Place]] = WeakValueDictionary()
-
     def __init__(self, name: str, owner: Any, attribute: str, purpose: Purpose) -> None:
+        """Look at a place.
+
+        Raises:
+            PatchError: What stands there cannot be patched.
+        """
         held = held_at(owner, attribute)
         function = plain(held)
         slot = inspect.ismethoddescriptor(held) and not isinstance(held, (staticmethod, classmethod))
@@ -199,175 +213,126 @@ class Place:
                 " Python; name a function that it calls, or that calls it"
             )
         self.owner, self.attribute, self.name = owner, attribute, name
-        self.held, self.inherited = held, attribute not in vars(owner)
-        self.binding = type(held) if held is not function else None
-        self.function = beneath(function)
-        self.exposure = None if self.inherited else exposure(function)
-        self.target: Any = None
-        self.items: Any = None
-        self.rule = _next_in_line(owner, attribute, self.function, self.binding) if self.inherited else self.function
-        self._purpose = purpose
-        self._levels: dict[int, int] = {}  # how many hold each level
-        self._wraps: dict[int, Wrap] = {}
-        self._made: dict[tuple[int, ...], Any] = {}  # what stands there, by the levels that are held
-        self._former: list[Any] = []  # what has stood there since
-        self._before: dict[tuple[Any, str], Any] = {}  # what stood under a name of a module
-
-    @classmethod
-    def at(cls, name: str, owner: Any, attribute: str, purpose: Purpose) -> Place:
-        """The place of an attribute of a class or module.
-
-        Raises:
-            PatchError: What stands there cannot be patched.
-        """
-        # A function of a module may have names in several modules, and is one place all the same.
-        held = held_at(owner, attribute)
-        key = (owner, attribute) if isinstance(owner, type) else (lasting(held), "")
-        place = cls._all.get(key)
-        if place is None or place.stale:
-            place = cls._all[key] = cls(name, owner, attribute, purpose)
-        return place
-
-    @classmethod
-    def known(cls, owner: Any, attribute: str) -> Place | None:
-        """The place of an attribute of a class, if somebody holds it."""
-        place = cls._all.get((owner, attribute)) if isinstance(owner, type) else None
-        return place if place is not None and place._levels else None
+        self.held, self.function = held, beneath(function)
+        self.inherited = self.passes_on = attribute not in vars(owner)
+        self.binding: Any = type(held) if held is not function else None
+        self._noun = purpose.noun
+        self._before: dict[tuple[Any, str], Any] = {}  # what stood under names of modules
 
     @property
-    def stale(self) -> bool:
-        """Whether something else has been set there, while nobody held it."""
+    def rule(self) -> Any:
+        """What runs there: the function, or what finds the inherited one."""
+        if not self.inherited:
+            return self.function
+        return _next_in_line(self.owner, self.attribute, self.function, self.binding)
+
+    def is_free(self, hook: Hook) -> bool:
+        """Whether what stands there is what stood there at first, or a stand-in of a hook."""
         there = vars(self.owner).get(self.attribute)
-        return not self._levels and there is not (None if self.inherited else self.held)
+        return there is (None if self.inherited else self.held) or hook_of(plain(there)) is hook
 
-    def hold(self, level: int, wrap: Wrap) -> None:
-        """Have something set there until as many calls of ``let_go``.
-
-        Args:
-            level: At which level.
-            wrap: Makes it, of what stands at the levels below. The same for all who hold this level.
+    def put(self, hook: Hook, stand_in: FunctionType) -> None:
+        """Set a stand-in of a hook, unless one stands there already.
 
         Raises:
             PatchError: The place refuses, or something else has been set there meanwhile.
         """
-        if self.stale:
-            raise PatchError(f"{self.name} has been replaced since it was named as a {self._purpose.noun}")
-        self._wraps[level] = wrap
-        # Counted at once: the collector may come in between and close an environment that holds it, too.
-        self._levels[level] = self._levels.get(level, 0) + 1
-        if self._levels[level] == 1:
-            try:
-                self._set()
-            except BaseException:
-                del self._levels[level]
-                with suppress(PatchError):
-                    self._set()
-                raise
-
-    def let_go(self, level: int) -> None:
-        """Undo one ``hold``; the last one puts back what stood there."""
-        if self._levels[level] > 1:
-            self._levels[level] -= 1
-        else:
-            del self._levels[level]
-            try:
-                self._set()
-            except BaseException:  # an interrupt has come in between
-                self._set()
-                raise
-
-    @classmethod
-    def where(cls, function: Any) -> Place | None:
-        """The place at which a function is set for a while, or was until lately."""
-        for place in list(cls._all.values()):
-            if not place.stale and any(
-                plain(made) is function or beneath(plain(made)) is function for made in place._made.values()
-            ):
-                return place
-        return None
-
-    def expose(self, target: Any) -> Any:
-        """Have an exposed function stand there for good, also when nobody holds the place any more.
-
-        Args:
-            target: The target that it is to belong to.
-
-        Returns:
-            What now stands there.
-        """
-        wrapped = target.wrap(self.rule)
-        self._former += [self.held, *self._made.values()]
-        self._made.clear()
-        self._before.clear()
-        self.held = wrapped if self.binding is None else self.binding(wrapped)
-        self.exposure, self.inherited = target, False
-        self._set()
-        return self._compose()
-
-    def _compose(self) -> Any:
-        """What is to stand there."""
-        levels = tuple(sorted(self._levels))
-        if not levels:
-            return self.held
-        if levels not in self._made:
-            made = self.rule
-            for level in levels:
-                if level != HANDLED or self.exposure is None:
-                    made = self._wraps[level](made)
-            if self.exposure is not None:
-                # Its own handlers stay outside; where nothing lies beneath them, it is what stood there.
-                made = plain(self.held) if made is self.rule else self.exposure.wrap(made)
-            self._made[levels] = made if self.binding is None else self.binding(made)
-        return self._made[levels]
-
-    def _set(self) -> None:
-        new = None
+        if not self.is_free(hook):
+            raise PatchError(f"{self.name} has been replaced since it was named as a {self._noun}")
         try:
-            while new is None or self._compose() is not new:  # which may have changed meanwhile
-                new = self._compose()
-                if isinstance(self.owner, type):
-                    self._set_in_class(new)
-                else:
-                    self._set_in_modules(new)
+            if not isinstance(self.owner, type):
+                self._put_in_modules(stand_in)
+            elif hook_of(plain(vars(self.owner).get(self.attribute))) is not hook:
+                setattr(self.owner, self.attribute, stand_in if self.binding is None else self.binding(stand_in))
         except (TypeError, AttributeError) as error:
-            raise PatchError(f"{self.name} cannot be a {self._purpose.noun}: {error}") from error
+            raise PatchError(f"{self.name} cannot be a {self._noun}: {error}") from error
 
-    def _set_in_class(self, new: Any) -> None:
-        there = vars(self.owner).get(self.attribute)
-        ours = [self.held, *self._made.values(), *self._former]
-        if there is not None and not any(there is own for own in ours):
-            return  # somebody has set something else since: leave it alone
-        if new is not self.held or not self.inherited:
-            setattr(self.owner, self.attribute, new)
-        elif there is not None:
+    def put_back(self, stand_in: FunctionType) -> None:
+        """Put back what stood there, unless something else has been set meanwhile."""
+        if not isinstance(self.owner, type):
+            self._put_back_in_modules(stand_in)
+        elif plain(vars(self.owner).get(self.attribute)) is not stand_in:
+            pass  # which is left alone
+        elif self.inherited:
             delattr(self.owner, self.attribute)
+        else:
+            setattr(self.owner, self.attribute, self.held)
 
-    def _set_in_modules(self, new: Any) -> None:
-        # A function of a module is found also where other modules imported it by name, maybe before it was exposed.
-        originals = [self.held, self.function]
-        ours = {id(own) for own in (*originals, *self._made.values(), *self._former)}
-        for module in list(modules.values()):
-            if not isinstance(module, ModuleType):
-                continue
-            for name, value in list(vars(module).items()):
-                if id(value) not in ours:
-                    continue
-                if any(value is original for original in originals):
-                    self._before.setdefault((module, name), value)
-                setattr(module, name, new if self._levels else self._before.get((module, name), self.held))
-        if not self._levels:
-            self._before.clear()
+    def _put_in_modules(self, stand_in: FunctionType) -> None:
+        # A function is found also where other modules imported it by name, maybe before it was exposed.
+        for module, name, value in _names_in_modules():
+            if value is self.function or (value is self.held and hook_of(value) is None):
+                self._before[module, name] = value
+                setattr(module, name, stand_in)
+
+    def _put_back_in_modules(self, stand_in: FunctionType) -> None:
+        for module, name, value in _names_in_modules():
+            if value is stand_in:
+                setattr(module, name, self._before.get((module, name), self.held))
+        self._before.clear()
+
+
+def _names_in_modules() -> list[tuple[ModuleType, str, Any]]:
+    """All that loaded modules have, with the names under which they have it."""
+    return [
+        (module, name, value)
+        for module in list(modules.values())
+        if isinstance(module, ModuleType)
+        for name, value in list(vars(module).items())
+    ]
 
 
 def places_of(function: Any) -> list[tuple[Any, str]]:
     """All names of loaded modules under which a function is found."""
-    return [
-        (module, name)
-        for module in list(modules.values())
-        if isinstance(module, ModuleType)
-        for name, value in list(vars(module).items())
-        if value is function
-    ]
+    return [(module, name) for module, name, value in _names_in_modules() if value is function]
+
+
+# -- hooks at places ------------------------------------------------------------------------------
+
+_PLACED: Final[WeakValueDictionary[Any, Hook]] = WeakValueDictionary()
+"""The hooks that are set for a while: by class and attribute, or by function of a module. Weak: they go with those who
+hold them."""
+
+
+def hook_at(name: str, owner: Any, attribute: str, purpose: Purpose) -> Hook:
+    """The hook of an attribute of a class or module: the one that stands there, or one that can be set there.
+
+    Raises:
+        PatchError: What stands there cannot be patched.
+    """
+    with LOCK:
+        held = held_at(owner, attribute)
+        hook = hook_of(plain(held))
+        if hook is not None and attribute in vars(owner):
+            return hook
+        # A function of a module may have names in several modules, and is one place all the same.
+        key = (owner, attribute) if isinstance(owner, type) or not isinstance(held, FunctionType) else (held,)
+        hook = _PLACED.get(key)
+        if hook is None or not hook.place.is_free(hook):
+            place = Place(name, owner, attribute, purpose)
+            hook = _PLACED[key] = Hook(
+                place.rule, name, bound=place.binding is not staticmethod, like=plain(held), place=place
+            )
+        return hook
+
+
+def stays(hook: Hook) -> None:
+    """A stand-in of a hook that was set for a while is going to stand somewhere for good."""
+    with LOCK:
+        hook.for_good = True
+        for key in [key for key, other in _PLACED.items() if other is hook]:
+            del _PLACED[key]
+
+
+def imported_elsewhere(hook: Hook, purpose: Purpose) -> None:
+    """See to it that an exposed function of a module is found where others had imported it before."""
+    if hook.place is not None or hook.slot or not isinstance(hook.function, FunctionType):
+        return
+    owner: Any = None
+    with suppress(Exception):  # where it is not found by its name, others may not find it either
+        owner, attribute = resolve(hook.name, purpose)
+    if isinstance(owner, ModuleType) and hook_of(held_at(owner, attribute)) is hook:
+        hook.place = Place(hook.name, owner, attribute, purpose)
 
 
 def _next_in_line(owner: type, attribute: str, function: Any, binding: type | None) -> Any:

@@ -1,39 +1,32 @@
 """Many simulations side by side, whose decisions are gathered and answered together.
 
-Of each simulation there is a session and an episode, as there is of an environment. Where a policy is to answer, the
-simulation stays suspended until many of them wait for the same policy. Which those are at a time depends on how many
+Of each simulation there is a session and an episode, as there is of an environment. Where a batched policy is to
+answer, the episode waits until many decisions wait for the same policy. Which those are at a time depends on how many
 simulations there are; what becomes of each of them does not.
 
-Policies stand in the plan as ``Entry``, one for each key under which they were given. Entries of the same policy share
-one ``Asked``, whose decisions are asked in ``Group`` s, each of the same spaces, so that they can be stacked.
+Policies stand in the plan as ``PolicyKey``, one for each key under which they were given. Keys of the same policy share
+one ``BatchPolicy``, whose decisions are asked in ``Group`` s, each of the same spaces, so that they can be stacked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from threading import get_ident
 from time import perf_counter
 from typing import Any, Final, Protocol
 
-import numpy as np
-from greenlet import getcurrent
-
-from ..core.agent import Record
-from ..core.bindings import Binding
-from ..core.episode import NAMED_AT_CALL, UNNAMED, Episode
+from ..core.bound import BoundPoint, DeferredPolicy
+from ..core.episode import Episode, When
 from ..core.plan import Plan, two_arguments
 from ..core.session import Session
 from ..core.stacking import rows, stacker
-from ..core.switch import EVALUATING, unattended
-from ..decision import DIFFERENCES
 from ..errors import InvalidActionError, annotate
-from ..hooks.hook import positional
-from ..simulation import RULE
+from ..hooks.stacks import outside_simulation
+from ..simulation import RULE, positional
 
 # -- who is asked ---------------------------------------------------------------------------------
 
 
-class Asked:
+class BatchPolicy:
     """A policy that answers many decisions at once.
 
     Attributes:
@@ -60,11 +53,11 @@ class Asked:
             return self.policy(observations, infos, identities)
         return self.policy(observations, infos)
 
-    def group(self, binding: Binding) -> Group:
+    def group(self, point: BoundPoint) -> Group:
         """The group of the decisions at a point."""
-        group = next((group for group in self.groups if group.takes(binding)), None)
+        group = next((group for group in self.groups if group.takes(point)), None)
         if group is None:
-            group = Group(self, binding)
+            group = Group(self, point)
             self.groups.append(group)
         return group
 
@@ -74,7 +67,7 @@ def _takes_three(policy: Callable[..., Any]) -> bool:
     return sum(p.default is p.empty for p in positional(policy)) > 2
 
 
-class Entry:
+class PolicyKey(DeferredPolicy):
     """What stands for a policy in a plan: the policy, and the key under which it was given.
 
     Attributes:
@@ -82,33 +75,33 @@ class Entry:
         asked: The policy.
     """
 
-    def __init__(self, place: int, asked: Asked) -> None:
+    def __init__(self, place: int, asked: BatchPolicy) -> None:
         self.place = place
         self.asked = asked
-        self._groups: dict[Binding, Group] = {}
+        self._groups: dict[BoundPoint, Group] = {}
 
-    def group(self, binding: Binding) -> Group:
+    def group(self, point: BoundPoint) -> Group:
         """The group of its decisions at a point."""
-        group = self._groups.get(binding)
+        group = self._groups.get(point)
         if group is None:
-            group = self._groups[binding] = self.asked.group(binding)
+            group = self._groups[point] = self.asked.group(point)
         return group
 
     def __call__(self, observation: Any, info: Any) -> Any:
-        """Nobody asks it: episodes wait instead."""
+        """Policies are callable; this one is never called, because episodes wait for it."""
         raise NotImplementedError
 
 
-def entries(policies: Mapping[Any, Any]) -> dict[Any, Any]:
+def policy_keys(policies: Mapping[Any, Any]) -> dict[Any, Any]:
     """What stands for policies in a plan; what is no policy, as it is."""
-    known: dict[int, Asked] = {}
+    known: dict[int, BatchPolicy] = {}
     found: dict[Any, Any] = {}
     for place, (key, policy) in enumerate(policies.items()):
         found[key] = policy
         if policy is not RULE and callable(policy):
-            asked = known.setdefault(id(policy), Asked(policy))
+            asked = known.setdefault(id(policy), BatchPolicy(policy))
             asked.keys.append(key)
-            found[key] = Entry(place, asked)
+            found[key] = PolicyKey(place, asked)
     return found
 
 
@@ -117,34 +110,36 @@ class Group:
 
     Attributes:
         asked: The policy.
-        binding: One of the points at which they are decided; the others are alike.
+        point: One of the points at which they are decided; the others are alike.
         stack: Stacks observations.
         waiting: The episodes whose decisions wait.
+        places: The places of their seeds among the seeds.
         observations: Theirs.
-        book: What is noted of them; None where nobody wants to know.
+        book: What is noted of the decisions; None where no trajectories are collected.
     """
 
-    __slots__ = ("_discrete", "asked", "binding", "book", "observations", "stack", "waiting")
+    __slots__ = ("_discrete", "asked", "book", "observations", "places", "point", "stack", "waiting")
 
-    def __init__(self, asked: Asked, binding: Binding) -> None:
-        self.asked, self.binding = asked, binding
-        self.stack = stacker(binding.definition.observation_space)
-        self.waiting: list[Asking] = []
+    def __init__(self, asked: BatchPolicy, point: BoundPoint) -> None:
+        self.asked, self.point = asked, point
+        self.stack = stacker(point.definition.observation_space, cast=True)
+        self.waiting: list[Episode] = []
+        self.places: list[int] = []
         # Kept beside the episodes: to ask every one of many suspended episodes again is to wait for their memory.
         self.observations: list[Any] = []
         self.book: Any = None
-        self._discrete = not binding.definition.action_space.shape
+        self._discrete = not point.definition.action_space.shape
 
-    def takes(self, binding: Binding) -> bool:
+    def takes(self, point: BoundPoint) -> bool:
         """Whether decisions at a point can be stacked with these."""
-        own, other = self.binding.definition, binding.definition
-        return binding is self.binding or (
+        own, other = self.point.definition, point.definition
+        return point is self.point or (
             own.observation_space == other.observation_space
             and own.action_space == other.action_space
-            and (self.binding.legal is None) == (binding.legal is None)
+            and (self.point.legal is None) == (point.legal is None)
         )
 
-    def ask(self, observations: Any, waiting: Sequence[Asking]) -> tuple[list[Any], Mapping[str, Any]]:
+    def ask(self, observations: Any, waiting: Sequence[Episode]) -> tuple[list[Any], Mapping[str, Any]]:
         """Have the policy answer.
 
         Args:
@@ -162,9 +157,9 @@ class Group:
         infos: list[Any] = []
         if asked.informed:
             for episode in waiting:
-                record: Any = episode.pending
-                infos.append(record.info)
-                record.info = {}  # what a policy does to its own is not to be seen at the next decision
+                agent: Any = episode.pending
+                infos.append(agent.info)
+                agent.info = {}  # what a policy does to its own is not to be seen at the next decision
         try:
             identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
             answers = asked.answers(observations, infos, identities)
@@ -190,167 +185,19 @@ class Group:
         return actions, extras
 
 
-# -- episodes that wait ---------------------------------------------------------------------------
-
-
-class Waiting(Record):
-    """What an episode knows of one agent for whom a policy answers.
-
-    Attributes:
-        group: With whose decisions its own are asked.
-        swift: Whether it alone decides at its point, and nothing but the mappings is to be seen to.
-        entry: The policy that answers for it.
-        trajectory, row, steps: In the group's book: of which trajectory its actions are, where its latest action
-            stands, and how many there have been; none yet.
-    """
-
-    __slots__ = ("entry", "group", "row", "steps", "swift", "trajectory")
-
-    def __init__(self, agent: str, binding: Binding, policy: Any, clock: Callable[[], float] | None) -> None:
-        super().__init__(agent, binding, policy, clock)
-        self.entry: Any = None
-        self.group: Any = None
-        self.swift = False
-        self.trajectory = self.row = -1
-        self.steps = 0
-
-
-class Asking(Episode):
-    """An episode whose decisions wait until their policies are asked.
-
-    Attributes:
-        place: Of its seed among the seeds.
-        seed: Its seed.
-        session: What it belongs to.
-        pending: As in every episode; those for whom policies answer are ``Waiting``.
-    """
-
-    place: int
-    seed: int
-    session: Session
-
-    def _enroll(self, agent: str, binding: Binding) -> Record:
-        entry: Any = self._plan.policies.get(agent) or binding.policy
-        if not isinstance(entry, Entry):
-            return super()._enroll(agent, binding)
-        record = self._answered[agent] = Waiting(agent, binding, entry, self.clock)
-        record.entry, record.group = entry, entry.group(binding)
-        return record
-
-
-class Unrewarded(Asking):
-    """An episode in which nobody is rewarded, as ``simulate`` has it."""
-
-    def _foresee(self, pending: Record | None) -> None:
-        """Nobody observes before deciding."""
-
-    def _consult(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        if type(record) is not Waiting:
-            return super()._consult(record, args, kwargs)
-        record.observe(args, kwargs)
-        binding = record.binding
-        if self.clock is None and binding.legal is None and binding.point.alone and not binding.tells:
-            record.swift = binding.agent is not None
-            self._swift[binding] = record if record.swift else NAMED_AT_CALL
-        self.pending = record
-        return None
-
-    def turn(self, action: Any) -> None:
-        """Answer the pending decision, as ``Episode.turn`` does, and run to the next one that waits, or to the end."""
-        record: Any = self.pending
-        driver: Any = self._driver
-        if getcurrent() is not driver.caller:
-            driver.enter()
-        binding: Any = record.binding
-        try:
-            if type(action) is int and binding.first <= action < binding.end:
-                convert = binding.convert
-                reply = convert(action)
-            elif action is RULE:
-                reply = action
-            else:
-                reply = binding.reply(action, record.agent, record.mask, record.choices)
-        except Exception as error:
-            self._annotate(error)
-            raise
-        self.pending = None
-        self.turns += 1
-        if record.followed_up:
-            record.follow_up()
-        agent: Any
-        first: Any
-        try:
-            while True:
-                resume = driver.resume
-                binding, args, kwargs = resume(reply)
-                agent = UNNAMED
-                if record is None or binding is not record.binding or not record.swift:
-                    record = self._swift.get(binding)
-                # Else the agent decides again that has decided before, and its record is at hand.
-                if record is NAMED_AT_CALL:
-                    (first,) = args
-                    name_agent = binding.name_agent
-                    agent = name_agent(first)
-                    record = self._answered.get(agent) if type(agent) is str else None
-                    if record is not None and (record.binding is not binding or type(record) is not Waiting):
-                        record = None
-                if record is not None:
-                    # What ``_take``, ``_consult`` and ``Record.observe`` do, for the calls of most models. Their info
-                    # is empty.
-                    self._latest = record
-                    (first,) = args
-                    if DIFFERENCES:
-                        EVALUATING[get_ident()] = record.memory
-                    observe, cast = binding.observe, binding.cast
-                    record.observation = cast(observe(first))
-                    if DIFFERENCES:
-                        EVALUATING.pop(get_ident(), None)
-                    self.pending = record
-                    return
-                reply = self._take(binding, args, kwargs, agent)
-                if self.pending is not None or self.over:
-                    return
-                # Else they would keep alive what the model lets go meanwhile.
-                binding = args = kwargs = first = agent = record = None
-        except BaseException as error:
-            binding = args = kwargs = first = driver = resume = None  # else the error would keep them alive
-            self._fail(error)
-            raise
-
-
-class Rewarded(Asking):
-    """An episode in which those for whom policies answer are rewarded and end, as in an AEC environment."""
-
-    _make_record = Waiting
-
-    def _enroll(self, agent: str, binding: Binding) -> Record:
-        record = super()._enroll(agent, binding)
-        if isinstance(record.policy, Entry):
-            record.policy = None  # its user answers, once that has asked
-            self.agents[agent] = self._answered.pop(agent)
-        return record
-
-    def _arise(self, record: Record, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        assert type(record) is Waiting
-        if record.group is None:  # it was there from the beginning
-            record.entry = self._plan.policies.get(record.agent) or record.binding.policy
-            record.group = record.entry.group(record.binding)
-        super()._arise(record, args, kwargs)
-
-
 # -- all of them ----------------------------------------------------------------------------------
 
 
 class Watcher(Protocol):
-    """Whoever wants to know what happens in the episodes."""
+    """What is told of what happens in the episodes."""
 
-    def asking(self, group: Group, waiting: Sequence[Asking], observations: Any) -> None:
-        """Decisions are going to be answered, whose observations are theirs to keep."""
+    def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
+        """Decisions are going to be answered; the observations are the watcher's to keep."""
 
     def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
-        """They have been."""
+        """They have been answered."""
 
-    def moved(self, episode: Asking) -> None:
+    def moved(self, episode: Episode) -> None:
         """An episode stands at its next decision, or is over."""
 
 
@@ -364,16 +211,16 @@ def run(
     """Run one simulation per seed, and have their policies answer.
 
     Args:
-        plan: What they are made of, with an ``Entry`` for each policy.
+        plan: What they are made of, with a ``PolicyKey`` for each policy.
         seeds: What they are reset with.
         size: How many there may be at a time.
         finish: Called with the place of a seed and its simulation, as soon as that has ended.
-        watcher: Who wants to know of rewards and ends; None: nobody, and then there are none.
+        watcher: What is told of rewards and ends; None: agents are not rewarded.
 
     Raises:
         BaseException: Whatever a model, a mapping, a policy or ``finish`` raises. All simulations are unwound.
     """
-    with unattended():
+    with outside_simulation():
         _Batches(plan, seeds, size, finish, watcher).run()
 
 
@@ -390,18 +237,17 @@ class _Batches:
     ) -> None:
         self._plan, self._seeds, self._size = plan, seeds, size
         self._finish, self._watcher = finish, watcher
-        self._kind: type[Asking] = Unrewarded if watcher is None else Rewarded
+        self._when = When.NEVER if watcher is None else When.DECISION
         self._crowd = min(size, CROWD)
         self._next = 0
-        self._open: dict[int, Session] = {}
+        self._sessions: dict[int, Session] = {}  # by the place of their seed
         # By the power of two that is not above their number: groups of which so many decisions wait.
         self._by_size: list[dict[Group, None]] = [{} for _ in range(size.bit_length())]
-        self._generator = np.random.default_rng(0)  # of seeds, none of which is ever drawn
 
     def run(self) -> None:
         try:
             self._refill()
-            while self._open:
+            while self._sessions:
                 self._answer(self._largest())
         except BaseException as error:
             self._unwind(error)
@@ -418,61 +264,47 @@ class _Batches:
     def _answer(self, group: Group) -> None:
         """Have decisions answered, and let each simulation go on to its next one."""
         waiting, group.waiting = group.waiting, []
+        places, group.places = group.places, []
         seen, group.observations = group.observations, []
         del self._by_size[len(waiting).bit_length() - 1][group]
-        watcher, number = self._watcher, len(waiting)
-        observations, begun = group.stack(seen), perf_counter()
-        if watcher is None:
-            actions, _ = group.ask(observations, waiting)
-            asked = perf_counter()
-            waiting.reverse()  # taken out one by one, so that nothing holds those that have ended
-            for action in actions:
-                episode = waiting.pop()
-                episode.turn(action)
-                record: Any = episode.pending
-                if record is None:
-                    self._end(episode)
-                    continue
-                # ``_wait``, without the call.
-                following = record.group
-                gathered = following.waiting
-                gathered.append(episode)
-                following.observations.append(record.observation)
-                record.observation = None
-                many = len(gathered)
-                if not many & (many - 1):
-                    self._grow(following, many)
-        else:
-            kept = group.stack(seen)
-            actions, extras = group.ask(observations, waiting)
-            asked = perf_counter()
-            watcher.asking(group, waiting, kept)
-            waiting.reverse()
-            for action in actions:
-                episode = waiting.pop()
-                episode.turn(action)
-                self._settle(episode)
+        watcher, number, begun = self._watcher, len(waiting), perf_counter()
+        kept = None if watcher is None else group.stack(seen)
+        actions, extras = group.ask(group.stack(seen), waiting)
+        asked = perf_counter()
+        if watcher is not None:
+            watcher.asking(group, places, waiting, kept)
+        waiting.reverse()  # taken out one by one, so that nothing holds those that have ended
+        for place, action in zip(places, actions, strict=True):
+            episode = waiting.pop()
+            episode.step(action)
+            self._settle(place, episode)
+        if watcher is not None:
             watcher.answered(group, actions, extras)
         if 2 * number > self._crowd < self._size and asked - begun > perf_counter() - asked:
             self._crowd = min(self._size, 2 * self._crowd)
         self._refill()
 
-    def _settle(self, episode: Asking) -> None:
+    def _settle(self, place: int, episode: Episode) -> None:
+        """See to an episode that stands at its next decision, or is over."""
         if self._watcher is not None:
             self._watcher.moved(episode)
-        if episode.pending is None:
-            self._end(episode)
-        else:
-            self._wait(episode)
-
-    def _wait(self, episode: Asking) -> None:
-        record: Any = episode.pending
-        group = record.group
-        group.waiting.append(episode)
-        group.observations.append(record.observation)
-        number = len(group.waiting)
-        if not number & (number - 1):
-            self._grow(group, number)
+        agent = episode.pending
+        if agent is None:
+            self._end(place)
+            return
+        group = agent.group
+        if group is None:
+            group = agent.group = agent.policy.group(agent.point)
+        gathered = group.waiting
+        gathered.append(episode)
+        group.places.append(place)
+        # Kept beside the episodes: to ask every one of many suspended episodes again is to wait for their memory.
+        group.observations.append(agent.observation)
+        if self._watcher is None:
+            agent.observation = None
+        many = len(gathered)
+        if not many & (many - 1):
+            self._grow(group, many)
 
     def _grow(self, group: Group, number: int) -> None:
         """So many decisions of a group wait now, a power of two."""
@@ -483,7 +315,7 @@ class _Batches:
 
     def _refill(self) -> None:
         """Begin simulations, until there are as many as there may be."""
-        while self._next < len(self._seeds) and len(self._open) < self._crowd:
+        while self._next < len(self._seeds) and len(self._sessions) < self._crowd:
             place, seed = self._next, self._seeds[self._next]
             self._next += 1
             try:
@@ -491,24 +323,22 @@ class _Batches:
             except BaseException as error:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
-            self._open[place] = session
-            episode = session.start(seed, None, self._generator, self._kind)
-            episode.place, episode.seed, episode.session = place, seed, session
-            self._settle(episode)
+            self._sessions[place] = session
+            self._settle(place, session.start(seed, None, self._when))
 
-    def _end(self, episode: Asking) -> None:
-        place, session = episode.place, episode.session
+    def _end(self, place: int) -> None:
+        session = self._sessions[place]
         session.close()  # it may have been truncated
-        del self._open[place]
+        del self._sessions[place]
         try:
             self._finish(place, session.simulation)
         except BaseException as error:
-            annotate(error, f"simenv_marl: after the simulation's end; seed {episode.seed}")
+            annotate(error, f"simenv_marl: after the simulation's end; seed {self._seeds[place]}")
             raise
 
     def _unwind(self, error: BaseException) -> None:
         """Unwind what is suspended, after an error in one of them."""
-        for place, session in self._open.items():
+        for place, session in self._sessions.items():
             try:
                 session.close()
             except BaseException as problem:
@@ -517,4 +347,4 @@ class _Batches:
                     f"simenv_marl: and the simulation of seed {self._seeds[place]}, when it was unwound, raised"
                     f" {problem!r}",
                 )
-        self._open.clear()
+        self._sessions.clear()

@@ -12,7 +12,7 @@ from ..core.plan import Plan
 from ..core.session import checked_seed
 from ..errors import OptionValueError
 from ..simulation import RULE
-from .batch import Entry, Watcher, entries, run
+from .batch import PolicyKey, Watcher, policy_keys, run
 from .spread import progress_bar, spread
 from .trajectories import Ledger, Trajectories, merged
 
@@ -77,7 +77,7 @@ def simulate_many(
     _check_collect(collect)
     arguments = (simulation, dict(_checked_policies(policies)), points, collect, int(batch_size), options)
     # Made here also where the work is done elsewhere, so that what cannot work is found out before.
-    plan = Plan.draw_up(simulation, points, {**options, "policies": entries(arguments[1])}, unanswered=True)
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unanswered=True)
     bar = progress_bar(len(checked)) if progress else None
     try:
         if not workers or not checked:
@@ -103,7 +103,7 @@ def _simulate_part(
     seeds: list[int],
 ) -> list[Any]:
     """In a worker: simulate a part of the seeds."""
-    plan = Plan.draw_up(simulation, points, {**options, "policies": entries(policies)}, unanswered=True)
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unanswered=True)
     return _simulate(plan, collect, batch_size, seeds, None)
 
 
@@ -191,9 +191,9 @@ def learners_plan(
     simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
 ) -> tuple[Plan, dict[Any, int]]:
     """The plan of the episodes, and the places of the policies by their keys."""
-    found = entries({key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()})
-    keys = {key: entry.place for key, entry in found.items() if isinstance(entry, Entry)}
-    return Plan.draw_up(simulation, points, {**options, "policies": found}, unanswered=True, asked=Entry), keys
+    found = policy_keys({key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()})
+    keys = {key: entry.place for key, entry in found.items() if isinstance(entry, PolicyKey)}
+    return Plan.draw_up(simulation, points, {**options, "policies": found}, unanswered=True, rewarded=True), keys
 
 
 def _left_to_the_rule(observations: Any) -> Any:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from ..core.episode import Episode
+from ..core.episode import When
 from ..core.plan import Plan
 from ..core.session import Session, checked_seed
 
@@ -40,7 +38,7 @@ def simulate(
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
     session = Session(plan)
     try:
-        session.start(checked_seed(seed), None, np.random.default_rng(), Episode)
+        session.start(checked_seed(seed), None, When.NEVER)
         return session.simulation
     finally:
         session.close()

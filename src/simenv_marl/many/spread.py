@@ -73,7 +73,7 @@ def spread(
 
 @contextmanager
 def _closing(results: Any) -> Iterator[None]:
-    """Cancel what is still to be done where nobody wants to know its results any more."""
+    """Cancel what is still to be done where its results are not awaited any more."""
     try:
         yield
     finally:

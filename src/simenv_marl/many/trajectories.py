@@ -16,13 +16,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.bindings import Binding
+from ..core.agent import Agent
+from ..core.bound import BoundPoint
+from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.spaces import blank
 from ..core.stacking import empty, joined, stack_masks, stacker, taken
 from ..errors import AgentError, OptionValueError
 from ..simulation import RULE
-from .batch import Asking, Entry, Group, Waiting
+from .batch import Group, PolicyKey
 
 # -- what learners get ----------------------------------------------------------------------------
 
@@ -62,8 +64,8 @@ class Trajectories:
         elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
             its end; nan where the model has let go of the agent before. None where there is no clock.
         extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
-        observation_space, action_space: Of the decision point. None where nobody has decided, and it is not known at
-            which point they would have.
+        observation_space, action_space: Of the decision point. None where no agent has decided, and it is not known
+            at which point they would have.
         collected: What ``collect`` has returned of each episode's simulation, in the order of the seeds. None where it
             was not asked for.
     """
@@ -162,13 +164,44 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
 # -- while episodes run ---------------------------------------------------------------------------
 
 
+@dataclass
+class _Life:
+    """What is noted of one trajectory, which stays without an end where its episode fails.
+
+    Attributes:
+        page: The page on which its decisions stand.
+        number: Its number on the page.
+        policy: The place of its policy.
+        episode: The place of its episode.
+        first_turn, last_turn: How many decisions the episode had seen when it began, and when it ended.
+        name: The name of its agent.
+        row: Where its latest decision stands.
+        steps: How many decisions there have been.
+        last_observation: What it has come to.
+        terminated, truncated: How it ended.
+    """
+
+    page: _Page
+    number: int
+    policy: int
+    episode: int
+    first_turn: int
+    name: str
+    last_turn: int = -1
+    row: int = -1
+    steps: int = 0
+    last_observation: Any = None
+    terminated: bool = False
+    truncated: bool = False
+
+
 class _Page:
     """What is noted of one group: rows in the order of their answers, and trajectories in that of their beginnings."""
 
     def __init__(self, group: Group) -> None:
-        definition = group.binding.definition
-        self.binding = group.binding
-        self.restricted = group.binding.legal is not None
+        definition = group.point.definition
+        self.point = group.point
+        self.restricted = group.point.legal is not None
         self.stack = stacker(definition.observation_space)
         self.stack_actions = stacker(definition.action_space)
         self.blank = blank(definition.action_space)
@@ -186,33 +219,13 @@ class _Page:
         self.times: list[float] = []
         self.rewards: list[float] = []
         self.elapsed: list[float] = []
-        # Of trajectories.
-        self.policies: list[int] = []
-        self.episodes: list[int] = []
-        self.first_turns: list[int] = []
-        self.names: list[str] = []
-        self.last_rows: list[int] = []
-        self.last_observations: list[Any] = []
-        self.last_turns: list[int] = []
-        self.terminated: list[bool] = []
-        self.truncated: list[bool] = []
+        self.lives: list[_Life] = []
 
-    def begin(self, episode: Asking, record: Waiting) -> int:
+    def begin(self, place: int, episode: Episode, agent: Agent) -> _Life:
         """Begin the trajectory of an agent."""
-        self.policies.append(record.entry.place)
-        self.episodes.append(episode.place)
-        self.first_turns.append(episode.turns)
-        self.names.append(record.agent)
-        self.last_rows.append(-1)
-        self.last_observations.append(None)
-        self.last_turns.append(-1)
-        self.terminated.append(False)
-        self.truncated.append(False)
-        return len(self.names) - 1
-
-    def learn(self, record: Waiting) -> None:
-        """Note which action the rule's decision has corresponded to."""
-        self.rule_actions[record.row], record.rule_action = record.rule_action, None
+        life = _Life(self, len(self.lives), agent.policy.place, place, episode.turns, agent.name)
+        self.lives.append(life)
+        return life
 
     def all_actions(self) -> Any:
         """What was decided, in all rows."""
@@ -231,7 +244,7 @@ class Ledger:
     def __init__(self) -> None:
         self._pages: list[_Page] = []
 
-    def asking(self, group: Group, waiting: Sequence[Asking], observations: Any) -> None:
+    def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
         """Decisions are going to be answered: see ``Watcher``."""
         page: _Page = group.book
         if page is None:
@@ -239,23 +252,24 @@ class Ledger:
             self._pages.append(page)
         row = len(page.rewards)
         trajectories, steps, turns = page.trajectory, page.steps, page.turns
-        records: list[Any] = [episode.pending for episode in waiting]
-        for episode, record in zip(waiting, records, strict=True):
-            if record.trajectory < 0:
-                record.trajectory = page.begin(episode, record)
-            record.row = row
-            trajectories.append(record.trajectory)
-            steps.append(record.steps)
+        agents: list[Any] = [episode.pending for episode in waiting]
+        for place, episode, agent in zip(places, waiting, agents, strict=True):
+            life = agent.notes
+            if life is None:
+                life = agent.notes = page.begin(place, episode, agent)
+            life.row = row
+            trajectories.append(life.number)
+            steps.append(life.steps)
             turns.append(episode.turns)
-            record.steps += 1
+            life.steps += 1
             row += 1
         page.observations.append(observations)
-        page.rewards.extend([0.0] * len(records))
-        page.elapsed.extend([nan] * len(records))
+        page.rewards.extend([0.0] * len(agents))
+        page.elapsed.extend([nan] * len(agents))
         if page.restricted:
-            page.masks.append(stack_masks([record.mask for record in records]))
+            page.masks.append(stack_masks([agent.mask for agent in agents]))
         if waiting[0].clock is not None:
-            page.times.extend([record.info["time"] for record in records])
+            page.times.extend([agent.info["time"] for agent in agents])
 
     def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
         """They have been: see ``Watcher``."""
@@ -275,36 +289,34 @@ class Ledger:
                 )
         page.extras.append(arrays)
 
-    def moved(self, episode: Asking) -> None:
+    def moved(self, episode: Episode) -> None:
         """An episode stands at its next decision, or is over: see ``Watcher``."""
-        record: Any = episode.pending
-        if record is not None and record.row >= 0:
-            page = record.group.book
-            page.rewards[record.row] = record.reward
-            if record.rule_action is not None:
-                page.learn(record)
-            if "elapsed" in record.info:
-                page.elapsed[record.row] = record.info["elapsed"]
-        if episode.parting:
-            for record in episode.parting:
-                self._close(record, episode.turns, terminated=True, truncated=False)
-            episode.parting = []
+        if episode.pending is not None:
+            self._pay(episode.pending)
+        for agent in episode.just_ended:
+            self._close(agent, episode.turns, terminated=True, truncated=False)
+        episode.just_ended = []
         if episode.over:
-            for record in episode.agents.values():
-                self._close(record, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
+            for agent in episode.agents.values():
+                self._close(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
-    def _close(self, record: Any, turns: int, *, terminated: bool, truncated: bool) -> None:
-        if record.row < 0:  # it has never decided
+    def _pay(self, agent: Agent) -> None:
+        """Note what an agent's latest action has brought."""
+        life = agent.notes
+        if life is None:  # it has not decided before
             return
-        page, trajectory = record.group.book, record.trajectory
-        page.rewards[record.row] = record.reward
-        if record.rule_action is not None:
-            page.learn(record)
-        page.elapsed[record.row] = record.info.get("elapsed", nan)
-        page.last_rows[trajectory] = record.row
-        page.last_observations[trajectory] = record.observation
-        page.last_turns[trajectory] = turns
-        page.terminated[trajectory], page.truncated[trajectory] = terminated, truncated
+        page, row = life.page, life.row
+        page.rewards[row] = agent.reward
+        page.elapsed[row] = agent.info.get("elapsed", nan)
+        if agent.rule_action is not None:
+            page.rule_actions[row], agent.rule_action = agent.rule_action, None
+
+    def _close(self, agent: Agent, turns: int, *, terminated: bool, truncated: bool) -> None:
+        self._pay(agent)
+        life = agent.notes
+        if life is not None:
+            life.last_observation, life.last_turn = agent.observation, turns
+            life.terminated, life.truncated = terminated, truncated
 
     # -- afterwards -------------------------------------------------------------------------------
 
@@ -326,7 +338,7 @@ class Ledger:
             own = [page for page in pages if (page.policies == place).any()]
             if len(own) > 1:
                 raise AgentError(
-                    f"{key!r} has decided at {' and at '.join(page.page.binding.point.name for page in own)}, whose"
+                    f"{key!r} has decided at {' and at '.join(page.page.point.point.name for page in own)}, whose"
                     " spaces differ; give its policy under the names of the points"
                 )
             tuple_of_seeds = tuple(seeds)
@@ -339,16 +351,13 @@ class _Sorted:
 
     def __init__(self, page: _Page) -> None:
         _check_extras(page.extras)
-        self.page = page
-        self.policies = np.array(page.policies)
-        self.episodes = np.array(page.episodes)
-        self.trajectory = np.array(page.trajectory)
-        self.steps = np.array(page.steps)
-        order = np.lexsort((page.first_turns, page.episodes))
-        self.ranks = np.empty(len(order), np.int64)
-        self.ranks[order] = np.arange(len(order))
-        self.rows = np.lexsort((self.steps, self.ranks[self.trajectory]))
-        self.trajectories = order
+        self.page, lives = page, page.lives
+        self.policies = np.array([life.policy for life in lives])
+        self.episodes = np.array([life.episode for life in lives])
+        self.trajectory, self.steps = np.array(page.trajectory), np.array(page.steps)
+        self.trajectories = np.lexsort((np.array([life.first_turn for life in lives]), self.episodes))
+        ranks = np.argsort(self.trajectories)
+        self.rows = np.lexsort((self.steps, ranks[self.trajectory]))
         self.observations, self.actions = joined(page.observations), page.all_actions()
         self.masks = joined(page.masks) if page.masks else None
         self.extras = {name: joined([extras[name] for extras in page.extras]) for name in page.extras[0]}
@@ -362,35 +371,36 @@ class _Sorted:
         if page.times:
             self.numbers["times"] = np.array(page.times, np.float64)
             self.numbers["elapsed"] = np.array(page.elapsed, np.float64)
-        last_rows = np.array(page.last_rows)
-        for name, ended in (("terminations", page.terminated), ("truncations", page.truncated)):
+        last_rows = [life.row for life in lives]
+        for name in ("terminations", "truncations"):
             self.numbers[name] = np.zeros(len(self.steps), np.bool_)
-            self.numbers[name][last_rows] = ended
+        self.numbers["terminations"][last_rows] = [life.terminated for life in lives]
+        self.numbers["truncations"][last_rows] = [life.truncated for life in lives]
 
     def of(self, policy: int, seeds: tuple[int, ...]) -> Trajectories:
         page = self.page
         rows = self.rows[self.policies[self.trajectory[self.rows]] == policy]
         trajectories = self.trajectories[self.policies[self.trajectories] == policy]
-        names = [page.names[trajectory] for trajectory in trajectories]
-        codes = {name: code for code, name in enumerate(dict.fromkeys(names))}
-        by_trajectory = np.zeros(len(page.names), np.int64)
-        by_trajectory[trajectories] = [codes[name] for name in names]
+        lives = [page.lives[trajectory] for trajectory in trajectories]
+        codes = {name: code for code, name in enumerate(dict.fromkeys(life.name for life in lives))}
+        agents = np.zeros(len(page.lives), np.int64)
+        agents[trajectories] = [codes[life.name] for life in lives]
         steps = self.steps[rows]
         return Trajectories(
             observations=taken(self.observations, rows),
             actions=taken(self.actions, rows),
-            last_observations=page.stack([page.last_observations[trajectory] for trajectory in trajectories]),
-            last_turns=np.array(page.last_turns, np.int64)[trajectories],
+            last_observations=page.stack([life.last_observation for life in lives]),
+            last_turns=np.array([life.last_turn for life in lives], np.int64),
             starts=np.flatnonzero(steps == 0),
             episodes=self.episodes[self.trajectory[rows]],
             seeds=seeds,
-            agents=by_trajectory[self.trajectory[rows]],
+            agents=agents[self.trajectory[rows]],
             names=tuple(codes),
             steps=steps,
             action_masks=None if self.masks is None else taken(self.masks, rows),
             extras=taken(self.extras, rows),
-            observation_space=page.binding.definition.observation_space,
-            action_space=page.binding.definition.action_space,
+            observation_space=page.point.definition.observation_space,
+            action_space=page.point.definition.action_space,
             **{name: array[rows] for name, array in self.numbers.items()},
         )
 
@@ -406,33 +416,28 @@ def _check_extras(extras: Sequence[Mapping[str, Any]]) -> None:
 
 def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
     """What there is to know of a policy that was never asked."""
-    binding = next((b for b in plan.bindings.values() if isinstance(b, Binding) and answers(plan, b, place)), None)
-    definition = None if binding is None else binding.definition
-    none = np.zeros(0, np.int64)
-    observations = np.zeros(0) if definition is None else empty(definition.observation_space)
+    point = next((point for point in plan.points if answers(plan, point, place)), None)
+    definition = None if point is None else point.definition
+    floats, whole, flags = np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.bool_)
+    none: dict[str, Any] = {
+        **dict.fromkeys(("last_turns", "starts", "episodes", "agents", "steps", "turns"), whole),
+        **dict.fromkeys(("terminations", "truncations", "by_rule", "known"), flags),
+    }
+    observations = floats if definition is None else empty(definition.observation_space)
     return Trajectories(
         observations=observations,
-        actions=np.zeros(0) if definition is None else empty(definition.action_space),
-        rewards=np.zeros(0),
-        terminations=np.zeros(0, np.bool_),
-        truncations=np.zeros(0, np.bool_),
+        actions=floats if definition is None else empty(definition.action_space),
         last_observations=observations,
-        last_turns=none,
-        starts=none,
-        episodes=none,
+        rewards=floats,
         seeds=seeds,
-        agents=none,
         names=(),
-        steps=none,
-        turns=none,
-        by_rule=np.zeros(0, np.bool_),
-        known=np.zeros(0, np.bool_),
         observation_space=None if definition is None else definition.observation_space,
         action_space=None if definition is None else definition.action_space,
+        **none,
     )
 
 
-def answers(plan: Plan, binding: Binding, place: int) -> bool:
+def answers(plan: Plan, point: BoundPoint, place: int) -> bool:
     """Whether it is known beforehand that a policy, by its place, answers at a decision point."""
-    policy = binding.policy if binding.agent is None else plan.policies.get(binding.agent, binding.policy)
-    return isinstance(policy, Entry) and policy.place == place
+    policy = point.policy if point.agent is None else plan.policies.get(point.agent, point.policy)
+    return isinstance(policy, PolicyKey) and policy.place == place

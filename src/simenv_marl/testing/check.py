@@ -2,82 +2,109 @@
 
 from __future__ import annotations
 
-import io
 import warnings
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterable
+from typing import Any, Final
 
-from ..core.switch import unattended
-from .conformance import ConformanceChecks
-from .episodes import EpisodeChecks
-from .plain import PlainChecks
-from .report import (
-    SEVERITIES,
-    CheckReport,
+import numpy as np
+
+from ..errors import OptionValueError, SimEnvError
+from .checks import check_plain_runs, check_repeated_run, check_views
+from .conformance import check_conformance, check_timing
+from .episodes import check_early_end, check_episodes
+from .inside import Plan, make_environment
+from .report import CheckReport, finding
+from .runs import error_in_words, quietly
+from .subject import Report, Subject
+
+CHECKS: Final[tuple[Callable[[Subject, Report], None], ...]] = (
+    check_plain_runs,
+    check_repeated_run,
+    check_views,
+    check_episodes,
+    check_early_end,
+    check_conformance,
+    check_timing,
 )
-from .runs import (
-    global_generators,
-    set_global_generators,
-)
-from .views import ViewChecks
-from .words import first_lines, order_of
+"""All checks, the more basic first: where the plain run already fails, the others are left out."""
 
 
-class Checker(PlainChecks, ViewChecks, EpisodeChecks, ConformanceChecks):
-    """Checks one simulation."""
+def check_simulation(
+    simulation: Any,
+    points: Any = None,
+    *,
+    seeds: Iterable[int] = (0, 1, 2),
+    episodes: int = 10,
+    max_steps: int = 1000,
+    time_limit: float = 60.0,
+    fingerprint: Callable[[Any], Any] | None = None,
+    **options: Any,
+) -> CheckReport:
+    """Check all that is to be known of a simulation before its environments are trusted.
 
-    def check(self) -> CheckReport:
-        """Check all there is; the more basic first, and nothing that can only fail for a reason known already."""
-        states = global_generators()
-        silenced = io.StringIO()
+    Compared are plain runs with ``RULE`` throughout in every view that fits, episodes of the same seed in new and used
+    environments and side by side, and observations with their spaces; PettingZoo's and Gymnasium's own tests are run.
+    Whatever the model raises is a finding. Python's and NumPy's global generators are left as they were.
+
+    Args:
+        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        points: The active decision points, as ``generate_env`` takes them.
+        seeds: With which seeds plain runs are compared; at least one.
+        episodes: How many episodes of random legal actions are played.
+        max_steps: After how many decisions a run is cut, so that models that never end can be checked as well.
+        time_limit: For about how many seconds to check at most; a single run may take a quarter of it. Running
+            Python code is interrupted; what waits outside of Python (in a sleep, say) is not.
+        fingerprint: What a simulation is compared by after a run: a callable of it that returns numbers, arrays,
+            strings, or containers of these. None: its ``state()``, or else all its attributes.
+        **options: Options of the environments, as ``aec_env`` takes them.
+
+    Returns:
+        The report: ``print`` it, or let tests call its ``raise_for_errors``.
+
+    Raises:
+        SimEnvError: The simulation, the points or the options cannot be used at all; the leaf says why.
+    """
+    chosen = tuple(seeds)
+    if not chosen or any(isinstance(s, bool) or not isinstance(s, (int, np.integer)) or s < 0 for s in chosen):
+        raise OptionValueError(f"seeds must be non-negative integers, at least one, not {seeds!r}")
+    for name, number in (("episodes", episodes), ("max_steps", max_steps)):
+        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+            raise OptionValueError(f"{name} must be a positive integer, not {number!r}")
+    if not time_limit > 0:
+        raise OptionValueError(f"time_limit must be a positive number of seconds, not {time_limit!r}")
+    try:
+        with quietly():
+            plan = Plan.draw_up(simulation, points, options)
+            make_environment(plan, "aec")
+    except SimEnvError:
+        raise
+    except Exception as error:  # the model's own, from its constructor
+        return _unmade(simulation, error)
+    subject = Subject(
+        plan, tuple(int(seed) for seed in dict.fromkeys(chosen)), episodes, max_steps, time_limit, fingerprint
+    )
+    report = Report()
+    with quietly() as caught:
+        warnings.filterwarnings("always", ".* refuses to end", ResourceWarning)
+        _run_checks(subject, report)
+    if caught:
+        report.add("refusal", str(caught[0].message)[:300])
+    if subject.late:
+        report.add("out_of_time", seconds=time_limit)
+    return report.finished(subject)
+
+
+def _run_checks(subject: Subject, report: Report) -> None:
+    for check in CHECKS:
         try:
-            with (
-                unattended(),
-                warnings.catch_warnings(record=True) as caught,
-                redirect_stdout(silenced),
-                redirect_stderr(silenced),
-            ):
-                warnings.simplefilter("ignore")
-                warnings.filterwarnings("always", ".* refuses to end", ResourceWarning)
-                self._check_all()
-        finally:
-            set_global_generators(states)
-        if caught:
-            self._add(
-                "warning",
-                "The simulation refuses to end",
-                "When an environment is closed or reset in mid-episode, SimulationExit is raised in the model, which"
-                " has to let it pass. Look for an except that catches everything and goes on.",
-                first_lines(str(caught[0].message)),
-            )
-        if self._late():
-            self._add(
-                "warning",
-                f"The time limit of {self._limit:g} seconds has stopped the check",
-                "What is missing below was not looked at. Give more time (time_limit=), or less to do (episodes=,"
-                " max_steps=, fewer seeds=).",
-            )
-        plain = self._plain.get(self._seeds[0])
-        return CheckReport(
-            simulation=self._plan.name,
-            findings=tuple(sorted(dict.fromkeys(self.findings), key=lambda f: SEVERITIES.index(f.severity))),
-            checked=tuple(self.checked),
-            observations=self._points,
-            episodes=self._statistics,
-            calls=order_of(plain.decisions) if plain else "",
-            timing=self._timing,
-        )
+            check(subject, report)
+        except (Exception, SystemExit) as error:  # of the model, from where it was not expected
+            report.add_error(error, "while it was checked")
+            return
+        if not subject.playable:
+            return
 
-    def _check_all(self) -> None:
-        try:
-            if not self._runs_plainly():
-                return
-            for look in (
-                self._compares_views,
-                self._plays_episodes,
-                self._ends_early,
-                self._conforms,
-                self._takes_time,
-            ):
-                look()
-        except (Exception, SystemExit) as error:  # of the model, from where nobody expects it
-            self._tell_of_error(error, "while it was checked")
+
+def _unmade(simulation: Any, error: Exception) -> CheckReport:
+    name = getattr(simulation, "__name__", None) or type(simulation).__name__
+    return CheckReport(str(name), (finding("unmade", error_in_words(error)),), ())

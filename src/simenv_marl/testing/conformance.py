@@ -6,28 +6,16 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any, Final
 
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
-from ..errors import (
-    AgentError,
-    InvalidActionError,
-)
-from .base import Checks
-from .report import (
-    Timing,
-)
-from .runs import (
-    TimeUp,
-    play_rules,
-    seed_global_generators,
-    untouched_run,
-    within,
-)
-from .words import at, first_lines
+from ..errors import AgentError, InvalidActionError
+from .inside import make_environment
+from .report import Timing
+from .runs import TimeUp, error_in_words, play_rules, seconds_of_plain_run, seed_global_generators, within
+from .subject import Opened, Report, Subject
 
 _SAID_OTHERWISE: Final = (
     "possible_agents defined",  # PettingZoo's rule where agents are only known when they decide
@@ -52,113 +40,98 @@ _SAID_OTHERWISE: Final = (
 """What PettingZoo and Gymnasium warn of that is no fault, or that the check says in words of its own."""
 
 _IN_PLAIN_WORDS: Final = (
-    (
-        "more than 3 dimensions",
-        "Observations have more than three dimensions",
-        "Learning libraries know what to do with up to three (pictures).",
-    ),
-    (
-        "minimum and maximum values are equal",
-        "A space holds only one value somewhere",
-        "Lower and upper bound of a component are the same, so that nothing can be observed or decided there.",
-    ),
+    ("more than 3 dimensions", "many_dimensions"),
+    ("minimum and maximum values are equal", "one_value"),
 )
+"""What stands in their warnings, and the finding that says the same."""
+
+_TESTS: Final[tuple[tuple[str, str, Callable[[Callable[[], Any]], Any]], ...]] = (
+    ("PettingZoo's api_test", "aec", lambda make: api_test(make(), num_cycles=50)),
+    ("seed_test", "aec", lambda make: seed_test(make, num_cycles=20)),
+    ("parallel_api_test", "parallel", lambda make: parallel_api_test(make(), num_cycles=50)),
+    ("parallel_seed_test", "parallel", lambda make: parallel_seed_test(make, num_cycles=20)),
+    ("Gymnasium's check_env (single view)", "single", lambda make: check_env(make(), skip_render_check=True)),
+    ("Gymnasium's check_env (joint view)", "joint", lambda make: check_env(make(), skip_render_check=True)),
+)
+"""The tests, with the view that they are for; each is called with what makes an environment."""
 
 
-class ConformanceChecks(Checks):
-    """Runs the tests of PettingZoo and Gymnasium."""
-
-    def _conforms(self) -> None:
-        """Run what PettingZoo and Gymnasium check; say what they warn of in plain words."""
-        if self._late() or any(finding.severity == "error" for finding in self.findings):
-            # They could only say the same in other words.
-            self.checked.append("not, because of the errors: what PettingZoo and Gymnasium test themselves")
-            return
-        limits = {"max_steps": self._max_steps}
-        passed = []
-        seed_global_generators(0)
-
-        def make(view: str) -> Callable[[], Any]:
-            return lambda: self._make(view, limits)
-
-        for name, view, test in (
-            ("PettingZoo's api_test", "aec", lambda make: api_test(make(), num_cycles=50)),
-            ("seed_test", "aec", lambda make: seed_test(make, num_cycles=20)),
-            ("parallel_api_test", "parallel", lambda make: parallel_api_test(make(), num_cycles=50)),
-            ("parallel_seed_test", "parallel", lambda make: parallel_seed_test(make, num_cycles=20)),
-            ("Gymnasium's check_env (single view)", "single", _check_env),
-            ("Gymnasium's check_env (joint view)", "joint", _check_env),
-        ):
-            if self._late() or (self._drawn and "seed" in name):
-                continue
-            try:
-                if (env := self._make(view, limits)) is None:
-                    continue
-                self._close(env)
-                with warnings.catch_warnings(record=True) as caught:
-                    warnings.simplefilter("always")
-                    within(self._deadline(), partial(test, make(view)))
-            except TimeUp:
-                continue
-            except InvalidActionError:
-                continue  # the test knows nothing of masks, or of those that change within a round
-            except AgentError as error:
-                if view != "joint":
-                    self._tell_of_error(error, f"in {name}")
-                continue
-            except AssertionError as error:
-                self._add(
-                    "error",
-                    f"{name} fails",
-                    "Learning libraries rely on what it tests.",
-                    first_lines(str(error)) + at(error),
-                )
-                continue
-            except (Exception, SystemExit) as error:
-                self._tell_of_error(error, f"in {name}")
-                continue
+def check_conformance(subject: Subject, report: Report) -> None:
+    """Run what PettingZoo and Gymnasium check; say what they warn of in plain words."""
+    if subject.late or report.has_errors:
+        # They could only say the same in other words.
+        report.checked.append("not, because of the errors: what PettingZoo and Gymnasium test themselves")
+        return
+    passed = []
+    seed_global_generators(0)
+    for name, view, test in _TESTS:
+        if subject.late or (subject.drawn and "seed" in name):
+            continue
+        caught = _passes(subject, report, name, view, test)
+        if caught is not None:
             passed.append(name)
-            self._tell_of_warnings(name, caught)
-        if passed:
-            self.checked.append(", ".join(passed))
+            _add_warnings(report, name, caught)
+    if passed:
+        report.checked.append(", ".join(passed))
 
-    def _tell_of_warnings(self, name: str, caught: Iterable[warnings.WarningMessage]) -> None:
-        for message in dict.fromkeys(_bare(str(warning.message)) for warning in caught):
-            if any(known in message for known in _SAID_OTHERWISE):
-                continue
-            for pattern, title, explanation in _IN_PLAIN_WORDS:
-                if pattern in message:
-                    self._add("note", title, explanation)
-                    break
-            else:
-                self._add("note", f"{name} warns", "Learning libraries may trip over this.", first_lines(message))
 
-    def _takes_time(self) -> None:
-        """Measure what a decision takes, where runs come to their end."""
-        seed = self._seeds[0]
-        run = self._plain[seed]
-        if run.cut or not run.decisions or self._late():
-            return
-        env = None
-        try:
-            seed_global_generators(seed)
-            plain = untouched_run(self._plan, seed, self._deadline())
-            env = self._make("aec", {"max_steps": None})
+def _passes(
+    subject: Subject, report: Report, name: str, view: str, test: Callable[[Callable[[], Any]], Any]
+) -> list[warnings.WarningMessage] | None:
+    """Run one test. Returns what it has warned of; None where it fails, or tells nothing."""
+    plan = subject.plan.amended({"max_steps": subject.max_steps})
+    try:
+        with Opened(subject, report, view, plan) as env:
+            if env is None:
+                return None
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            within(subject.deadline(), lambda: test(lambda: make_environment(plan, view)))
+        return caught
+    except (TimeUp, InvalidActionError):
+        pass  # the test knows nothing of masks, or of those that change within a round
+    except AgentError as error:
+        if view != "joint":
+            report.add_error(error, f"in {name}")
+    except AssertionError as error:
+        words = error_in_words(error).partition(": ")[2]
+        report.add("failed_test", words, test=name)
+    except (Exception, SystemExit) as error:
+        report.add_error(error, f"in {name}")
+    return None
+
+
+def _add_warnings(report: Report, name: str, caught: Iterable[warnings.WarningMessage]) -> None:
+    for message in dict.fromkeys(_bare(str(warning.message)) for warning in caught):
+        if any(known in message for known in _SAID_OTHERWISE):
+            continue
+        for pattern, found in _IN_PLAIN_WORDS:
+            if pattern in message:
+                report.add(found)
+                break
+        else:
+            report.add("warning_test", message[:300], test=name)
+
+
+def check_timing(subject: Subject, report: Report) -> None:
+    """Measure what a decision takes, where runs come to their end."""
+    seed = subject.seeds[0]
+    run = subject.plain[seed]
+    if run.cut or not run.decisions or subject.late:
+        return
+    number = len(run.decisions)
+    try:
+        seed_global_generators(seed)
+        plain = seconds_of_plain_run(subject.plan, seed, subject.deadline())
+        with Opened(subject, report, max_steps=None) as env:
             seed_global_generators(seed)
             env.reset(seed=seed)
             start = time.perf_counter()
-            within(self._deadline(), partial(play_rules, env))
+            within(subject.deadline(), lambda: play_rules(env))
             seconds = time.perf_counter() - start
-        except (Exception, SystemExit):
-            return
-        finally:
-            self._close(env)
-        number = len(run.decisions)
-        self._timing = Timing(plain / number * 1e6, seconds / number * 1e6)
-
-
-def _check_env(make: Callable[[], Any]) -> None:
-    check_env(make(), skip_render_check=True)
+    except (Exception, SystemExit):
+        return
+    report.timing = Timing(plain / number * 1e6, seconds / number * 1e6)
 
 
 def _bare(message: str) -> str:

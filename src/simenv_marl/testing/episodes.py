@@ -3,252 +3,177 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
-from itertools import zip_longest
+from itertools import chain, count, islice, zip_longest
 from statistics import fmean
 from typing import Any, Final
 
-from .base import SHARE, Checks
-from .fingerprint import alike, fingerprint, general
-from .report import (
-    EpisodeStatistics,
-)
-from .runs import (
-    Step,
-    TimeUp,
-    random_steps,
-    seed_global_generators,
-    within,
-)
-from .statistics import collectors
-from .words import parts_in_words, seeds_in_words, step_difference
+from .fingerprint import alike, differences_in_words, general
+from .report import EpisodeStatistics
+from .runs import TimeUp, random_steps, seed_global_generators, within
+from .statistics import Collectors
+from .subject import SHARE, Opened, Played, Report, Subject, play
 
 _MOST_ERRORS: Final = 3
 """After how many failing episodes of random actions no more are played."""
 
 
-class EpisodeChecks(Checks):
-    """Plays episodes."""
-
-    def _plays_episodes(self) -> None:
-        """Play episodes with random legal actions; collect statistics; compare episodes of the same seed."""
-        env = self._make("aec", {"max_steps": self._max_steps})
-        collected = collectors(env._plan)
-        known: dict[int, list[Step]] = {}
-        lengths: list[int] = []
-        ends = {"terminated": 0, "truncated": 0, "cut": 0}
-        failures = 0
-        for number, seed in enumerate(_enough(self._seeds, self._episodes), 1):
-            if self._late() or failures == _MOST_ERRORS:
+def check_episodes(subject: Subject, report: Report) -> None:
+    """Play episodes with random legal actions; collect statistics; compare episodes of the same seed."""
+    collectors = Collectors(subject.plan)
+    known: dict[int, Played] = {}
+    failures: list[BaseException] = []
+    lengths: list[int] = []
+    ends = {"terminated": 0, "truncated": 0, "cut": 0}
+    with Opened(subject, report, plan=collectors.plan, max_steps=subject.max_steps) as env:
+        seeds = islice(chain(subject.seeds, count(max(subject.seeds) + 1)), subject.episodes)
+        for number, seed in enumerate(seeds, 1):
+            if subject.late or len(failures) == _MOST_ERRORS:
                 break
             seed_global_generators(seed)
-            steps, error = self._played(env, seed)
-            if error is not None:
-                failures += 1
-                if isinstance(error, TimeUp):
-                    self._tell_of_stall(f"episode {number}, seed {seed}, after {len(steps)} steps")
+            played = play(subject, env, seed)
+            if played.error is not None:
+                failures.append(played.error)
+                if isinstance(played.error, TimeUp):
+                    _add_stall(subject, report, played, f"episode {number}, seed {seed}")
                     break
-                self._tell_of_error(error, f"in episode {number} of random legal actions, seed {seed}")
+                report.add_error(played.error, f"in episode {number} of random legal actions, seed {seed}")
                 continue
-            if number <= max(2, len(self._seeds)):
-                known.setdefault(seed, steps)
-            met: set[str] = set()
-            for step in steps:
-                collected[step.point].stepped(step, first=step.agent not in met)
-                met.add(step.agent)
-            decided = sum(not (step.told[2] or step.told[3]) for step in steps)
-            lengths.append(decided)
-            truncated = bool(steps) and steps[-1].told[3]
-            how = "cut" if truncated and decided >= self._max_steps else "truncated" if truncated else "terminated"
-            ends[how] += 1
-        self._points = tuple(collector.statistics() for collector in collected.values())
+            if number <= max(2, len(subject.seeds)):
+                known[seed] = played
+            collectors.played(played.steps)
+            lengths.append(sum(not (step.told[2] or step.told[3]) for step in played.steps))
+            truncated = bool(played.steps) and played.steps[-1].told[3]
+            cut = truncated and lengths[-1] >= subject.max_steps
+            ends["cut" if cut else "truncated" if truncated else "terminated"] += 1
+        report.points = tuple(point.statistics() for point in collectors.points)
         if lengths:
-            self._statistics = EpisodeStatistics(len(lengths), min(lengths), max(lengths), fmean(lengths), **ends)
-            for collector in collected.values():
-                self.findings += collector.findings()
+            report.episodes = EpisodeStatistics(len(lengths), min(lengths), max(lengths), fmean(lengths), **ends)
+            report.findings += [finding for point in collectors.points for finding in point.findings()]
             if ends["cut"] == len(lengths):
-                self._add(
-                    "note",
-                    "No episode came to its end",
-                    f"All were cut after {self._max_steps} steps. Environments of a model that never ends need the"
-                    " option max_steps.",
-                )
-            self.checked.append(f"{len(lengths)} episodes of random legal actions in the AEC view")
-        if not failures and known and self._repeats:
-            self._compares_episodes(env, known)
-        self._close(env)
+                report.add("endless", most=subject.max_steps)
+            report.checked.append(f"{len(lengths)} episodes of random legal actions in the AEC view")
+        if known and not failures and subject.repeats:
+            _compare_episodes(subject, report, env, known)
 
-    def _tell_of_stall(self, where: str) -> None:
-        if time.monotonic() - self._latest_step < self._limit * SHARE / 2:
-            self._add(
-                "warning",
-                "An episode took too long",
-                "It went on, but not to its end. Give the check more time (time_limit=), or cut episodes earlier"
-                " (max_steps=).",
-                where,
-            )
+
+def _add_stall(subject: Subject, report: Report, played: Played, where: str) -> None:
+    where = f"{where}, after {len(played.steps)} steps"
+    if time.monotonic() - played.latest < subject.limit * SHARE / 2:
+        report.add("slow_episode", where)
+    else:
+        report.add("standstill", where)
+
+
+def _compare_episodes(subject: Subject, report: Report, used: Any, known: dict[int, Played]) -> None:
+    """Compare episodes of the same seed: in a new environment, in a used one, and beside another one."""
+    first, *others = known
+    new = partial(Opened, subject, report, max_steps=subject.max_steps)
+    with new() as fresh, new() as beside:
+        for env in (fresh, used):
+            seed_global_generators(first)
+            again = play(subject, env, first)
+            if isinstance(again.error, TimeUp) or subject.late:
+                return
+            if not (difference := known[first].difference(again)):
+                continue
+            where = f"seed {first}, the same actions: {difference}"
+            if env is fresh:
+                report.add_unrepeatable(subject, f"two environments, {where}")
+            else:
+                report.add("left_over", where + _left_over(subject, report, first))
             return
-        self._add(
-            "error",
-            "An episode came to a standstill",
-            "After random legal actions the simulation neither ended nor asked for a decision in the time that the"
-            " check had for it. Look for a loop that waits for what some actions never bring about; or, if it only is"
-            " slow, give the check more time (time_limit=) or fewer steps (max_steps=).",
-            where,
+        if others and not subject.drawn:
+            _compare_side_by_side(subject, report, (fresh, beside), known)
+        _compare_seeds(subject, report, known)
+        _compare_actions(subject, report, used, first, known[first])
+        report.checked.append(
+            "the same seed and actions in a new environment, in one that was used before, and beside another one"
         )
 
-    def _compares_episodes(self, env: Any, known: dict[int, list[Step]]) -> None:
-        """Compare episodes of the same seed: in a new environment, in a used one, and beside another one."""
-        first, *others = known
-        fresh = self._make("aec", {"max_steps": self._max_steps})
-        beside = self._make("aec", {"max_steps": self._max_steps})
-        try:
-            seed_global_generators(first)
-            steps, error = self._played(fresh, first)
-            if isinstance(error, TimeUp) or self._late():
-                return
-            difference = step_difference(known[first], steps, error)
-            if difference:
-                self._tell_of_chance(first, f"two environments, seed {first}, the same actions: {difference}")
-                return
-            seed_global_generators(first)
-            steps, error = self._played(env, first)
-            if isinstance(error, TimeUp) or self._late():
-                return
-            difference = step_difference(known[first], steps, error)
-            if difference:
-                self._add(
-                    "error",
-                    "Something is left over from earlier episodes",
-                    "An episode in an environment that has played others differs from the same one in a new"
-                    " environment. reset() must bring back everything that run() changes; what is set in __init__ and"
-                    " changed later is the usual cause.",
-                    f"seed {first}, the same actions: {difference}" + self._left_over(first),
-                )
-                return
-            if others and not self._drawn:
-                self._compares_side_by_side(fresh, beside, known)
-            self._compares_seeds(env, known)
-            self.checked.append(
-                "the same seed and actions in a new environment, in one that was used before, and beside another one"
-            )
-        finally:
-            self._close(fresh)
-            self._close(beside)
 
-    def _left_over(self, seed: int) -> str:
-        """What a simulation holds after a run and a reset that it does not hold after the first reset."""
-        try:
-            plan = self._plan
-            env = self._make("aec", {"max_steps": self._max_steps, "policies": None})
-            looks = []
+def _left_over(subject: Subject, report: Report, seed: int) -> str:
+    """What a simulation holds after a run and a reset that it does not hold after the first reset."""
+    looks = []
 
-            def look() -> None:
-                seed_global_generators(seed)
-                env.reset(seed=seed)
-                looks.append(fingerprint(env.simulation, self._own))
-                for _ in random_steps(env, seed + 1):
-                    pass
-
-            for _ in range(2):
-                within(self._deadline(), look)
-            env.close()
-            parts = looks[0].differences(looks[1], self._chancy)
-        except (Exception, SystemExit):
-            return ""
-        return f"\nafter reset, {plan.name}: {parts_in_words(parts, 'at first', 'later')}" if parts else ""
-
-    def _compares_side_by_side(self, one: Any, other: Any, known: dict[int, list[Step]]) -> None:
-        seeds = list(known)[:2]
-        played: list[list[Step]] = [[], []]
-        error: BaseException | None = None
-
-        def play() -> None:
-            games = [random_steps(env, seed) for env, seed in zip((one, other), seeds, strict=True)]
-            for pair in zip_longest(*games):
-                for steps, step in zip(played, pair, strict=True):
-                    if step is not None:
-                        steps.append(step)
-
-        try:
-            within(self._deadline(), play)
-        except TimeUp:
-            return
-        except (Exception, SystemExit) as raised:
-            error = raised
-        for seed, steps in zip(seeds, played, strict=True):
-            difference = step_difference(known[seed], steps, error)
-            if difference:
-                self._add(
-                    "error",
-                    "Two environments of the model disturb each other",
-                    "Stepped in turns, they give other episodes than each by itself. They share something: attributes"
-                    " of classes, global variables, a file, or objects that were made when the module was imported.",
-                    f"seeds {seeds_in_words(seeds)}: {difference}",
-                )
-                return
-
-    def _compares_seeds(self, env: Any, known: dict[int, list[Step]]) -> None:
-        if len(known) > 1:
-            starts = [(steps[0].agent, steps[0].told) for steps in known.values() if steps]
-            rules = [run.decisions for run in self._plain.values()]
-            prints = [run.fingerprint for run in self._plain.values() if run.fingerprint is not None]
-            same_runs = all(alike(rules[0], other) for other in rules[1:])
-            same_runs = same_runs and not any(prints[0].differences(other, self._seed_like) for other in prints[1:])
-            if same_runs and all(alike(starts[0], other) for other in starts[1:]):
-                self._add(
-                    "note",
-                    "All seeds give the same episode",
-                    "If something in the model is random, reset() does not seed it with what it is given. If nothing"
-                    " is, every episode begins alike, and agents may learn it by heart.",
-                    f"seeds {seeds_in_words(known)}",
-                )
-        first = next(iter(known))
-        seed_global_generators(first)
-        steps, error = self._played(env, first, salt=1)
-        if error is None and not self._drawn and len(steps) > 1:
-            acted = [step.action for step in known[first] if step.action is not None]
-            other = [step.action for step in steps if step.action is not None]
-            unmoved = alike([(s.agent, s.told) for s in known[first]], [(s.agent, s.told) for s in steps])
-            if unmoved and not alike(acted, other):
-                self._add(
-                    "warning",
-                    "What the agents do changes nothing",
-                    "Two episodes of the same seed with different actions gave the same observations and rewards. Do"
-                    " the actions reach the model (action_space_mapping, apply), and do observations and rewards show"
-                    " what they bring about?",
-                    f"seed {first}, {len(acted)} actions",
-                )
-
-    @property
-    def _seed_like(self) -> frozenset[str]:
-        """Parts that hold nothing but the seed itself."""
-        return self._chancy | {
-            general(path)
-            for seed, run in self._plain.items()
-            if run.fingerprint is not None
-            for path, value in run.fingerprint.parts.items()
-            if type(value) is int and value == seed and "seed" in path
-        }
-
-    def _ends_early(self) -> None:
-        """Close an environment in mid-episode."""
-        if self._late() or any(finding.severity == "error" for finding in self.findings):
-            return
-        env = self._make("aec", {"max_steps": None})
-        seed_global_generators(self._seeds[0])
-        try:
-            within(self._deadline(), partial(env.reset, seed=self._seeds[0]))
-        except TimeUp:
+    def look(env: Any) -> None:
+        seed_global_generators(seed)
+        env.reset(seed=seed)
+        looks.append(subject.look(env.simulation))
+        for _ in random_steps(env, seed + 1):
             pass
-        finally:
-            self._close(env)
-        self.checked.append("an environment that is closed in mid-episode")
+
+    try:
+        with Opened(subject, report, max_steps=subject.max_steps) as env:
+            for _ in range(2):
+                within(subject.deadline(), partial(look, env))
+    except (Exception, SystemExit):
+        return ""
+    parts = looks[0].differences(looks[1], subject.unstable)
+    return f"\nafter reset, {subject.plan.name}: {differences_in_words(parts, 'at first', 'later')}" if parts else ""
 
 
-def _enough(seeds: tuple[int, ...], number: int) -> Iterator[int]:
-    """As many seeds as there are to be episodes: those that are given, and then the next ones."""
-    following = max(seeds) + 1
-    for place in range(number):
-        yield seeds[place] if place < len(seeds) else following + place - len(seeds)
+def _compare_side_by_side(subject: Subject, report: Report, envs: Sequence[Any], known: dict[int, Played]) -> None:
+    """Step two environments in turns, and compare their episodes with those of each by itself."""
+    seeds, played = list(known)[:2], (Played(), Played())
+
+    def steps() -> None:
+        games = [random_steps(env, seed) for env, seed in zip(envs, seeds, strict=True)]
+        for pair in zip_longest(*games):
+            for one, step in zip(played, pair, strict=True):
+                if step is not None:
+                    one.steps.append(step)
+
+    try:
+        within(subject.deadline(), steps)
+    except TimeUp:
+        return
+    except (Exception, SystemExit) as raised:
+        for one in played:
+            one.error = raised
+    differences = [known[seed].difference(one) for seed, one in zip(seeds, played, strict=True)]
+    if any(differences):
+        report.add("disturbance", f"seeds {', '.join(map(str, seeds))}: {differences[0] or differences[1]}")
+
+
+def _compare_seeds(subject: Subject, report: Report, known: dict[int, Played]) -> None:
+    """Say so if all seeds give the same episode."""
+    runs = [(seed, run.decisions, run.fingerprint) for seed, run in subject.plain.items() if run.fingerprint]
+    seed_like = {  # parts that hold nothing but the seed itself
+        general(path)
+        for seed, _, held in runs
+        for path, value in held.parts.items()
+        if type(value) is int and value == seed and "seed" in path
+    }
+    starts = [played.told[0] for played in known.values() if played.steps]
+    if (
+        len(known) > 1
+        and all(alike(runs[0][1], decisions) for _, decisions, _ in runs[1:])
+        and not any(runs[0][2].differences(held, subject.unstable | seed_like) for _, _, held in runs[1:])
+        and all(alike(starts[0], other) for other in starts[1:])
+    ):
+        report.add("same_seeds", f"seeds {', '.join(map(str, known))}")
+
+
+def _compare_actions(subject: Subject, report: Report, env: Any, seed: int, known: Played) -> None:
+    """Play other actions with the same seed, and say so if they change nothing."""
+    seed_global_generators(seed)
+    other = play(subject, env, seed, salt=1)
+    if other.error is not None or subject.drawn or len(other.steps) < 2:
+        return
+    acted, instead = ([step.action for step in one.steps if step.action is not None] for one in (known, other))
+    if alike(known.told, other.told) and not alike(acted, instead):
+        report.add("no_effect", f"seed {seed}, {len(acted)} actions")
+
+
+def check_early_end(subject: Subject, report: Report) -> None:
+    """Close an environment in mid-episode."""
+    if subject.late or report.has_errors:
+        return
+    with Opened(subject, report, max_steps=None) as env:
+        seed_global_generators(subject.seeds[0])
+        with suppress(TimeUp):
+            within(subject.deadline(), partial(env.reset, seed=subject.seeds[0]))
+    report.checked.append("an environment that is closed in mid-episode")

@@ -1,8 +1,8 @@
 """What is left of a run: all that an arbitrary simulation holds, written down so that two runs can be compared.
 
-Nobody asks models to be comparable. So their attributes are gone through, as far as they lead, down to numbers,
-strings, arrays and the states of random generators; each of these *parts* has a path, which is what a difference is
-told by. What cannot be compared (open files, generators, locks) is left out, and its kind is noted.
+Models need not be comparable. So their attributes are followed, as far as they lead, down to numbers, strings, arrays
+and the states of random generators; each of these *parts* has a path, by which a difference is told. What cannot be
+compared (open files, generators, locks) is left out, and its kind is noted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..core.switch import unattended
 from ..simulation import Sentinel
 
 MOST_PARTS: Final = 50_000
@@ -77,12 +76,9 @@ def fingerprint(simulation: Any, own: Callable[[Any], Any] | None = None) -> Fin
             simulation's own ``state()``, or else all its attributes.
     """
     tell = getattr(simulation, "state", None)
-    with unattended():
-        if own is not None:
-            return _written("fingerprint", own(simulation))
-        if callable(tell):
-            return _written("state()", tell())
-        return _written("simulation", simulation)
+    if own is not None:
+        return _written("fingerprint", own(simulation))
+    return _written("state()", tell()) if callable(tell) else _written("simulation", simulation)
 
 
 def _written(name: str, root: Any) -> Fingerprint:
@@ -239,3 +235,10 @@ def shown(value: Any, most: int = 60) -> str:
         return "nothing"
     text = " ".join(repr(value).split())
     return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
+def differences_in_words(parts: list[tuple[str, Any, Any]], here: str = "first", there: str = "then") -> str:
+    """What differs between two fingerprints, in words."""
+    listed = [f"{path} is {here} {shown(left)}, {there} {shown(right)}" for path, left, right in parts[:3]]
+    more = f"; {len(parts) - 3} more" if len(parts) > 3 else ""
+    return "; ".join(listed) + more

@@ -1,18 +1,20 @@
-"""What a check has found and what an inspection has seen, as objects that read as plain text."""
+"""What a check has found and what an inspection has seen, as immutable objects that read as plain text."""
 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from textwrap import fill, indent
+from importlib.resources import files
+from textwrap import TextWrapper, indent
 from typing import Any, Final, Literal
 
 from ..errors import CheckFailedError
 
 Severity = Literal["error", "warning", "note"]
 
-SEVERITIES: Final = ("error", "warning", "note")
+SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 """In the order of their importance."""
 
 WIDTH: Final = 100
@@ -41,8 +43,25 @@ class Finding:
     def __str__(self) -> str:
         lines = [f"{self.severity.upper():<9}{self.title}", _wrapped(self.explanation)]
         if self.evidence:
-            lines += [_wrapped(line, hang="  ") for line in f"Seen: {self.evidence}".splitlines()]
+            lines += [_wrapped(line, hang=11) for line in f"Seen: {self.evidence}".splitlines()]
         return "\n".join(lines)
+
+
+_WORDS: Final = tomllib.loads(files(__package__).joinpath("findings.toml").read_text(encoding="utf-8"))
+
+
+def finding(name: str, evidence: str = "", **words: Any) -> Finding:
+    """Make a finding whose words stand in ``findings.toml``.
+
+    Args:
+        name: Under which name.
+        evidence: Where and when it was seen.
+        **words: What is put into title and explanation.
+    """
+    entry = _WORDS[name]
+    severity = next(severity for severity in SEVERITIES if severity in entry)
+    title, text = entry[severity].format(**words), " ".join(entry["text"].split()).format(**words)
+    return Finding(severity, title, text, evidence)
 
 
 # -- statistics -----------------------------------------------------------------------------------
@@ -107,16 +126,16 @@ class PointStatistics:
         rewards = "no rewards"
         if self.rewards:
             rewards = (
-                f"rewards {_number(self.reward_minimum)} to {_number(self.reward_maximum)},"
-                f" mean {_number(self.reward_mean)}"
+                f"rewards {in_digits(self.reward_minimum)} to {in_digits(self.reward_maximum)},"
+                f" mean {in_digits(self.reward_mean)}"
             )
         lines = [f"{self.agents}, at {self.point}", f"  {self.decisions} decisions, {rewards}"]
         lines.append(f"  actions {self.action_space}, observations {self.observation_space}")
         if self.components:
             rows = [("observed", "least", "mean", "most", "bounds", "at a bound")]
             for part in self.components[:_MOST_COMPONENTS]:
-                values = _number(part.minimum), _number(part.mean), _number(part.maximum)
-                bounds = f"{_number(part.low)} to {_number(part.high)}"
+                values = in_digits(part.minimum), in_digits(part.mean), in_digits(part.maximum)
+                bounds = f"{in_digits(part.low)} to {in_digits(part.high)}"
                 rows.append((part.name or "(value)", *values, bounds, f"{part.at_bounds:.0%}"))
             lines += [f"  {line}" for line in _table(rows)]
             if len(self.components) > _MOST_COMPONENTS:
@@ -148,7 +167,7 @@ class EpisodeStatistics:
         ends = {"ended": self.terminated, "truncated by the simulation": self.truncated, "cut at max_steps": self.cut}
         length = f"{self.shortest}" if self.shortest == self.longest else f"{self.shortest} to {self.longest}"
         return (
-            f"{self.episodes} of {length} decisions (mean {_number(self.mean)});"
+            f"{self.episodes} of {length} decisions (mean {in_digits(self.mean)});"
             f" {', '.join(f'{number} {end}' for end, number in ends.items() if number)}"
         )
 
@@ -162,7 +181,7 @@ class Timing:
 
     def __str__(self) -> str:
         return (
-            f"{_number(self.plain)} us per decision in the plain run, {_number(self.environment)} us behind the"
+            f"{in_digits(self.plain)} us per decision in the plain run, {in_digits(self.environment)} us behind the"
             f" environment"
         )
 
@@ -213,24 +232,23 @@ class CheckReport:
 
     def to_dict(self) -> dict[str, Any]:
         """The report as dicts, lists, strings and numbers, for JSON; infinite numbers as strings."""
-        made: dict[str, Any] = {"ok": self.ok, **_plain(asdict(self))}
+        made: dict[str, Any] = {"ok": self.ok, **_for_json(asdict(self))}
         return made
 
     def __str__(self) -> str:
-        parts = [f"{self.simulation}: {self._counts()}"]
-        parts += [str(finding) for finding in self.findings]
+        parts = [f"{self.simulation}: {self._counts()}", *map(str, self.findings)]
         if self.checked:
-            parts.append("\n".join(["What was looked at", *(_wrapped(line, "  ", "  ") for line in self.checked)]))
-        lines = [f"Episodes of random legal actions: {self.episodes}"]
-        parts.append("\n".join([*lines, *(indent(str(point), "  ") for point in self.observations)]))
+            parts.append("\n".join(["What was looked at", *(_wrapped(line, "  ") for line in self.checked)]))
+        points = [indent(str(point), "  ") for point in self.observations]
+        parts.append("\n".join([f"Episodes of random legal actions: {self.episodes}", *points]))
         if self.calls:
-            parts.append(f"Order of the decisions in a plain run\n{_wrapped(self.calls, '  ', '  ')}")
+            parts.append(f"Order of the decisions in a plain run\n{_wrapped(self.calls, '  ')}")
         if self.timing is not None:
             parts.append(f"Time: {self.timing}")
         return "\n\n".join(parts)
 
     def _counts(self) -> str:
-        counts = [(len(self.of(severity)), severity) for severity in ("error", "warning", "note")]
+        counts = [(len(self.of(severity)), severity) for severity in SEVERITIES]
         named = [f"{number} {severity}{'s' * (number != 1)}" for number, severity in counts if number]
         return ", ".join(named) if named else "nothing to complain of"
 
@@ -253,12 +271,13 @@ class PointDescription:
     details: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        lines = [self.name]
-        lines.append(f"  agent         {self.agents}")
-        lines.append(f"  observations  {self.observation_space}")
-        lines.append(f"  actions       {self.action_space}")
-        lines += [f"  {detail}" for detail in self.details]
-        return "\n".join(lines)
+        lines = [
+            self.name,
+            f"  agent         {self.agents}",
+            f"  observations  {self.observation_space}",
+            f"  actions       {self.action_space}",
+        ]
+        return "\n".join(lines + [f"  {detail}" for detail in self.details])
 
 
 @dataclass(frozen=True)
@@ -285,23 +304,24 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """The same as dicts, lists, strings and numbers, for JSON."""
-        made: dict[str, Any] = _plain(asdict(self))
+        made: dict[str, Any] = _for_json(asdict(self))
         return made
 
     def __str__(self) -> str:
-        parts = [f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}"]
-        parts += [str(point) for point in self.points]
-        parts.append(f"Views that fit: {', '.join(self.views)}")
         counts = ", ".join(f"{point} {number} times" for point, number in self.counts.items())
-        parts.append(
-            f"One episode by the model's own rules: {self.ended}\n"
-            + _wrapped(f"calls    {counts or 'none'}", "  ", "           ")
-            + "\n"
-            + _wrapped(f"order    {self.calls or '-'}", "  ", "           ")
-            + "\n"
-            + _wrapped(f"agents   {_names(self.agents) or '-'}", "  ", "           ")
+        more = f" and {len(self.agents) - 8} more" if len(self.agents) > 8 else ""
+        episode = {"calls": counts, "order": self.calls, "agents": ", ".join(self.agents[:8]) + more}
+        empty = {"calls": "none", "order": "-", "agents": "-"}
+        lines = [f"One episode by the model's own rules: {self.ended}"]
+        lines += [_wrapped(f"{name:<8} {text or empty[name]}", "  ", 11) for name, text in episode.items()]
+        return "\n\n".join(
+            [
+                f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}",
+                *map(str, self.points),
+                f"Views that fit: {', '.join(self.views)}",
+                "\n".join(lines),
+            ]
         )
-        return "\n\n".join(parts)
 
 
 # -- the order of calls ---------------------------------------------------------------------------
@@ -311,19 +331,25 @@ _MOST_CALLS: Final = 3000
 _MOST_TERMS: Final = 30
 
 
+def order_of(calls: Sequence[str]) -> str:
+    """The order in which decision points were called, compressed and by the shortest names."""
+    short = short_names(list(dict.fromkeys(calls)))
+    return compressed(short[name] for name in calls)
+
+
 def compressed(calls: Iterable[str]) -> str:
     """Write a sequence down with its repetitions, as ``(a b){30} c``; long ones end in an ellipsis."""
     all_calls = list(calls)
     terms = all_calls[:_MOST_CALLS]
     for length in range(1, _LONGEST_BLOCK + 1):
         terms = _folded(terms, length)
-    rest = len(terms) - _MOST_TERMS
-    left = len(all_calls) - _MOST_CALLS
+    rest, left = len(terms) - _MOST_TERMS, len(all_calls) - _MOST_CALLS
     ending = f" ... and {rest} more such terms" if rest > 0 else f" ... and {left} more calls" if left > 0 else ""
     return " ".join(terms[:_MOST_TERMS]) + ending
 
 
 def _folded(terms: Sequence[str], length: int) -> list[str]:
+    """The same terms, with repetitions of blocks of one length written as one term."""
     made: list[str] = []
     place = 0
     while place < len(terms):
@@ -333,10 +359,9 @@ def _folded(terms: Sequence[str], length: int) -> list[str]:
             times += 1
         if times > 1:
             made.append(f"{block[0]}{{{times}}}" if length == 1 else f"({' '.join(block)}){{{times}}}")
-            place += times * length
         else:
             made.append(terms[place])
-            place += 1
+        place += times * length if times > 1 else 1
     return made
 
 
@@ -345,55 +370,39 @@ def short_names(points: Sequence[str]) -> dict[str, str]:
     short = {}
     for point in points:
         parts = point.split(".")
-        for length in range(1, len(parts) + 1):
-            end = ".".join(parts[-length:])
-            if sum(other == end or other.endswith(f".{end}") for other in points) == 1:
-                break
-        short[point] = end
+        ends = [".".join(parts[-length:]) for length in range(1, len(parts) + 1)]
+        unique = (end for end in ends if sum(f".{other}".endswith(f".{end}") for other in points) == 1)
+        short[point] = next(unique, point)
     return short
 
 
 # -- text -----------------------------------------------------------------------------------------
 
 
-def _wrapped(text: str, first: str = "         ", hang: str = "") -> str:
-    following = hang if hang.strip() == "" and len(hang) > len(first) else first + hang
-    if first == "  ":
-        following = hang
-    return fill(
-        text,
-        WIDTH,
-        initial_indent=first,
-        subsequent_indent=following,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+def _wrapped(text: str, margin: str = " " * 9, hang: int | None = None) -> str:
+    """Wrap a text, with a margin before its first line and one before the others (of ``hang`` spaces)."""
+    rest = margin if hang is None else " " * hang
+    wrapper = TextWrapper(WIDTH, margin, rest, break_long_words=False, break_on_hyphens=False)
+    return wrapper.fill(text)
 
 
-def _number(value: float) -> str:
+def in_digits(value: float) -> str:
+    """A number in four digits."""
     if not math.isfinite(value):
         return "not a number" if math.isnan(value) else "-inf" if value < 0 else "inf"
     return f"{value:.4g}"
 
 
-def _names(names: Sequence[str], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
-
-
 def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        first, *others = row
+    for first, *others in rows:
         cells = [first.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True))]
         yield "  ".join(cells).rstrip()
 
 
-def _plain(value: Any) -> Any:
+def _for_json(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
+        return {str(key): _for_json(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value
+        return [_for_json(part) for part in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

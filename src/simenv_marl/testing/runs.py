@@ -8,26 +8,23 @@ from __future__ import annotations
 
 import copy
 import ctypes
+import io
 import random
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar
 from zlib import crc32
 
 import numpy as np
 
-from ..core.bindings import Binding
-from ..core.contexts import Surroundings
-from ..core.plan import Plan
-from ..core.spaces import MASK
-from ..core.switch import RUNNING, SimulationExit
-from ..decision import DecisionPoint
-from ..simulation import RULE, make_simulation, resetter
-from .fingerprint import Fingerprint, alike, brief, fingerprint
+from ..simulation import RULE
+from .fingerprint import Fingerprint, alike, brief, shown
+from .inside import MASK, Plan, SimulationExit, make_simulation, outside_simulation, plain_loop, watching_rules
 
 
 class Cut(SimulationExit):
@@ -39,6 +36,8 @@ class TimeUp(SimulationExit):
 
 
 Result = TypeVar("Result")
+Look = Callable[[Any], Fingerprint | None]
+"""Writes down what a simulation holds."""
 
 # -- time -----------------------------------------------------------------------------------------
 
@@ -57,12 +56,11 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
     if time.monotonic() >= deadline:
         raise TimeUp
     thread, over = threading.get_ident(), threading.Event()
-    interrupt = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
     def watch() -> None:
         pause = deadline - time.monotonic()
         while not over.wait(max(0.0, pause)):
-            interrupt(ctypes.c_ulong(thread), ctypes.py_object(TimeUp))
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(TimeUp))
             pause = _AGAIN
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
@@ -70,8 +68,8 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
         watcher.start()
         return function()
     finally:
-        # It may still be raised up to when nobody is left who would raise it, and is then delivered at once. (It is not
-        # taken back: in CPython that leaves the interpreter checking for it for ever.)
+        # TimeUp may still be raised until the watcher has ended, and is then delivered at once. (It is not taken back:
+        # in CPython that leaves the interpreter checking for it for ever.)
         while True:
             try:
                 over.set()
@@ -103,14 +101,28 @@ def seed_global_generators(seed: int) -> None:
     np.random.seed(seed % 2**32)
 
 
-def drawn_from(before: tuple[Any, Any]) -> set[str]:
-    """Which of the global generators have moved since."""
-    now = global_generators()
-    names = ("Python's random", "numpy.random")
-    return {name for name, one, other in zip(names, before, now, strict=True) if not alike(one, other)}
+@contextmanager
+def quietly() -> Iterator[list[warnings.WarningMessage]]:
+    """Let a model run that may print and warn; the global generators are left as they were.
+
+    Yields:
+        The warnings that were not ignored.
+    """
+    states, silenced = global_generators(), io.StringIO()
+    try:
+        with (
+            outside_simulation(),
+            warnings.catch_warnings(record=True) as caught,
+            redirect_stdout(silenced),
+            redirect_stderr(silenced),
+        ):
+            warnings.simplefilter("ignore")
+            yield caught
+    finally:
+        set_global_generators(states)
 
 
-# -- watched rules --------------------------------------------------------------------------------
+# -- runs of the model's own rules ----------------------------------------------------------------
 
 
 @dataclass
@@ -124,7 +136,6 @@ class Run:
         error: What it raised.
         result: What ``run`` returned, of a plain run.
         drawn: From which global generators it has drawn.
-        seconds: How long it took.
     """
 
     decisions: list[list[Any]] = field(default_factory=list)
@@ -133,95 +144,70 @@ class Run:
     error: BaseException | None = None
     result: Any = None
     drawn: set[str] = field(default_factory=set)
-    seconds: float = 0.0
+
+    @property
+    def calls(self) -> list[str]:
+        """The points that were called, in that order."""
+        return [name for name, _ in self.decisions]
+
+    def difference(self, other: Run, here: str = "first", there: str = "then") -> str:
+        """Where the decisions differ first from those of another run, in words; empty where they do not."""
+        for number, (left, right) in enumerate(zip(self.decisions, other.decisions, strict=False), 1):
+            if left[0] != right[0]:
+                return f"decision {number} is {here} of {left[0]}, {there} of {right[0]}"
+            if not alike(left[1], right[1]):
+                return f"decision {number}, of {left[0]}, is {here} {shown(left[1])}, {there} {shown(right[1])}"
+        if len(self.decisions) != len(other.decisions):
+            return f"there are {here} {len(self.decisions)} decisions, {there} {len(other.decisions)}"
+        return ""
 
 
-class Watcher:
-    """Notes what the rules of some points return, until a limit.
+class _Watch:
+    """Watches one run, until a limit of decisions.
 
     Attributes:
         run: What is noted.
-        simulation: The simulation whose run it is, once that is known.
+        simulation: The simulation whose run it is.
     """
 
-    def __init__(self, points: list[DecisionPoint], limit: int, own: Callable[[Any], Any] | None) -> None:
+    def __init__(self, limit: int, look: Look) -> None:
         self.run = Run()
         self.simulation: Any = None
-        self._points, self._limit, self._own = points, limit, own
+        self._limit, self._look = limit, look
 
-    @contextmanager
-    def watching(self) -> Iterator[Run]:
-        """Have the rules watched, and whatever is raised noted."""
-        run = self.run
-        rules = [point.rule for point in self._points]
-        before, start = global_generators(), time.perf_counter()
-        for point in self._points:
-            point.rule = self._watched(point)
-        try:
-            yield run
-            run.seconds = time.perf_counter() - start
-            run.fingerprint = fingerprint(self.simulation, self._own)
-        except Cut:
-            run.seconds = time.perf_counter() - start
-        except (Exception, SystemExit) as error:
-            if not run.cut:
-                run.error = error
-        finally:
-            for point, rule in zip(self._points, rules, strict=True):
-                point.rule = rule
-            run.drawn = drawn_from(before)
+    def over(self, plan: Plan, play: Callable[[], Any]) -> Run:
+        """Watch what a function plays, and note whatever it raises."""
+        run, before = self.run, global_generators()
+        with watching_rules(plan, self._begin):
+            try:
+                run.result = play()
+                run.fingerprint = self._look(self.simulation)
+            except Cut:
+                pass
+            except (Exception, SystemExit) as error:
+                if not run.cut:
+                    run.error = error
+        sources = zip(("Python's random", "numpy.random"), before, global_generators(), strict=True)
+        run.drawn = {name for name, one, other in sources if not alike(one, other)}
+        return run
 
-    def _arise(self, point: DecisionPoint) -> list[Any]:
+    def _begin(self, name: str) -> Callable[[Any], None]:
         run = self.run
         if len(run.decisions) >= self._limit:
             if not run.cut:
                 run.cut = True
-                run.fingerprint = fingerprint(self.simulation, self._own)
+                run.fingerprint = self._look(self.simulation)
             raise Cut
-        note = [point.name, "nothing, but was left"]
+        note = [name, "nothing, but was left"]
         run.decisions.append(note)
-        return note
 
-    def _watched(self, point: DecisionPoint) -> Any:
-        rule: Any = point.rule
-
-        def function(*args: Any, **kwargs: Any) -> Any:
-            note = self._arise(point)
-            value = rule(*args, **kwargs)
+        def end(value: Any) -> None:
             note[1] = brief(value)
-            return value
 
-        def generator(*args: Any, **kwargs: Any) -> Any:
-            note = self._arise(point)
-            value = yield from rule(*args, **kwargs)
-            note[1] = brief(value)
-            return value
-
-        async def coroutine(*args: Any, **kwargs: Any) -> Any:
-            note = self._arise(point)
-            value = await rule(*args, **kwargs)
-            note[1] = brief(value)
-            return value
-
-        return {"function": function, "generator": generator, "coroutine": coroutine}[point.kind]
+        return end
 
 
-def points_of(plan: Plan) -> list[DecisionPoint]:
-    """The points whose decisions an environment of a plan sees."""
-    return [point for point, binding in plan.bindings.items() if isinstance(binding, Binding)]
-
-
-# -- runs -----------------------------------------------------------------------------------------
-
-
-def plain_run(
-    plan: Plan,
-    seed: int,
-    limit: int,
-    deadline: float,
-    own: Callable[[Any], Any] | None,
-    profile: Any = None,
-) -> Run:
+def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look, profile: Any = None) -> Run:
     """Run a simulation's own loop, with nothing around it but a note of what its rules return.
 
     Args:
@@ -229,94 +215,72 @@ def plain_run(
         seed: What it is reset with.
         limit: After how many decisions it is cut.
         deadline: When its time is up.
-        own: What it is compared by.
+        look: Writes down what the simulation holds at the end.
         profile: What is told of all calls meanwhile, as ``sys.setprofile`` has it.
     """
-    watcher = Watcher(points_of(plan), limit, own)
-    thread = threading.get_ident()
-    before = sys.getprofile()
+    watch, before = _Watch(limit, look), sys.getprofile()
 
-    def run_it() -> None:
-        watcher.simulation = simulation = make_simulation(plan.source)
-        if profile is not None:
-            sys.setprofile(profile)
+    def play() -> Any:
+        watch.simulation = make_simulation(plan.source)
+        sys.setprofile(before if profile is None else profile)
         try:
-            surroundings.begin(seed)
-            resetter(simulation)(seed, None)
-            RUNNING[thread] = _rule
-            watcher.run.result = simulation.run()
+            reset(watch.simulation, seed)
+            return main(watch.simulation)
         finally:
-            RUNNING.pop(thread, None)
-            if profile is not None:
-                sys.setprofile(before)
+            sys.setprofile(before)
 
-    with held(plan) as surroundings, watcher.watching() as run:
-        within(deadline, run_it)
-    return run
+    with plain_loop(plan, watched=True) as (reset, main):
+        return watch.over(plan, lambda: within(deadline, play))
 
 
-@contextmanager
-def held(plan: Plan) -> Iterator[Surroundings]:
-    """Set in the model what environments of a plan set there, and be where their simulations are."""
-    surroundings, done = Surroundings(plan.surroundings()), []
-    try:
-        for site in plan.patches:
-            site.hold()
-            done.append(site)
-        with surroundings.entered():
-            yield surroundings
-    finally:
-        for site in reversed(done):
-            site.let_go()
-
-
-def _rule(point: DecisionPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    return point.rule(*args, **kwargs)
-
-
-def untouched_run(plan: Plan, seed: int, deadline: float) -> float:
+def seconds_of_plain_run(plan: Plan, seed: int, deadline: float) -> float:
     """Run a simulation's own loop with nothing around it at all. Returns how many seconds that took."""
 
-    def run_it() -> float:
+    def play() -> float:
         simulation = make_simulation(plan.source)
-        surroundings.begin(seed)
-        resetter(simulation)(seed, None)
+        reset(simulation, seed)
         start = time.perf_counter()
-        simulation.run()
+        main(simulation)
         return time.perf_counter() - start
 
-    surroundings = Surroundings(plan.surroundings())
-    with surroundings.entered():
-        return within(deadline, run_it)
+    with plain_loop(plan, watched=False) as (reset, main):
+        return within(deadline, play)
 
 
-def rule_run(env: Any, seed: int, limit: int, deadline: float, own: Callable[[Any], Any] | None) -> Run:
-    """Run an environment of any view with ``RULE`` throughout, watched."""
-    watcher = Watcher(points_of(env._plan), limit, own)
-    watcher.simulation = env.simulation
-    with watcher.watching() as run:
-        within(deadline, lambda: all_rules(env, seed))
-    return run
+def rule_run(plan: Plan, env: Any, seed: int, limit: int, deadline: float, look: Look) -> Run:
+    """Run an environment of a plan, of any view, with ``RULE`` throughout, watched."""
+
+    def play() -> None:
+        env.reset(seed=seed)
+        play_rules(env)
+
+    watch = _Watch(limit, look)
+    watch.simulation = env.simulation
+    return watch.over(plan, lambda: within(deadline, play))
 
 
-def all_rules(env: Any, seed: int) -> None:
-    """Play an environment of any view with ``RULE`` throughout."""
-    env.reset(seed=seed)
-    play_rules(env)
+def play_rules(env: Any, selected: dict[str, None] | None = None) -> None:
+    """Play an environment of any view with ``RULE`` throughout, once it has been reset.
 
-
-def play_rules(env: Any) -> None:
-    """The same, once it has been reset."""
+    Args:
+        env: The environment.
+        selected: Where the agents are noted that the AEC view selects.
+    """
     if not hasattr(env, "agents"):
         while not any(env.step(RULE)[2:4]):
             pass
-    elif hasattr(env, "agent_selection"):
-        while env.agents:
-            agent = env.agent_selection
-            env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
-    else:
-        while env.agents:
+        return
+    while env.agents:
+        if not hasattr(env, "agent_selection"):
             env.step(RULE)
+            continue
+        agent = env.agent_selection
+        if selected is not None:
+            selected[agent] = None
+        env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
+
+
+# -- episodes of random actions -------------------------------------------------------------------
 
 
 @dataclass
@@ -324,17 +288,18 @@ class Step:
     """What an agent was told at its turn, and what it did (None where its episode has ended)."""
 
     agent: str
-    point: str
     told: tuple[Any, float, bool, bool, dict[str, Any]]
     action: Any
 
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Step)
-            and self.agent == other.agent
-            and alike(self.told, other.told)
-            and alike(brief(self.action), brief(other.action))
-        )
+    def difference(self, other: Step) -> str:
+        """What differs from a step of another episode, in words; empty where nothing does."""
+        if self.agent != other.agent:
+            return f"is first of {self.agent}, then of {other.agent}"
+        names = ("observation", "reward", "terminated", "truncated", "info")
+        for name, here, there in zip(names, self.told, other.told, strict=True):
+            if not alike(here, there):
+                return f"the {name} of {self.agent} is first {shown(here)}, then {shown(there)}"
+        return "" if alike(brief(self.action), brief(other.action)) else f"the action of {self.agent} differs"
 
 
 def random_steps(env: Any, seed: int, salt: int = 0) -> Iterator[Step]:
@@ -346,31 +311,37 @@ def random_steps(env: Any, seed: int, salt: int = 0) -> Iterator[Step]:
         told = env.last()
         action = None
         if not (told[2] or told[3]):
-            space = spaces.get(agent)
-            if space is None:
-                space = spaces[agent] = copy.deepcopy(env.action_space(agent))
-                space.seed(crc32(f"{seed} {agent} {salt}".encode()))
+            if agent not in spaces:
+                spaces[agent] = copy.deepcopy(env.action_space(agent))
+                spaces[agent].seed(crc32(f"{seed} {agent} {salt}".encode()))
             mask = told[4].get(MASK)
-            action = space.sample() if mask is None else space.sample(mask)
-        yield Step(agent, env._binding(agent).point.name, told, action)
+            action = spaces[agent].sample() if mask is None else spaces[agent].sample(mask)
+        yield Step(agent, told, action)
         env.step(action)
+
+
+# -- where errors and differences come from -------------------------------------------------------
+
+_PACKAGE: Final = __file__.rpartition("testing")[0]
+_CLOCKS: Final = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
 
 
 def culprit(error: BaseException) -> str:
     """Where an error was raised, outside of this library: file, line and function; empty if nowhere."""
-    package = __file__.rpartition("testing")[0]
     place, trace = "", error.__traceback__
     while trace is not None:
         code = trace.tb_frame.f_code
-        if not code.co_filename.startswith((package, "<")) and "site-packages" not in code.co_filename:
+        if not code.co_filename.startswith((_PACKAGE, "<")) and "site-packages" not in code.co_filename:
             place = f"{code.co_filename}:{trace.tb_lineno}, in {code.co_name}"
         trace = trace.tb_next
     return place
 
 
-# -- what makes runs differ -----------------------------------------------------------------------
-
-_CLOCKS: Final = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
+def error_in_words(error: BaseException, most: int = 300) -> str:
+    """An error with its kind, the first lines of its text, and where it was raised."""
+    text, place = " ".join(str(error).split()), culprit(error)
+    text = text if len(text) <= most else f"{text[: most - 4]} ..."
+    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
 
 
 def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> list[str]:
@@ -380,37 +351,34 @@ def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> lis
         Each as a sentence's end, the place that asks for it included.
     """
     found: dict[str, None] = {}
-    package = __file__.rpartition("testing")[0]
     library = random.__file__.rpartition("random.py")[0]
     shared: Any = random.random.__self__  # type: ignore[attr-defined]
     seeding = random.Random.seed.__code__
 
     def asked(what: str, frame: Any) -> None:
-        while frame is not None:
+        while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
             path = frame.f_code.co_filename
-            outside = "site-packages" in path or not path.startswith(library)
-            if outside and not path.startswith((package, "<")):
+            if ("site-packages" in path or not path.startswith(library)) and not path.startswith("<"):
                 if "numpy" not in path:
                     found[f"{what} at {path}:{frame.f_lineno}, in {frame.f_code.co_name}"] = None
-                return
-            if path.startswith(package):
                 return
             frame = frame.f_back
 
     def profile(frame: Any, event: str, argument: Any) -> None:
-        if event == "c_call":
-            module, name = getattr(argument, "__module__", None), getattr(argument, "__name__", "")
-            owner = getattr(argument, "__self__", None)
-            if module == "time" and name in _CLOCKS:
-                asked(f"the clock is asked (time.{name})", frame)
-            elif name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
-                asked(f"the clock is asked (datetime.{name})", frame)
-            elif name == "urandom":
-                asked("the operating system is asked for random bits (as by a generator without a seed)", frame)
-            elif owner is shared and name in ("random", "getrandbits"):
-                asked("Python's global generator is used", frame)
-        elif event == "call" and frame.f_code is seeding and frame.f_locals.get("a", 0) is None:
+        if event == "call" and frame.f_code is seeding and frame.f_locals.get("a", 0) is None:
             asked("a random.Random is made without a seed", frame.f_back)
+        if event != "c_call":
+            return
+        module, name = getattr(argument, "__module__", None), getattr(argument, "__name__", "")
+        owner = getattr(argument, "__self__", None)
+        if module == "time" and name in _CLOCKS:
+            asked(f"the clock is asked (time.{name})", frame)
+        elif name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
+            asked(f"the clock is asked (datetime.{name})", frame)
+        elif name == "urandom":
+            asked("the operating system is asked for random bits (as by a generator without a seed)", frame)
+        elif owner is shared and name in ("random", "getrandbits"):
+            asked("Python's global generator is used", frame)
 
     plain_run(plan, seed, limit, deadline, lambda simulation: None, profile)
     return list(found)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import reduce, wraps
+from operator import getitem
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.bindings import Binding
-from ..core.plan import Plan
-from ..core.spaces import MASK
+from ..decision import Definition
 from .fingerprint import shown
-from .report import ComponentStatistics, Finding, PointStatistics
+from .inside import MASK, ActivePoint, Plan, redefined
+from .report import ComponentStatistics, Finding, PointStatistics, finding
 from .runs import Step
 
 _ENOUGH: Final = 30
@@ -23,139 +25,103 @@ _HUGE: Final = 1e3
 _HARDLY: Final = 0.01
 
 
-class _Leaf:
-    """The values of one part of an observation, of a ``Box`` or of another kind of numbers."""
+class _Leaf(NamedTuple):
+    """One part of an observation: a ``Box`` or another kind of numbers, and where it stands."""
 
-    def __init__(self, path: str, space: spaces.Space[Any]) -> None:
-        self.path, self.space = path, space
-        low, high = _bounds(space)
-        self.low, self.high = low.ravel().astype(np.float64), high.ravel().astype(np.float64)
-        size = self.low.size
-        self.names = _names(path, low.shape)
-        self.number = 0
-        self.minimum, self.maximum = np.full(size, np.inf), np.full(size, -np.inf)
-        self.total, self.at_bounds, self.beyond = np.zeros(size), np.zeros(size), np.zeros(size)
-        self.outside: dict[int, float] = {}
-        self.wrapped = self.cut_off = self.rounded = ""
+    name: str
+    path: tuple[Any, ...]
+    space: Any
 
-    def add(self, raw: Any, value: Any) -> None:
-        values = np.asarray(value, np.float64).ravel()
-        self.number += 1
-        np.fmin(self.minimum, values, out=self.minimum)
-        np.fmax(self.maximum, values, out=self.maximum)
-        self.total += values
-        self.at_bounds += (values == self.low) | (values == self.high)
-        beyond = ~((values >= self.low) & (values <= self.high))
-        if beyond.any():
-            self.beyond += beyond
-            for place in np.flatnonzero(beyond)[:3]:
-                self.outside.setdefault(int(place), float(values[place]))
-        self._compare(raw, values)
+    def bounds(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """The lower and the upper bounds."""
+        space = self.space
+        if isinstance(space, spaces.Box):
+            return space.low, space.high
+        if isinstance(space, spaces.Discrete):
+            return np.array(int(space.start)), np.array(int(space.start + space.n - 1))
+        if isinstance(space, spaces.MultiDiscrete):
+            return np.asarray(space.start), np.asarray(space.start + space.nvec - 1)
+        return np.zeros(space.shape), np.ones(space.shape)
 
-    def _compare(self, raw: Any, values: NDArray[np.float64]) -> None:
-        """See what the cast to the space's dtype has done."""
-        dtype = self.space.dtype
-        if dtype is None or isinstance(self.space, spaces.Discrete):
-            return
-        given = np.asarray(raw).ravel()
-        if given.dtype == dtype or given.dtype.kind not in "iuf" or given.size != values.size:
-            return
-        changed = given.astype(np.float64) != values
-        if not changed.any():
-            return
-        place = int(np.flatnonzero(changed)[0])
-        before, after = float(given[place]), float(values[place])
-        text = f"{self.names[place]} was {before:.10g} and became {after:.10g}".strip()
-        if dtype.kind in "iub":
-            if abs(before - after) >= 1:
-                self.wrapped = self.wrapped or text
-            else:
-                self.cut_off = self.cut_off or text
-        elif given.dtype.kind in "iu" or not np.isfinite(after):
-            self.rounded = self.rounded or text
-
-    def components(self) -> Iterator[ComponentStatistics]:
-        number = max(1, self.number)
-        for place, name in enumerate(self.names):
-            yield ComponentStatistics(
-                name=name,
-                low=float(self.low[place]),
-                high=float(self.high[place]),
-                minimum=float(self.minimum[place]),
-                maximum=float(self.maximum[place]),
-                mean=float(self.total[place]) / number,
-                at_bounds=float(self.at_bounds[place]) / number,
-                beyond=float(self.beyond[place]) / number,
-            )
+    def names(self) -> list[str]:
+        """What its components are called."""
+        shape = self.space.shape
+        return [f"{self.name}{list(place)}" for place in np.ndindex(*shape)] if shape else [self.name]
 
 
-def _bounds(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    if isinstance(space, spaces.Box):
-        return space.low, space.high
-    if isinstance(space, spaces.Discrete):
-        return np.array(int(space.start)), np.array(int(space.start + space.n - 1))
-    if isinstance(space, spaces.MultiDiscrete):
-        return np.asarray(space.start), np.asarray(space.start + space.nvec - 1)
-    return np.zeros(space.shape or ()), np.ones(space.shape or ())
-
-
-def _names(path: str, shape: tuple[int, ...]) -> list[str]:
-    if not shape:
-        return [path]
-    return [f"{path}[{', '.join(map(str, place))}]" for place in np.ndindex(*shape)]
-
-
-def _leaves(path: str, space: spaces.Space[Any]) -> Iterator[_Leaf]:
+def _leaves(space: spaces.Space[Any], name: str = "", path: tuple[Any, ...] = ()) -> Iterator[_Leaf]:
     if isinstance(space, spaces.Dict):
         for key, part in space.spaces.items():
             if key != MASK:
-                yield from _leaves(f"{path}.{key}" if path else str(key), part)
+                yield from _leaves(part, f"{name}.{key}" if name else str(key), (*path, key))
     elif isinstance(space, spaces.Tuple):
         for number, part in enumerate(space.spaces):
-            yield from _leaves(f"{path}({number})", part)
+            yield from _leaves(part, f"{name}({number})", (*path, number))
     elif isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-        yield _Leaf(path, space)
+        yield _Leaf(name, path, space)
 
 
-def _values(space: spaces.Space[Any], raw: Any, value: Any) -> Iterator[tuple[Any, Any]]:
-    if isinstance(space, spaces.Dict):
-        for key, part in space.spaces.items():
-            if key != MASK:
-                yield from _values(part, raw[key], value[key])
-    elif isinstance(space, spaces.Tuple):
-        for part, one, other in zip(space.spaces, raw, value, strict=True):
-            yield from _values(part, one, other)
-    elif isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-        yield raw, value
+def _flat(arrays: Iterable[NDArray[Any]]) -> NDArray[np.float64]:
+    return np.concatenate([np.zeros(0), *(array.ravel().astype(np.float64) for array in arrays)])
 
 
 class PointCollector:
     """Collects what is to be known of one decision point."""
 
-    def __init__(self, binding: Binding) -> None:
-        self.binding = binding
-        space = binding.definition.observation_space
-        self._space, self._leaves = space, list(_leaves("", space))
-        self.observations = self.decisions = self.rewards = 0
-        self.unfit = ""
+    def __init__(self, point: ActivePoint) -> None:
+        self.point, self._space = point, point.definition.observation_space
+        self._leaves = list(_leaves(self._space))
+        # Of all components of an observation, one after the other.
+        self._names = [name for leaf in self._leaves for name in leaf.names()]
+        self._dtypes = [leaf.space.dtype for leaf in self._leaves for _ in leaf.names()]
+        self._boxes = [isinstance(leaf.space, spaces.Box) for leaf in self._leaves for _ in leaf.names()]
+        self._whole = np.array([dtype.kind in "iub" for dtype in self._dtypes], np.bool_)
+        self._low = _flat(leaf.bounds()[0] for leaf in self._leaves)
+        self._high = _flat(leaf.bounds()[1] for leaf in self._leaves)
+        size = len(self._names)
+        self._least, self._most = np.full(size, np.inf), np.full(size, -np.inf)
+        self._total, self._at_bounds, self._beyond = np.zeros(size), np.zeros(size), np.zeros(size)
+        self._outside: dict[int, float] = {}
+        self._lost: dict[tuple[str, Any], str] = {}  # what casts have changed, by finding and dtype
+        self.observations = self.decisions = 0
+        self._unfit = ""
         self._legal: Any = None
-        self._total, self._least, self._most = 0.0, np.inf, -np.inf
+        self._rewards: list[float] = []
 
-    def observed(self, raw: Any, value: Any) -> None:
-        """Note an observation, as its mapping has returned it and as it was cast."""
+    def observed(self, raw: Any) -> None:
+        """Note an observation, as its mapping has returned it."""
+        try:
+            parts = [np.asarray(reduce(getitem, leaf.path, raw)) for leaf in self._leaves]
+        except (LookupError, TypeError, ValueError):
+            return  # it does not fit its space at all, which the environment says
+        pairs = list(zip(self._leaves, parts, strict=True))
+        if any(part.dtype.kind not in "biuf" or part.shape != (leaf.space.shape or ()) for leaf, part in pairs):
+            return
+        given, values = _flat(parts), _flat(part.astype(leaf.space.dtype) for leaf, part in pairs)
+        if (self._whole & ~(np.abs(given - values) < 1)).any():
+            return  # numbers that the dtype cannot hold, which the environment refuses
         self.observations += 1
-        for leaf, (one, other) in zip(self._leaves, _values(self._space, raw, value), strict=True):
-            leaf.add(one, other)
-        if not self.unfit and not self._space.contains(value):
-            self.unfit = shown(value, 200)
+        np.fmin(self._least, values, out=self._least)
+        np.fmax(self._most, values, out=self._most)
+        self._total += values
+        self._at_bounds += (values == self._low) | (values == self._high)
+        beyond = ~((values >= self._low) & (values <= self._high))
+        self._beyond += beyond
+        for place in np.flatnonzero(beyond)[:3].tolist():
+            self._outside.setdefault(place, float(values[place]))
+        whole = _flat(np.full(part.shape, part.dtype.kind in "iu") for part in parts).astype(np.bool_)
+        lost = (given != values) & np.isfinite(given) & (self._whole | whole | ~np.isfinite(values))
+        for place in np.flatnonzero(lost)[:3].tolist():
+            text = f"{self._names[place]} was {given[place]:.10g} and became {values[place]:.10g}".strip()
+            self._lost.setdefault(("lost_fractions" if self._whole[place] else "rounded", self._dtypes[place]), text)
 
     def stepped(self, step: Step, *, first: bool) -> None:
         """Note a step of an agent; the reward before its first action is none."""
-        _, reward, terminated, truncated, info = step.told
+        observation, reward, terminated, truncated, info = step.told
+        if not self._unfit and not self._space.contains(observation):
+            self._unfit = shown(observation, 200)
         if not first:
-            self.rewards += 1
-            self._total += reward
-            self._least, self._most = min(self._least, reward), max(self._most, reward)
+            self._rewards.append(reward)
         if terminated or truncated:
             return
         self.decisions += 1
@@ -164,214 +130,133 @@ class PointCollector:
             legal = mask.astype(bool)
             self._legal = legal if self._legal is None else self._legal | legal
 
+    def _components(self) -> list[ComponentStatistics]:
+        number = max(1, self.observations)
+        columns = (self._low, self._high, self._least, self._most)
+        shares = (self._total / number, self._at_bounds / number, self._beyond / number)
+        rows = np.stack([*columns, *shares], axis=1).tolist()
+        return [ComponentStatistics(name, *row) for name, row in zip(self._names, rows, strict=True)]
+
     def statistics(self) -> PointStatistics:
         """What was collected."""
-        definition = self.binding.definition
+        definition, rewards = self.point.definition, self._rewards
         return PointStatistics(
-            point=self.binding.point.name,
-            agents=agents_in_words(self.binding),
+            point=self.point.name,
+            agents=self.point.agents,
             observation_space=str(definition.observation_space),
             action_space=str(definition.action_space),
             observations=self.observations,
-            components=tuple(part for leaf in self._leaves for part in leaf.components()) if self.observations else (),
+            components=tuple(self._components()) if self.observations else (),
             decisions=self.decisions,
-            never_legal=() if self._legal is None else tuple(int(place) for place in np.flatnonzero(~self._legal)),
-            rewards=self.rewards,
-            reward_minimum=float(self._least) if self.rewards else 0.0,
-            reward_maximum=float(self._most) if self.rewards else 0.0,
-            reward_mean=self._total / max(1, self.rewards),
+            never_legal=() if self._legal is None else tuple(np.flatnonzero(~self._legal).tolist()),
+            rewards=len(rewards),
+            reward_minimum=min(rewards, default=0.0),
+            reward_maximum=max(rewards, default=0.0),
+            reward_mean=sum(rewards) / max(1, len(rewards)),
         )
 
     # -- what there is to say ---------------------------------------------------------------------
 
     def findings(self) -> Iterator[Finding]:
         """What is wrong or worth knowing about what was collected."""
-        name = short(self.binding.point.name)
+        for name, evidence, dtype in self._found():
+            yield finding(name, evidence, point=".".join(self.point.name.split(".")[-2:]), dtype=dtype)
+
+    def _found(self) -> Iterator[tuple[str, str, Any]]:
+        """What is found: its name, the evidence, and the dtype where it is about one."""
         if not self.decisions:
-            yield Finding(
-                "warning",
-                f"{name} was never called",
-                "No episode asked for this decision, so that its agent cannot learn anything. Does the simulation"
-                " call the function as an attribute of its class or module, and do episodes last long enough?",
-            )
+            yield "never_called", "", None
             return
-        yield from self._about_fit(name)
-        yield from self._about_casts(name)
-        if self.observations >= _ENOUGH:
-            yield from self._about_ranges(name)
-        yield from self._about_actions(name)
-        yield from self._about_rewards(name)
-
-    def _about_fit(self, name: str) -> Iterator[Finding]:
         outside = [
-            (leaf.names[place], value, leaf.low[place], leaf.high[place], leaf.beyond[place] / leaf.number)
-            for leaf in self._leaves
-            for place, value in leaf.outside.items()
+            f"{self._names[place] or 'the value'} was {value:.6g}, its bounds are {self._low[place]:.6g} to"
+            f" {self._high[place]:.6g} ({self._beyond[place] / self.observations:.0%} of the time)"
+            for place, value in self._outside.items()
         ]
-        if not outside and not self.unfit:
-            return
-        seen = "; ".join(
-            f"{part or 'the value'} was {value:.6g}, its bounds are {low:.6g} to {high:.6g} ({share:.0%} of the time)"
-            for part, value, low, high, share in outside[:5]
-        )
-        yield Finding(
-            "error",
-            f"Observations at {name} lie outside their space",
-            "Learning code relies on the bounds (to normalise, or to size its networks). Widen the observation_space,"
-            " or clip in the observation_space_mapping.",
-            seen or f"the observation {self.unfit}",
-        )
+        if outside or self._unfit:
+            yield "outside", "; ".join(outside[:5]) or f"the observation {self._unfit}", None
+        for (name, dtype), text in self._lost.items():
+            yield name, text, dtype
+        if self.observations >= _ENOUGH:
+            yield from self._about_ranges()
+        if self._legal is not None and not self._legal.all():
+            start = int(getattr(self.point.definition.action_space, "start", 0))
+            never = (np.flatnonzero(~self._legal) + start).tolist()
+            yield "never_legal", _listed([f"action {action}" for action in never]), None
+        if len(self._rewards) > 1:
+            number, least, most = len(self._rewards), min(self._rewards), max(self._rewards)
+            if least == most == 0:
+                yield "zero_rewards", f"{number} rewards", None
+            elif least == most:
+                yield "same_rewards", f"{number} rewards of {least:.6g}", None
+            elif max(abs(least), abs(most)) > _HUGE:
+                yield "large_rewards", f"{least:.4g} to {most:.4g}", None
 
-    def _about_casts(self, name: str) -> Iterator[Finding]:
-        for leaf in self._leaves:
-            dtype = leaf.space.dtype
-            if leaf.wrapped:
-                yield Finding(
-                    "error",
-                    f"Observations at {name} are turned into other numbers by their dtype {dtype}",
-                    f"{dtype} cannot hold what the mapping returns, and wraps it around. Choose a dtype that can.",
-                    leaf.wrapped,
-                )
-            if leaf.cut_off:
-                yield Finding(
-                    "warning",
-                    f"Observations at {name} lose their fractions to their dtype {dtype}",
-                    "Choose a floating dtype for the observation_space, or round in the mapping if that is meant.",
-                    leaf.cut_off,
-                )
-            if leaf.rounded:
-                yield Finding(
-                    "warning",
-                    f"Observations at {name} are too large for their dtype {dtype}",
-                    f"Different numbers become the same in {dtype}. Scale them down in the mapping, or choose a wider"
-                    " dtype.",
-                    leaf.rounded,
-                )
-
-    def _about_ranges(self, name: str) -> Iterator[Finding]:
-        parts = [part for leaf in self._leaves for part in leaf.components()]
-        constant = [part for part in parts if part.constant]
-        if constant:
-            yield Finding(
-                "note",
-                f"Parts of the observations at {name} never change",
-                "What is always the same tells an agent nothing. Leave it out, unless it differs between set-ups.",
-                _listed(f"{part.name or 'the value'} = {part.minimum:.4g}" for part in constant),
-            )
-        boxes = [part for leaf in self._leaves if isinstance(leaf.space, spaces.Box) for part in leaf.components()]
-        moving = [part for part in boxes if not part.constant and not part.beyond]
-        hardly = [
-            part
-            for part in moving
-            if np.isfinite(width := part.high - part.low) and part.maximum - part.minimum < _HARDLY * width
-        ]
-        if hardly:
-            yield Finding(
-                "note",
-                f"Observations at {name} use hardly any of their bounds",
-                "Less than a hundredth of the room between the bounds was used. Learning code that normalises by the"
-                " bounds sees almost the same number all the time. Bounds nearer to what occurs help.",
-                _listed(
-                    f"{part.name or 'the value'}: {part.minimum:.4g} to {part.maximum:.4g} of {part.low:.4g} to"
-                    f" {part.high:.4g}"
-                    for part in hardly
-                ),
-            )
-        huge = [part for part in moving if max(abs(part.minimum), abs(part.maximum)) > _HUGE]
-        if huge:
-            yield Finding(
-                "note",
-                f"Observations at {name} are large numbers",
-                "Neural networks learn best from numbers of about -1 to 1. Scale these in the mapping, or normalise"
-                " observations in the training code.",
-                _listed(f"{part.name or 'the value'}: {part.minimum:.4g} to {part.maximum:.4g}" for part in huge),
-            )
-        endless = [part for part in boxes if not (np.isfinite(part.low) and np.isfinite(part.high))]
-        if endless:
-            yield Finding(
-                "note",
-                f"Observations at {name} have infinite bounds",
-                "That is allowed, and leaves nothing to normalise by. Where you know bounds, give them.",
-                _listed(
-                    f"{part.name or 'the value'}: seen {part.minimum:.4g} to {part.maximum:.4g}" for part in endless
-                ),
-            )
-
-    def _about_actions(self, name: str) -> Iterator[Finding]:
-        never = self.statistics().never_legal
-        if never:
-            yield Finding(
-                "note",
-                f"Some actions at {name} were never legal",
-                "Either the episodes were too few to see them legal, or the action space is larger than it need be.",
-                _listed(f"action {action + _start(self.binding)}" for action in never),
-            )
-
-    def _about_rewards(self, name: str) -> Iterator[Finding]:
-        if self.rewards < 2:
-            return
-        if self._least == self._most == 0:
-            yield Finding(
-                "warning",
-                f"Rewards at {name} are always zero",
-                "Random actions were never rewarded. If the reward is rare, that makes learning hard; if it is not,"
-                " look at the reward_mapping.",
-                f"{self.rewards} rewards",
-            )
-        elif self._least == self._most:
-            yield Finding(
-                "note",
-                f"Rewards at {name} are always the same",
-                "Whatever random actions did, it was paid alike. Look at the reward_mapping, unless only the length"
-                " of the episode is to count.",
-                f"{self.rewards} rewards of {self._least:.6g}",
-            )
-        elif max(abs(self._least), abs(self._most)) > _HUGE:
-            yield Finding(
-                "note",
-                f"Rewards at {name} are large numbers",
-                "Many learning algorithms are set up for rewards of about -1 to 1. Scale them in the reward_mapping,"
-                " or normalise them in the training code.",
-                f"{self._least:.4g} to {self._most:.4g}",
-            )
+    def _about_ranges(self) -> Iterator[tuple[str, str, Any]]:
+        """What is to be said of components, by name of the finding."""
+        told: dict[str, list[str]] = {"constant": [], "narrow": [], "large": [], "unbounded": []}
+        for part, box in zip(self._components(), self._boxes, strict=True):
+            name = part.name or "the value"
+            seen, width = f"{part.minimum:.4g} to {part.maximum:.4g}", part.high - part.low
+            if part.constant:
+                told["constant"].append(f"{name} = {part.minimum:.4g}")
+            elif box and not part.beyond:
+                if np.isfinite(width) and part.maximum - part.minimum < _HARDLY * width:
+                    told["narrow"].append(f"{name}: {seen} of {part.low:.4g} to {part.high:.4g}")
+                if max(abs(part.minimum), abs(part.maximum)) > _HUGE:
+                    told["large"].append(f"{name}: {seen}")
+            if box and not (np.isfinite(part.low) and np.isfinite(part.high)):
+                told["unbounded"].append(f"{name}: seen {seen}")
+        return ((name, _listed(texts), None) for name, texts in told.items() if texts)
 
 
-def _start(binding: Binding) -> int:
-    space = binding.definition.action_space
-    return int(space.start) if isinstance(space, spaces.Discrete) else 0
+def _listed(texts: Sequence[str], most: int = 5) -> str:
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return "; ".join(texts[:most]) + more
 
 
-def _listed(texts: Iterator[str], most: int = 5) -> str:
-    listed = list(texts)
-    more = f" and {len(listed) - most} more" if len(listed) > most else ""
-    return "; ".join(listed[:most]) + more
+class Collectors:
+    """Collects what is to be known of all decision points of a plan.
 
+    Attributes:
+        plan: The plan for the environment whose episodes are played.
+        points: The collectors, in the order of the points.
+    """
 
-def short(name: str) -> str:
-    """The last two parts of a dotted name."""
-    return ".".join(name.split(".")[-2:])
+    def __init__(self, plan: Plan) -> None:
+        self.points: list[PointCollector] = []
+        self._by_agent: dict[str, PointCollector] = {}
+        self.plan = redefined(plan, self._tapped)
 
+    def _tapped(self, point: ActivePoint) -> Definition:
+        """The definition of a point, whose observations and agents are noted."""
+        of, definition = PointCollector(point), point.definition
+        self.points.append(of)
+        if point.agent is not None:
+            self._by_agent[point.agent] = of
+        observe, name_agent = definition.observation_space_mapping, definition.agent
 
-def agents_in_words(binding: Binding) -> str:
-    """Who decides at a point: its agent, or that each call names one."""
-    return binding.agent if binding.agent is not None else "agents named by each call"
+        @wraps(observe)
+        def observing(*args: Any, **kwargs: Any) -> Any:
+            value = observe(*args, **kwargs)
+            of.observed(value)
+            return value
 
+        if not callable(name_agent):
+            return replace(definition, observation_space_mapping=observing)
 
-def collectors(plan: Plan) -> Mapping[str, PointCollector]:
-    """Have the observations of a plan collected, by point. Environments of that plan must be for nothing else."""
-    made = {}
-    for binding in plan.active:
-        made[binding.point.name] = collector = PointCollector(binding)
-        _tap(binding, collector)
-    return made
+        @wraps(name_agent)
+        def naming(*args: Any, **kwargs: Any) -> Any:
+            agent = name_agent(*args, **kwargs)
+            if isinstance(agent, str):
+                self._by_agent[agent] = of
+            return agent
 
+        return replace(definition, observation_space_mapping=observing, agent=naming)
 
-def _tap(binding: Binding, collector: PointCollector) -> None:
-    cast = binding.cast
-
-    def collecting(value: Any) -> Any:
-        result = cast(value)
-        collector.observed(value, result)
-        return result
-
-    binding.cast = collecting
+    def played(self, steps: Sequence[Step]) -> None:
+        """Note the steps of an episode. Agents that were declared and never decided are left out."""
+        met: set[str] = set()
+        for step in steps:
+            if step.agent in self._by_agent:
+                self._by_agent[step.agent].stepped(step, first=step.agent not in met)
+            met.add(step.agent)

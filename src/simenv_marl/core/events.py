@@ -1,0 +1,179 @@
+"""What comes from a simulation, and what becomes of it in its episode.
+
+A call that crosses from the simulation is ``(event, args, kwargs)``. Of each kind of event there is a class, whose
+method ``arise(episode, args, kwargs)`` returns the reply to the simulation, or ``WAIT``: the episode waits for an
+action, or is over.
+
+| event | what has happened | what becomes of it |
+|---|---|---|
+| ``Decision`` | an agent decides | it is found or joins; it is settled, and the episode waits |
+| ``Answered`` | an agent decides for which a policy answers | it is observed, and the policy is asked |
+| ``Removed`` | a function of ``removed_by=`` is called | its agents are settled for the last time and leave |
+| ``Told`` | a rule has decided | its action is noted |
+| ``Finished`` | ``run`` has returned | all agents end |
+| ``Failed``, ``Refused`` | the simulation has raised; a decision was refused | the error is raised |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+from ..decision import DecisionPoint
+from ..simulation import RULE, TRUNCATED, Sentinel
+from .agent import Agent
+from .bound import BoundPoint
+
+if TYPE_CHECKING:
+    from .episode import Episode
+
+
+WAIT: Final = Sentinel("WAIT")
+"""Returned in place of a reply to the simulation: the episode waits for an action, or is over."""
+
+
+class Decision(BoundPoint):
+    """A decision of an agent: the one agent of a point, or the one that ``agent=`` names."""
+
+    __slots__ = ()
+
+    def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Settle the agent, and wait for its action; or do what is to be done in its stead."""
+        name, name_agent = self.agent, self.name_agent
+        if name_agent is not None:
+            name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
+        agent = episode.agents.get(name) if type(name) is str else None
+        if agent is None or agent.point is not self:
+            agent = episode.dispatch(self, name, args, kwargs)
+            if type(agent) is not Agent:
+                return agent  # the reply of the rule or of a policy
+        if name_agent is None:
+            agent.rest, agent.kwargs = args, kwargs  # what it is called on is no entity that a model would let go
+        else:
+            agent.keep(args, kwargs)
+        episode.latest = agent
+        decide = episode.decide
+        if decide is not None:  # in a round, or when the last step has been taken
+            return decide(episode, agent, args, kwargs)
+        settle = agent.settle_again  # fetched before it is called: calling it at its attribute is slower
+        settle(agent, args, kwargs)
+        episode.pending = agent
+        return WAIT
+
+
+class Answered(BoundPoint):
+    """A decision of a point whose agents are all answered by a policy."""
+
+    __slots__ = ()
+
+    def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Have the policy answer."""
+        name = self.agent or self.name_agent(*args, **kwargs)
+        agent = episode.answered.get(name) if type(name) is str else None
+        if agent is None or agent.point is not self:
+            return episode.dispatch(self, name, args, kwargs)
+        episode.latest = agent
+        return episode.consult(agent, args, kwargs)
+
+
+class Removed:
+    """A call of a function that ends the episode of agents.
+
+    Attributes:
+        point: The function.
+        of: The points whose agents it ends; for each a callable of the call's arguments that names the agent, or None;
+            and then the class whose instances are such agents, if it is known.
+        deliver, told: None: the call always runs the function, and nothing is told of its result.
+    """
+
+    __slots__ = ("of", "point")
+
+    deliver = told = None
+
+    def __init__(self, point: DecisionPoint) -> None:
+        self.point = point
+        self.of: list[tuple[BoundPoint, Callable[..., Any] | None, type | None]] = []
+
+    def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Give the agents their last rewards and observations while they are whole, and let the call go on."""
+        latest = episode.latest
+        for point, name in self._named(args, kwargs):
+            agent = episode.agents.get(name)
+            if agent is not None and agent.point is point:
+                episode.finish_agent(agent)
+        episode.latest = latest  # after whose decision the model goes on
+        return RULE
+
+    def _named(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[tuple[BoundPoint, Any]]:
+        named: list[tuple[BoundPoint, Any]] = []  # a generator could not pass on a StopIteration
+        for point, name, owner in self.of:
+            if name is not None:
+                named.append((point, name(*args, **kwargs)))
+            elif args and (owner is None or isinstance(args[0], owner)):
+                named.append((point, point.agent or point.name_agent(args[0])))
+        return named
+
+
+class Told:
+    """A decision that the rule of a point has taken.
+
+    Attributes:
+        point: The decision point.
+        deliver, told: None: the simulation just goes on.
+    """
+
+    __slots__ = ("point",)
+
+    deliver = told = None
+
+    def __init__(self, point: BoundPoint) -> None:
+        self.point = point
+
+    def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Note which action it corresponds to. The arguments are the decision, and those of its call."""
+        decision, call_args, call_kwargs = args
+        point = self.point
+        name = point.agent or point.name_agent(*call_args, **call_kwargs)
+        agent = (episode.agents.get(name) or episode.answered.get(name)) if type(name) is str else None
+        if agent is not None and agent.point is point:
+            episode.latest = agent
+            agent.learn_rule_action(decision, call_args, call_kwargs)
+
+
+class Finished:
+    """The simulation's ``run`` has returned."""
+
+    def arise(self, episode: Episode, box: list[Any], _: Any) -> Any:
+        """End the episode of all agents. The box holds what ``run`` has returned."""
+        episode.running = False
+        episode.finish(truncated=box.pop() is TRUNCATED)
+        return WAIT
+
+
+class Failed:
+    """The simulation's ``run`` has raised."""
+
+    def arise(self, episode: Episode, box: list[Any], _: Any) -> Any:
+        """Raise the error, which the box holds."""
+        episode.running, episode.failed_in_model = False, True
+        raise box.pop()
+
+
+class Refused:
+    """A decision was asked for where the simulation cannot wait, as in a thread that it has started.
+
+    Attributes:
+        deliver, told: None: the simulation does not go on.
+    """
+
+    deliver = told = None
+
+    def arise(self, episode: Episode, args: Any, kwargs: Any) -> Any:
+        """Raise the error that says so."""
+        episode.failed_in_model = True
+        raise episode.driver.refusal()
+
+
+FINISHED: Final = Finished()
+FAILED: Final = Failed()
+REFUSED: Final = Refused()

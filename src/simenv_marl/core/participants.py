@@ -1,0 +1,111 @@
+"""The agents that take part in an episode: those that live, those that have ended, those that policies answer for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ..errors import AgentError
+from .agent import Agent
+from .bound import BoundPoint
+from .plan import Plan
+
+
+class Participants:
+    """The agents of one episode.
+
+    Attributes:
+        agents: The live agents of the environment, by name, in the order in which they joined.
+        answered: The agents for which policies answer, by name.
+        ended: The agents of the environment whose episode has ended before the simulation's, by name.
+        just_ended: Those of them whose end no view has entered yet.
+        latest: The agent whose decision was the latest, for those who read an error's notes.
+        clock: Returns the simulation's time; None where it has none.
+    """
+
+    __slots__ = ("_plan", "_simulation", "agents", "answered", "clock", "ended", "just_ended", "latest")
+
+    def __init__(self, plan: Plan, simulation: Any, clock: Callable[[], float] | None) -> None:
+        """Have the agents take part that are known beforehand."""
+        self._plan, self._simulation, self.clock = plan, simulation, clock
+        self.agents: dict[str, Agent] = {
+            name: self._agent_of(name, point, plan.policy_of(name, point)) for name, point in plan.roster.items()
+        }
+        self.answered: dict[str, Agent] = {}
+        self.ended: dict[str, Agent] = {}
+        self.just_ended: list[Agent] = []
+        self.latest: Agent | None = None
+
+    def agent_for(self, point: BoundPoint, name: Any) -> Agent:
+        """Find the agent of a name that decides at a point, or let it join.
+
+        Raises:
+            AgentError: The name is none, or belongs to another point, or to an agent that has ended.
+        """
+        if not isinstance(name, str):
+            raise AgentError(f"agent= of {point.point.name} must name a string or None, not {name!r}")
+        agent = self.answered.get(name) or self.agents.get(name)
+        if agent is None:
+            if name in self.ended:
+                raise AgentError(
+                    f"the agent {name!r} decides at {point.point.name} after its end; let agent= give each entity"
+                    " a name of its own, and removed_by= name what really ends it"
+                )
+            policy = self._plan.policy_of(name, point)
+            agent = self._agent_of(name, point, policy)
+            (self.agents if self._plan.is_active(policy) else self.answered)[name] = agent
+        elif agent.point is not point:
+            raise AgentError(
+                f"the agent {name!r} decides at {agent.point.point.name} and at {point.point.name};"
+                " an agent has one decision point: give each point's agents names of their own"
+            )
+        return agent
+
+    def _agent_of(self, name: str, point: BoundPoint, policy: Any) -> Agent:
+        return Agent(name, point, policy, self.clock, self._plan.plugins)
+
+    def agent(self, name: str) -> Agent | None:
+        """An agent of the environment, whether it lives or has ended; None where there is no such agent."""
+        return self.agents.get(name) or self.ended.get(name)
+
+    def announced(self) -> list[tuple[Agent, tuple[Any, ...]]]:
+        """The live agents that the simulation says are going to decide, with the arguments of their calls."""
+        expected = getattr(self._simulation, "expected_calls", None)
+        announced: list[tuple[Agent, tuple[Any, ...]]] = []  # a generator could not pass on a StopIteration
+        if expected is None:
+            return announced
+        for point in self._plan.active:
+            for call in expected(point.point.name):
+                args = call if type(call) is tuple else tuple(call)
+                name = point.agent or point.name_agent(*args)
+                agent = self.agents.get(name) if type(name) is str else None
+                if agent is None or agent.point is not point:
+                    if name is None or name in self.ended or name in self.answered:
+                        continue
+                    agent = self.agent_for(point, name)
+                    if name in self.answered:
+                        continue
+                announced.append((agent, args))
+        return announced
+
+    def names(self) -> str:
+        """The names of the live agents, for messages."""
+        names = list(self.agents)
+        return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+
+    def finish_agent(self, agent: Agent) -> None:
+        """End the episode of one agent, in the midst of the simulation's."""
+        self.conclude(agent)
+        agent.ended = True
+        self.ended[agent.name] = self.agents.pop(agent.name)
+        self.just_ended.append(agent)
+
+    def conclude(self, agent: Agent) -> None:
+        """Give an agent its last reward and its last observation."""
+        self.latest = agent
+        args = agent.arguments()
+        if args is None:  # it never decided, or the model has let it go
+            agent.unsee()
+        else:
+            agent.settle(agent, args, agent.kwargs, last=True)
+        agent.release()

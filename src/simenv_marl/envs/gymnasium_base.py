@@ -1,0 +1,115 @@
+"""What the views with one agent have in common: they are Gymnasium environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from ..core.episode import Episode, When
+from ..core.session import checked_seed, seed_space
+from ..errors import ViewError
+from .base import View
+
+
+class OneAgentView(View, gym.Env[Any, Any]):
+    """A view with one agent, and so a Gymnasium environment."""
+
+    _agent: str
+    _own_spaces: tuple[spaces.Space[Any], spaces.Space[Any]] | None = None
+
+    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        """Make spaces for this environment alone: of observations and of actions."""
+        raise NotImplementedError
+
+    @property
+    def _spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        if self._own_spaces is None:  # made when they are asked for: many simulations side by side share what they can
+            self._own_spaces = self._make_spaces()
+            seed = self._session.np_random_seed
+            if seed is not None and seed >= 0:
+                self._seed_spaces(seed)
+        return self._own_spaces
+
+    @property
+    def observation_space(self) -> spaces.Space[Any]:
+        """The observation space, of this environment alone."""
+        return self._spaces[0]
+
+    @observation_space.setter
+    def observation_space(self, space: spaces.Space[Any]) -> None:
+        self._own_spaces = space, self._spaces[1]
+
+    @property
+    def action_space(self) -> spaces.Space[Any]:
+        """The action space, of this environment alone."""
+        return self._spaces[1]
+
+    @action_space.setter
+    def action_space(self, space: spaces.Space[Any]) -> None:
+        self._own_spaces = self._spaces[0], space
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator that the last given seed has seeded, and from which other seeds are drawn."""
+        return self._session.np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self._session.np_random = generator
+
+    _np_random = np_random  # where Gymnasium's checks look
+
+    @property
+    def np_random_seed(self) -> int:
+        """What the generator was seeded with; -1 where it was set."""
+        seed = self._session.np_random_seed
+        if seed is None:
+            _ = self._session.np_random  # which a seed is drawn for
+            seed = self._session.np_random_seed
+        assert seed is not None
+        return seed
+
+    _np_random_seed = np_random_seed
+
+    def _seed_spaces(self, seed: int) -> None:
+        for space in self._spaces:
+            seed_space(space, seed, self._agent)
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        return [self.observation_space]
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Which actions are legal now, in the shape in which sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns:
+            Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the masks of its parts, one behind the other.
+            True throughout where the decision point does not restrict its actions.
+
+        Raises:
+            ViewError: The action space is neither, and so there are no masks of it.
+            ResetNeededError: There is no episode.
+        """
+        if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+            raise ViewError(
+                f"there are masks of Discrete and MultiDiscrete action spaces, and not of {self.action_space}; joint"
+                " environments of discrete actions have a MultiDiscrete with flatten=True"
+            )
+        masks = self._legal(self._running())
+        parts = [part for mask in masks for part in (mask if isinstance(mask, tuple) else (mask,))]
+        return np.concatenate(parts).astype(np.bool_)
+
+    def _legal(self, episode: Episode) -> list[Any]:
+        """The masks of all that is decided in a step."""
+        raise NotImplementedError
+
+    def _begin(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
+        """End the episode that runs, begin another, and seed the generator and the spaces."""
+        seed = checked_seed(seed)
+        self._make_way()
+        if seed is not None and self._own_spaces is not None:
+            self._seed_spaces(seed)
+        return self._session.start(seed, options, when)

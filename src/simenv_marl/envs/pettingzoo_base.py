@@ -1,0 +1,137 @@
+"""What the views with several agents have in common: they are PettingZoo environments."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+from gymnasium import spaces
+
+from ..core.bound import BoundPoint
+from ..core.episode import Episode, When
+from ..core.plan import Plan
+from ..core.session import checked_seed, seed_space
+from ..core.spaces import duplicate
+from ..errors import OptionValueError, UnknownAgentError, ViewError
+from .base import View
+
+
+class AgentsView(View):
+    """A view in which agents are told apart. ``possible_agents`` exists only where all are known beforehand.
+
+    Attributes:
+        agents: The agents that are there now.
+    """
+
+    agents: list[str]
+
+    def __init__(self, plan: Plan) -> None:
+        """Make the view of a plan.
+
+        Raises:
+            SimEnvError: Something in the plan cannot work.
+        """
+        if plan.options.padded and not plan.complete:
+            raise OptionValueError("padded=True needs a roster: say in possible_agents= who there may be")
+        super().__init__(plan)
+        if plan.possible_agents is not None:
+            self.possible_agents = plan.possible_agents
+        self._padded = plan.options.padded
+        self._observation_spaces: dict[str, spaces.Space[Any]] = {}
+        self._action_spaces: dict[str, spaces.Space[Any]] = {}
+
+    def _start(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
+        """End the episode that runs, begin another, and seed the agents' spaces."""
+        seed = checked_seed(seed)
+        self._make_way()
+        episode = self._session.start(seed, options, when)
+        if not self._plan.complete:  # names that may never come again
+            self._observation_spaces, self._action_spaces = {}, {}
+        elif seed is not None:
+            for agent in self._action_spaces:
+                self._seed_spaces(agent, seed)
+        return episode
+
+    @staticmethod
+    def check(plan: Plan) -> None:
+        """Make sure that a plan allows this view.
+
+        Raises:
+            ViewError: It does not.
+        """
+        View.check(plan)
+        if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
+            raise ViewError(
+                'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='
+            )
+
+    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+        return [self.observation_space(agent) for agent in self.possible_agents]
+
+    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+        return tuple(self._observation(episode, agent) for agent in self.possible_agents)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The observation space of an agent: of this environment alone, and always the same object.
+
+        Raises:
+            UnknownAgentError: There is no such agent.
+        """
+        space = self._observation_spaces.get(agent)
+        return space if space is not None else self._make_spaces(agent)[0]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The action space of an agent: of this environment alone, and always the same object.
+
+        Raises:
+            UnknownAgentError: There is no such agent.
+        """
+        space = self._action_spaces.get(agent)
+        return space if space is not None else self._make_spaces(agent)[1]
+
+    @property
+    def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """By possible agent, its observation space: for learners that ask for all at once.
+
+        Raises:
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+        """
+        return {agent: self.observation_space(agent) for agent in self.possible_agents}
+
+    @property
+    def action_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """By possible agent, its action space: for learners that ask for all at once.
+
+        Raises:
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+        """
+        return {agent: self.action_space(agent) for agent in self.possible_agents}
+
+    def _point(self, agent: str) -> BoundPoint:
+        point = self._plan.roster.get(agent)
+        if point is None:
+            episode = self._session.episode
+            found = None if episode is None else episode.agent(agent)
+            if found is None:
+                raise UnknownAgentError(f"there is no agent {agent!r}; the agents now are {self.agents[:10]}")
+            point = found.point
+        return point
+
+    def _make_spaces(self, agent: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        definition = self._point(agent).definition
+        made = copy.deepcopy((definition.observation_space, definition.action_space))
+        self._observation_spaces[agent], self._action_spaces[agent] = made
+        if self._session.seed is not None:
+            self._seed_spaces(agent, self._session.seed)
+        return made
+
+    def _seed_spaces(self, agent: str, seed: int) -> None:
+        seed_space(self._observation_spaces[agent], seed, agent)
+        seed_space(self._action_spaces[agent], seed, agent)
+
+    def _observation(self, episode: Episode, agent: str) -> Any:
+        """The latest observation of an agent, as a copy of the caller's own."""
+        found = episode.agent(agent)
+        if found is None or found.observation is None or (self._padded and found.ended):
+            return self._point(agent).blank()
+        return duplicate(found.observation)

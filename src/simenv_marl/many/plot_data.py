@@ -1,0 +1,291 @@
+"""What plots draw: an episode as a row for each agent, in panels of those whose actions are alike; and returns."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OptionValueError, UnknownAgentError
+from .trajectories import Trajectories
+
+CHARTED: Final = 6
+"""So many agents at most have a chart each; more of them have a row each, of colours."""
+
+NAMED: Final = 12
+"""So many different actions at most are told apart one by one; more of them are a scale."""
+
+ENDS: Final = {"x": "terminated", "|": "truncated"}
+"""The marks of how agents end."""
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One array of the actions of a policy.
+
+    Attributes:
+        name: How it is indexed; empty where it is all there is.
+        width: How many components it has.
+        names: What its numbers are called, where they are told apart one by one.
+        limits: The smallest and the largest of them, in all episodes.
+    """
+
+    name: str
+    width: int
+    names: Mapping[int, str] | None
+    limits: tuple[float, float]
+
+    def component(self, place: int) -> str:
+        """What one of its components is called."""
+        return f"{self.name}[{place}]" if self.width > 1 else self.name
+
+
+@dataclass(frozen=True)
+class Row:
+    """One agent in the episode: the key of its policy, its name, its decisions (``rows`` of ``found``), when they were.
+
+    Attributes:
+        actions: Of each leaf, ``(decisions, width)``.
+        at, end: When it decided, and when its trajectory ended.
+    """
+
+    key: Any
+    name: str
+    found: Trajectories
+    rows: slice
+    actions: Sequence[NDArray[Any]]
+    at: NDArray[Any]
+    end: float
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Of which of its decisions it is known what they were."""
+        return self.found.known[self.rows]
+
+    @property
+    def ruled(self) -> NDArray[np.bool_]:
+        """Which of its decisions were left to the rule."""
+        return self.found.by_rule[self.rows]
+
+    @property
+    def ends(self) -> list[str]:
+        """The marks of how it ended."""
+        last = self.rows.stop - 1
+        return [
+            mark for mark, how in zip(ENDS, (self.found.terminations, self.found.truncations), strict=True) if how[last]
+        ]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Agents whose actions are alike: those of one policy, or of many."""
+
+    title: str
+    rows: list[Row]
+    leaves: list[Leaf]
+
+
+def by_policy(trajectories: Any) -> dict[Any, Trajectories]:
+    """What was given to be drawn, by the keys of the policies."""
+    if isinstance(trajectories, Trajectories):
+        return {None: trajectories}
+    if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):
+        raise OptionValueError(
+            f"what is to be drawn is what collect_episodes has returned, a dict of Trajectories, not {trajectories!r}"
+        )
+    if not trajectories:
+        raise OptionValueError("there is nothing to draw: no policy has answered any decision")
+    return dict(trajectories)
+
+
+def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
+    """The number of an episode, which may be counted from the end.
+
+    Raises:
+        OptionValueError: There is no such episode.
+    """
+    number = min(len(found.seeds) for found in parts.values())
+    try:
+        place = operator.index(episode)
+    except TypeError:
+        raise OptionValueError(f"episode must be the number of an episode, not {episode!r}") from None
+    if not -number <= place < number:
+        raise OptionValueError(f"there is no episode {place}, but {number} from 0 on")
+    return place % number
+
+
+def panels_of(parts: Mapping[Any, Trajectories], episode: int, agents: Any, action_names: Any) -> list[Panel]:
+    """A panel for each policy; one for all of them where they are many and their actions alike.
+
+    Raises:
+        OptionValueError: No agent has decided in the episode, or an argument cannot have its value.
+        UnknownAgentError: One of the agents has not decided in the episode.
+    """
+    leaves: dict[Any, list[Leaf]] = {}
+    rows: list[Row] = []
+    timed = all(found.times is not None for found in parts.values() if (found.episodes == episode).any())
+    for key, found in parts.items():
+        if (found.episodes == episode).any():
+            pairs = _taken_apart(found.actions, found.known, _namer(key, action_names))
+            leaves[key] = [leaf for leaf, _ in pairs]
+            rows += _rows(key, found, [array for _, array in pairs], episode, timed)
+    if not leaves:
+        seed = next(iter(parts.values())).seeds[episode]
+        raise OptionValueError(
+            f"there is nothing to draw of episode {episode} (seed {seed}): no agent has decided in it"
+        )
+    # Where the model has let go of an agent before its last reward was known, its end is not: one usual step later.
+    gaps = np.concatenate([np.diff(row.at) for row in rows])
+    gap = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+    rows = [row if row.end == row.end else replace(row, end=float(row.at[-1]) + gap) for row in rows]
+    if agents is not None:
+        rows = _chosen(rows, agents, episode)
+    keys = list(dict.fromkeys(row.key for row in rows))
+    alike = len({tuple((leaf.name, leaf.width, leaf.names is None) for leaf in leaves[key]) for key in keys}) == 1
+    if len(keys) <= CHARTED or not alike:
+        return [Panel(title_of(key), [row for row in rows if row.key == key], leaves[key]) for key in keys]
+    shared = [_shared(same) for same in zip(*(leaves[key] for key in keys), strict=True)]
+    return [Panel("", sorted(rows, key=lambda row: int(row.found.turns[row.rows.start])), shared)]
+
+
+def _rows(key: Any, found: Trajectories, arrays: Sequence[NDArray[Any]], episode: int, timed: bool) -> Iterator[Row]:
+    for place in np.flatnonzero(found.episodes[found.starts] == episode):
+        start = int(found.starts[place])
+        own = slice(start, start + int(found.lengths[place]))
+        at: NDArray[Any] = found.turns[own]
+        end = float(found.last_turns[place])
+        if timed and found.times is not None and found.elapsed is not None:
+            at, end = found.times[own], float(found.times[own.stop - 1] + found.elapsed[own.stop - 1])
+        yield Row(key, found.names[found.agents[start]], found, own, [array[own] for array in arrays], at, end)
+
+
+def _chosen(rows: Sequence[Row], agents: Any, episode: int) -> list[Row]:
+    if isinstance(agents, str) or not agents:
+        raise OptionValueError(f"agents must be a sequence of names, not {agents!r}")
+    by_name = {row.name: row for row in rows}
+    for name in agents:
+        if name not in by_name:
+            raise UnknownAgentError(
+                f"{name!r} has not decided in episode {episode}; those who have are {', '.join(list(by_name)[:20])}"
+                f"{' and others' if len(by_name) > 20 else ''}"
+            )
+    return [by_name[name] for name in dict.fromkeys(agents)]
+
+
+def _namer(key: Any, action_names: Any) -> Callable[[int], str]:
+    if isinstance(action_names, Mapping) and not isinstance(action_names.get(key, ""), str):
+        action_names = action_names[key]
+    if action_names is None:
+        return str
+    if isinstance(action_names, (str, bytes)) or not isinstance(action_names, (Mapping, Sequence)):
+        raise OptionValueError(f"action_names must be a sequence or a dict of names, not {action_names!r}")
+    names = action_names if isinstance(action_names, Mapping) else dict(enumerate(action_names))
+    return lambda action: str(names.get(action, action))
+
+
+def _taken_apart(
+    actions: Any, known: NDArray[np.bool_], name: Callable[[int], str], prefix: str = ""
+) -> list[tuple[Leaf, NDArray[Any]]]:
+    """The leaves of actions, of which some are not known, each with its array."""
+    if isinstance(actions, Mapping):
+        parts = [(f"{prefix}[{key!r}]" if prefix else str(key), part) for key, part in actions.items()]
+        return [found for index, part in parts for found in _taken_apart(part, known, name, index)]
+    if isinstance(actions, tuple):
+        places = enumerate(actions)
+        return [found for place, part in places for found in _taken_apart(part, known, name, f"{prefix}[{place}]")]
+    values = actions.reshape(len(actions), -1)
+    if actions.dtype == object:  # what has no shape is told apart by its text
+        texts, codes = np.unique([str(action) for action in actions], return_inverse=True)
+        values = codes.reshape(-1, 1)
+        name = [text if len(text) < 20 else f"{text[:18]}…" for text in texts.tolist()].__getitem__
+    different = np.unique(values[known]).tolist() if values.dtype.kind in "iub" else []
+    names = {int(value): name(int(value)) for value in different} if 0 < len(different) <= NAMED else None
+    finite = values[known][np.isfinite(values[known])]
+    limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    return [(Leaf(prefix, values.shape[1], names, limits), values)]
+
+
+def _shared(leaves: Sequence[Leaf]) -> Leaf:
+    """The same leaf of several policies."""
+    named = [item for leaf in leaves for item in (leaf.names or {}).items()]
+    names = None if leaves[0].names is None else dict(sorted(named))
+    limits = min(leaf.limits[0] for leaf in leaves), max(leaf.limits[1] for leaf in leaves)
+    return replace(leaves[0], names=names, limits=limits)
+
+
+def title_of(key: Any) -> str:
+    """What a policy's key is called: of a dotted name, its last two parts."""
+    return "" if key is None else ".".join(str(getattr(key, "__qualname__", key)).split(".")[-2:])
+
+
+# -- rows of colours ------------------------------------------------------------------------------
+
+
+def coloured_by(panels: Sequence[Panel], component: str | None) -> list[tuple[Leaf, int]]:
+    """The leaf of each panel, and its component, by which rows are coloured.
+
+    Raises:
+        OptionValueError: There is no such component.
+    """
+    known = [
+        {leaf.component(place): (leaf, place) for leaf in panel.leaves for place in range(leaf.width)}
+        for panel in panels
+    ]
+    if component is not None and not any(component in own for own in known):
+        names = ", ".join(repr(name) for name in dict.fromkeys(name for own in known for name in own))
+        raise OptionValueError(f"no action has a component {component!r}; there are {names}")
+    return [own.get(component or "", next(iter(own.values()))) for own in known]
+
+
+def cells_of(rows: Sequence[Row], *, slim: bool) -> NDArray[np.float64]:
+    """``(decisions, 4, 2)``: the corners of what is to be coloured of each decision, row by row."""
+    cells = []
+    for number, row in enumerate(rows):
+        # Decisions of the same time share what goes by until the next one.
+        times, which, same = np.unique(row.at.astype(float), return_inverse=True, return_counts=True)
+        each = (np.diff(times, append=max(row.end, times[-1])) / same)[which]
+        begin = times[which] + each * (np.arange(len(row.at)) - np.searchsorted(row.at, row.at))
+        half = np.full(len(begin), 0.5 if len(rows) > 60 else 0.42)
+        if slim:
+            half[row.ruled] *= 0.45
+        x = np.stack([begin, begin + each, begin + each, begin], axis=1)
+        cells.append(np.stack([x, number + np.stack([-half, -half, half, half], axis=1)], axis=2))
+    return np.concatenate(cells)
+
+
+# -- many episodes --------------------------------------------------------------------------------
+
+
+def _collections(collected: Any) -> dict[str, dict[Any, Trajectories]]:
+    """What was given to be drawn, by what it is called."""
+    if isinstance(collected, Mapping) and any(isinstance(value, Mapping) for value in collected.values()):
+        return {str(label): by_policy(value) for label, value in collected.items()}
+    return {"": by_policy(collected)}
+
+
+def groups_of(collected: Any, per: str) -> dict[str, dict[str, NDArray[Any]]]:
+    """Returns of episodes, by what they are the returns of, and by the collection."""
+    groups: dict[str, dict[str, NDArray[Any]]] = {}
+    for label, parts in _collections(collected).items():
+        of_policies = [(title_of(key), found.episodes[found.starts], found) for key, found in parts.items()]
+        named = [(title, episodes, found.returns) for title, episodes, found in of_policies]
+        if per == "team":
+            _, episodes, returns = zip(*named, strict=True)
+            named = [("", np.concatenate(episodes), np.concatenate(returns))]
+        if per == "agent":
+            masks = [
+                (name, episodes, found, found.agents[found.starts] == agent)
+                for _, episodes, found in of_policies
+                for agent, name in enumerate(found.names)
+            ]
+            named = [(name, episodes[own], found.returns[own]) for name, episodes, found, own in masks]
+        for title, places, values in named:
+            numbers = np.bincount(places)
+            if len(values):
+                sums = np.bincount(places, values) / (numbers.clip(1) if per == "policy" else 1)
+                groups.setdefault(title, {})[label] = sums[numbers > 0]
+    return groups

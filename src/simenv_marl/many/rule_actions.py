@@ -1,0 +1,41 @@
+"""Whether it is known which actions the decisions of the model's rule are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import DefinitionError
+from .collect import learners_plan
+from .mixture import defers
+from .trajectories import Trajectories, answers
+
+
+def check_knowable(
+    simulation: Any, policies: Mapping[Any, Any], keys: Iterable[Any], points: Any, options: Mapping[str, Any]
+) -> None:
+    """Before anything runs: where the rule is going to decide, it must be known which actions its decisions are."""
+    plan, places = learners_plan(simulation, policies, points, options)
+    for key in keys:
+        if not defers(policies[key]):
+            continue
+        for point in plan.points:
+            if not point.recorded and answers(plan, point, places[key]):
+                raise DefinitionError(
+                    f"which action the rule of {point.point.name} takes is not known; give its make_step a"
+                    " rule_action_mapping, from the rule's decision to the action that it corresponds to"
+                )
+
+
+def check_known(found: Trajectories) -> None:
+    """Afterwards the same, for each decision that was left to the rule."""
+    unknown = np.flatnonzero(~found.known)
+    if len(unknown):
+        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
+        raise DefinitionError(
+            f"in {len(unknown)} of {len(found)} decisions it is not known which action the rule has taken, first in"
+            f" that of {agent!r} at turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point"
+            " needs a rule_action_mapping that returns an action for every decision of the rule"
+        )

@@ -1,0 +1,165 @@
+"""All that the kit uses of the library's inside. Its other modules use public names, and what stands here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from greenlet import getcurrent
+
+from ..core.contexts import at_work
+from ..core.plan import Plan
+from ..core.rng import GlobalRandom
+from ..core.spaces import MASK
+from ..core.switch import SimulationExit
+from ..decision import DecisionPoint, Definition
+from ..envs import VIEWS, view_class
+from ..hooks.stacks import outside_simulation, stack_of
+from ..simulation import make_simulation, resetter
+
+__all__ = [
+    "MASK", "VIEWS", "ActivePoint", "Plan", "SimulationExit", "active_points", "make_environment", "make_simulation",
+    "outside_simulation", "plain_loop", "redefined", "watching_rules",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ActivePoint:
+    """A decision point that an environment decides: its dotted name, its definition, and its agent (None: many)."""
+
+    name: str
+    definition: Definition
+    agent: str | None
+
+    @property
+    def agents(self) -> str:
+        """Who decides there, in words."""
+        return self.agent if self.agent is not None else "agents named by each call"
+
+
+def active_points(plan: Plan) -> list[ActivePoint]:
+    """The decision points that environments of a plan decide."""
+    return [ActivePoint(binding.point.name, binding.definition, binding.agent) for binding in plan.active]
+
+
+def redefined(plan: Plan, change: Callable[[ActivePoint], Definition]) -> Plan:
+    """The same plan with other definitions of its active points."""
+    for binding, point in zip(plan.active, active_points(plan), strict=True):
+        plan = plan.redefined(binding.point, change(point))
+    return plan
+
+
+def make_environment(plan: Plan, view: str) -> Any:
+    """An environment of a plan.
+
+    Raises:
+        ViewError: The plan does not allow the view.
+    """
+    if view != "joint" and plan.options.flatten:
+        plan = plan.amended({"flatten": False})
+    return view_class(plan, view)(plan)
+
+
+Reset = Callable[[Any, int], None]
+Main = Callable[[Any], Any]
+
+
+_PLAIN_RUNS: list[Any] = []
+"""The simulations whose main loops run plainly now."""
+
+
+@contextmanager
+def plain_loop(plan: Plan, *, watched: bool) -> Iterator[tuple[Reset, Main]]:
+    """Set in the model what environments of a plan set there: handlers, and generators of its own.
+
+    Args:
+        plan: The plan.
+        watched: Whether calls of decision functions go to the rules that ``watching_rules`` has set.
+
+    Yields:
+        A function that resets a simulation with a seed, and one that runs its main loop.
+    """
+    rng = GlobalRandom() if plan.options.global_rng else None
+    held: list[Any] = []
+
+    def reset(simulation: Any, seed: int) -> None:
+        if rng is not None:
+            rng.begin(seed)
+        resetter(simulation)(seed, None)
+
+    def main(simulation: Any) -> Any:
+        if not watched:
+            return simulation.run()
+        _PLAIN_RUNS.append(simulation)
+        try:
+            return simulation.run()
+        finally:
+            _PLAIN_RUNS.pop()
+
+    try:
+        for patch in plan.patches if watched else ():
+            patch.hold()
+            held.append(patch)
+        with at_work(plan.plugins, rng):
+            yield reset, main
+    finally:
+        for patch in reversed(held):
+            patch.let_go()
+
+
+@contextmanager
+def watching_rules(plan: Plan, begin: Callable[[str], Callable[[Any], None]]) -> Iterator[None]:
+    """Have the rules of a plan's decision points watched, behind environments and in plain loops.
+
+    Args:
+        plan: The plan.
+        begin: Called with the name of the point as its rule begins to decide. What it returns is called with the
+            decision, unless the rule raises.
+    """
+    points = list(dict.fromkeys(point.point for point in plan.points))
+    for point in points:
+        point.hook.replace_rule(_watched(point, begin))
+    try:
+        yield
+    finally:
+        for point in points:
+            point.hook.replace_rule()
+
+
+def _decides(point: DecisionPoint) -> bool:
+    """Whether a main loop runs here, and not a reset or a mapping, in which decision functions only run their rule."""
+    stack = stack_of(getcurrent())
+    return bool(_PLAIN_RUNS) if stack is None else stack.decides(point.hook)
+
+
+def _watched(point: DecisionPoint, begin: Callable[[str], Callable[[Any], None]]) -> Any:
+    """The rule of a point, which stays a function, a generator function or a coroutine function."""
+    rule: Any = point.rule
+
+    def function(*args: Any, **kwargs: Any) -> Any:
+        if not _decides(point):
+            return rule(*args, **kwargs)
+        end = begin(point.name)
+        value = rule(*args, **kwargs)
+        end(value)
+        return value
+
+    def generator(*args: Any, **kwargs: Any) -> Any:
+        if not _decides(point):
+            return (yield from rule(*args, **kwargs))
+        end = begin(point.name)
+        value = yield from rule(*args, **kwargs)
+        end(value)
+        return value
+
+    async def coroutine(*args: Any, **kwargs: Any) -> Any:
+        if not _decides(point):
+            return await rule(*args, **kwargs)
+        end = begin(point.name)
+        value = await rule(*args, **kwargs)
+        end(value)
+        return value
+
+    return {"function": function, "generator": generator, "coroutine": coroutine}[point.kind]

@@ -1,0 +1,121 @@
+"""What there is to be decided in a simulation."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+from ..simulation import TRUNCATED
+from .inside import VIEWS, ActivePoint, Plan, active_points, make_environment
+from .report import Inspection, PointDescription, order_of
+from .runs import Run, TimeUp, error_in_words, plain_run, play_rules, quietly, seed_global_generators, within
+
+
+def inspect_simulation(
+    simulation: Any,
+    points: Any = None,
+    *,
+    seed: int = 0,
+    max_steps: int = 10_000,
+    time_limit: float = 30.0,
+    **options: Any,
+) -> Inspection:
+    """Tell what there is to be decided in a simulation, and in what order, by running one episode of its own rules.
+
+    Args:
+        simulation: A simulation (which is copied), its class, or a zero-argument factory.
+        points: The decision points, as ``generate_env`` takes them.
+        seed: Of the episode.
+        max_steps: After how many decisions the episode is cut.
+        time_limit: After how many seconds it is.
+        **options: Options of the environments, as ``aec_env`` takes them.
+
+    Returns:
+        What was seen; ``print`` it.
+
+    Raises:
+        SimEnvError: The simulation, the points or the options cannot be used at all; the leaf says why.
+        Exception: Whatever the model raises when it is made.
+    """
+    with quietly():
+        plan = Plan.draw_up(simulation, points, options)
+        seed_global_generators(seed)
+        run = plain_run(plan, seed, max_steps, time.monotonic() + time_limit, lambda simulation: None)
+        agents: dict[str, None] = dict.fromkeys(plan.roster)
+        if run.decisions and not plan.complete and run.error is None:
+            agents |= _agents_of(plan, seed, max_steps, time.monotonic() + time_limit)
+        views = tuple(_fitting_views(plan))
+    return Inspection(
+        simulation=plan.name,
+        points=tuple(_described(point) for point in active_points(plan)),
+        views=views,
+        calls=order_of(run.calls),
+        counts=dict(Counter(run.calls)),
+        ended=_ending(run),
+        agents=tuple(agents),
+    )
+
+
+def _agents_of(plan: Plan, seed: int, max_steps: int, deadline: float) -> dict[str, None]:
+    """The agents of an episode with ``RULE`` throughout, in the order in which they joined."""
+    named: dict[str, None] = {}
+    env = make_environment(plan.amended({"max_steps": max_steps}), "aec")
+
+    def play() -> None:
+        env.reset(seed=seed)
+        play_rules(env, named)
+
+    seed_global_generators(seed)
+    with suppress(Exception, SystemExit):  # those who were seen until then are told
+        within(deadline, play)
+    env.close()
+    return named
+
+
+def _described(point: ActivePoint) -> PointDescription:
+    """What is to be known of a decision point."""
+    definition = point.definition
+    details = []
+    if definition.action_mask_mapping is not None:
+        details.append("a mask says which actions are legal")
+    if definition.choices is not None:
+        details.append("the legal answers come with each call")
+    if definition.apply is not None:
+        details.append("actions are carried out in place of the rule")
+    if definition.removed_by:
+        details.append(f"agents end by {', '.join(definition.removed_by)}")
+    if definition.goal_space is not None:
+        details.append(f"has goals in {definition.goal_space}")
+    return PointDescription(
+        name=point.name,
+        agents=point.agents,
+        observation_space=str(definition.observation_space),
+        action_space=str(definition.action_space),
+        details=tuple(details),
+    )
+
+
+def _ending(run: Run) -> str:
+    """How a plain run ended, in words."""
+    number = f"{len(run.decisions)} decisions"
+    if run.cut:
+        return f"cut after {number}"
+    if isinstance(run.error, TimeUp):
+        return f"stopped by the time limit after {number}"
+    if run.error is not None:
+        return f"{number}, then {error_in_words(run.error)}"
+    how = "truncated (a limit of time)" if run.result is TRUNCATED else "terminated (an end of the task)"
+    return f"{number}, then {how}"
+
+
+def _fitting_views(plan: Plan) -> Iterator[str]:
+    """The views that a plan allows."""
+    for view in VIEWS:
+        try:
+            make_environment(plan, view).close()
+        except Exception:  # of the plan, or of the model where the view resets it
+            continue
+        yield view

@@ -1,6 +1,8 @@
 """Settings of the tests, and the drivers with which they run."""
 
 import gc
+import os
+import random
 import signal
 
 import pytest
@@ -18,28 +20,28 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 DRIVERS = ("greenlet", "thread")
 
-CONTRACT = (
-    "collected", "conformance", "ends", "environments", "episodes", "errors", "faults", "goals_and_time", "identity",
-    "joint", "many_agents", "mesa", "properties", "rounds", "side_by_side", "simulate", "simulate_many", "simulations",
-    "unwinding",
-)  # fmt: skip
-"""Modules of tests that say what happens when, whatever the driver. All others have nothing to do with one."""
-
 
 def pytest_addoption(parser) -> None:
     parser.addoption("--driver", choices=(*DRIVERS, "both"), default="both", help="drivers to test the contract with")
+    parser.addoption("--order", metavar="SEED", help="shuffle the files by this seed, or by a new one: random")
 
 
 def pytest_configure(config) -> None:
     config.addinivalue_line("markers", "greenlet(reason): what is tested is different with other drivers")
+    if config.option.order == "random":
+        # The processes of pytest-xdist are to have the same one.
+        config.option.order = os.environ.setdefault("TEST_ORDER", str(random.SystemRandom().randrange(10**6)))
 
 
-def pytest_generate_tests(metafunc) -> None:
-    chosen = metafunc.config.getoption("--driver")
-    if metafunc.module.__name__.rpartition("test_")[2] in CONTRACT:
-        alone = metafunc.definition.get_closest_marker("greenlet") is not None
-        drivers = ["greenlet"] if alone else DRIVERS if chosen == "both" else [chosen]
-        metafunc.parametrize("_driver", drivers, indirect=True)
+def pytest_report_header(config) -> str | None:
+    return f"files in the order of --order {config.option.order}" if config.option.order else None
+
+
+def pytest_collection_modifyitems(config, items) -> None:
+    if config.option.order:
+        files = list(dict.fromkeys(item.path for item in items))
+        random.Random(config.option.order).shuffle(files)
+        items.sort(key=lambda item: files.index(item.path))
 
 
 @pytest.fixture(autouse=True)
@@ -50,5 +52,13 @@ def _driver(request, monkeypatch):
 
 def pytest_collection_finish() -> None:
     """Spare the many calls of the collector what is imported anyway."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _freeze():
+    """Spare the collector's calls what the files before have left: it is the same from now on."""
+    yield
     gc.collect()
     gc.freeze()

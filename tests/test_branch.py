@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 from simenv_marl import (
     RULE,
     BranchError,
+    ClosedError,
     EpisodeOverError,
     NotResetError,
     OptionValueError,
@@ -32,10 +34,9 @@ from simenv_marl import (
     single_env,
 )
 from simenv_marl.core import episode
-
-from .copied import Walk
-from .many_worlds import Being, beings
-from .models import decision, define, script
+from tests.worlds.copied import Walk
+from tests.worlds.many_worlds import Being, beings
+from tests.worlds.models import decision, define, script
 
 ROOT = Path(__file__).parent.parent
 METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
@@ -337,7 +338,7 @@ def test_simulations_that_are_random_for_themselves():
 
 
 def test_too_many_decisions_to_be_kept(monkeypatch):
-    monkeypatch.setattr(episode, "MOST_TAKEN", 3)
+    monkeypatch.setattr(episode, "LONGEST_TAPE", 3)
     env = single_env(lambda: Walk(9), Walk.choose)
     for _ in range(2):
         env.reset(seed=3)
@@ -354,7 +355,7 @@ def test_too_many_decisions_to_be_kept(monkeypatch):
 
 
 def test_too_many_rounds_to_be_kept(monkeypatch):
-    monkeypatch.setattr("simenv_marl.core.rounds.MOST_TAKEN", 2)
+    monkeypatch.setattr("simenv_marl.core.episode.LONGEST_TAPE", 1)
     env = parallel_env(lambda: Walk(9), Walk.choose)
     env.reset(seed=3)
     env.step({"walker_0": 1})
@@ -367,16 +368,16 @@ def test_too_many_rounds_to_be_kept(monkeypatch):
 
 def test_what_cannot_be_continued():
     env = single_env(lambda: Walk(1), Walk.choose)
-    with pytest.raises(NotResetError):
+    with pytest.raises(NotResetError, match="no episode yet"):
         branch(env, short)
     env.reset()
     for changes in ({"n": -1}, {"n": 2.0}, {"method": "clone"}):
         with pytest.raises(OptionValueError):
             branch(env, short, **changes)
     env.step(1)
-    with pytest.raises(EpisodeOverError):
+    with pytest.raises(EpisodeOverError, match="begin the next one"):
         branch(env, short)
-    with pytest.raises(ViewError):
+    with pytest.raises(ViewError, match="branch continues environments"):
         branch("env", short)
     env = single_env(lambda: Walk(1), Walk.choose, driver="thread")
     env.reset()
@@ -397,7 +398,7 @@ def test_not_from_inside_its_own_mappings():
     env = aec_env(script(lambda simulation: [ant(), ant()]), ant)
     env.reset()
     envs.append(env)
-    with pytest.raises(ReentrancyError):
+    with pytest.raises(ReentrancyError, match="was used from"):
         env.step(1)
     envs.clear()
 
@@ -406,7 +407,7 @@ def test_what_a_branch_prints_is_printed_once():
     code = """
     import sys
     from simenv_marl import branch, single_env
-    from tests.copied import Walk
+    from tests.worlds.copied import Walk
     env = single_env(Walk, Walk.choose)
     env.reset(seed=1)
     print("before")
@@ -417,3 +418,93 @@ def test_what_a_branch_prints_is_printed_once():
     ran = subprocess.run(run, capture_output=True, text=True, timeout=60, check=False, cwd=ROOT)
     assert ran.stdout.split("\n")[:3] == ["before", "in 0", "after"], ran.stderr
     assert ran.stderr == ""
+
+
+@METHODS
+def test_without_an_episode_the_function_is_not_called(method):
+    env, called = single_env(lambda: Walk(1), Walk.choose), []
+    with pytest.raises(NotResetError, match="reset"):
+        branch(env, lambda twin, number: called.append(number), 1, method=method)
+    env.reset()
+    env.step(1)
+    with pytest.raises(EpisodeOverError, match="over"):
+        branch(env, lambda twin, number: called.append(number), 1, method=method)
+    assert called == []
+
+
+def test_numbers_of_branches_are_integers():
+    env = single_env(lambda: Walk(3), Walk.choose)
+    env.reset()
+    for number in (True, False, "1", None):
+        with pytest.raises(OptionValueError, match="n must be a number"):
+            branch(env, short, number)
+    assert branch(env, short, 0) == []
+
+
+def test_branches_are_closed_when_their_function_has_returned():
+    env, twins = single_env(lambda: Walk(3), Walk.choose), []
+    env.reset()
+
+    def keep(twin, number):
+        twins.append(twin.unwrapped)
+        if number:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        branch(env, keep, 2, method="replay")
+    for twin in twins:
+        with pytest.raises(ClosedError, match="call reset"):
+            twin.step(1)
+    env.step(1)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the number of cores cannot be set")
+def test_no_more_branches_run_at_a_time_than_there_are_cores(tmp_path):
+    env = single_env(lambda: Walk(3), Walk.choose)
+    env.reset()
+
+    def alone(twin, number):
+        (tmp_path / str(number)).touch()
+        there = len(list(tmp_path.iterdir()))
+        (tmp_path / str(number)).unlink()
+        return there
+
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        assert branch(env, alone, 6, method="fork") == [1] * 6
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def test_forked_branches_leave_torchs_threads_behind(monkeypatch):
+    """Those of a library whose threads do not come along would be waited for."""
+    told = []
+    torch = types.ModuleType("torch")
+    torch.set_num_threads = told.append
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    env = single_env(lambda: Walk(3), Walk.choose)
+    env.reset()
+    assert branch(env, lambda twin, number: told, 1, method="fork") == [[1]]
+    assert told == []
+
+
+def test_answers_of_policies_are_replayed_as_they_were_given():
+    walk = define(
+        agent="wind_0",
+        action_space=spaces.Box(-9, 9, (1,), np.float32),
+        action_space_mapping=lambda action: float(action[0]),
+        reward_mapping=lambda walk: 0.0,
+    )
+    buffer = np.zeros(1, np.float32)
+
+    def policy(observation):
+        buffer[0] += 0.25
+        return buffer
+
+    env = aec_env(lambda: Walk(6), {**POINTS, f"{Walk.__module__}.Walk.drift": walk}, policies={"wind_0": policy})
+    env.reset(seed=3)
+    for _ in range(3):
+        env.step(1)
+    places = branch(env, lambda twin, number: twin.simulation.place, 1, method="replay")
+    assert places == [env.simulation.place]

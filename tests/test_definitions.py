@@ -8,6 +8,7 @@ import typing
 from abc import ABC, abstractmethod
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -25,8 +26,7 @@ from simenv_marl import (
     make_step,
     single_env,
 )
-
-from .models import Script, calling, decision, decisions, define, plainly, play, rewards_of, script
+from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, rewards_of, script
 
 # -- outside any environment ----------------------------------------------------------------------
 
@@ -316,7 +316,7 @@ def test_an_async_generator_cannot_be_decided():
     async def flow():
         yield 1
 
-    with pytest.raises(PatchError):
+    with pytest.raises(PatchError, match="is an async generator function"):
         define()(flow)
 
 
@@ -458,7 +458,7 @@ def test_a_dict_may_start_anywhere():
     decide = decision(action_space=spaces.Discrete(2, start=-1), action_space_mapping={-1: "down", 0: "stay"})
     env = single_env(calling(decide, decide), decide)
     env.reset()
-    with pytest.raises(InvalidActionError):
+    with pytest.raises(InvalidActionError, match="is not in its action space"):
         env.step(1)
     env.step(np.int64(-1))
     env.step(0)
@@ -674,7 +674,7 @@ def test_a_masked_action_is_illegal_and_moves_nothing():
     decide = masked([0, 1, 1])
     env = single_env(calling(decide), decide)
     env.reset()
-    with pytest.raises(InvalidActionError):
+    with pytest.raises(InvalidActionError, match="is masked"):
         env.step(0)
     assert env.unwrapped.simulation.log == []
     env.step(1)
@@ -686,7 +686,7 @@ def test_the_user_cannot_open_the_mask():
     env = single_env(calling(decide, decide), decide)
     _, info = env.reset()
     info["action_mask"][:] = 1
-    with pytest.raises(InvalidActionError):
+    with pytest.raises(InvalidActionError, match="is masked"):
         env.step(0)
     assert env.step(1)[4]["action_mask"].tolist() == [0, 1, 1]
 
@@ -703,7 +703,7 @@ def test_masks_of_spaces_that_do_not_start_at_zero():
     decide = decision(action_space=spaces.Discrete(2, start=5), action_mask_mapping=lambda: [0, 1])
     env = single_env(calling(decide), decide)
     env.reset()
-    with pytest.raises(InvalidActionError):
+    with pytest.raises(InvalidActionError, match="is masked"):
         env.step(5)
     env.step(6)
     assert env.unwrapped.simulation.log == [6]
@@ -716,7 +716,7 @@ def test_masks_of_multi_discrete_spaces():
     assert [part.tolist() for part in info["action_mask"]] == [[1, 0], [0, 1, 1]]
     assert all(part.dtype == np.int8 for part in info["action_mask"])
     for illegal in ([1, 1], [0, 0]):
-        with pytest.raises(InvalidActionError):
+        with pytest.raises(InvalidActionError, match="is masked"):
             env.step(np.array(illegal))
     env.action_space.seed(0)
     env.step(env.action_space.sample(info["action_mask"]))
@@ -739,7 +739,7 @@ def test_the_mask_also_stands_in_a_dict_observation_with_that_key():
 @pytest.mark.parametrize("mask", [[0, 0, 0], [1, 1], [1, 1, 1, 1], [1, 2, 0], 1, [[1, 1, 1]], [0.5, 1, 1]], ids=str)
 def test_masks_that_fit_no_action_space_are_refused(mask):
     decide = masked(mask)
-    with pytest.raises(MaskError):
+    with pytest.raises(MaskError, match="mask"):
         single_env(calling(decide), decide).reset()
 
 
@@ -755,7 +755,7 @@ def test_choices_are_asked_once_and_indexed():
     _, info = env.reset()
     assert info["action_mask"].tolist() == [1, 1, 1, 0]
     assert info["action_mask"].dtype == np.int8
-    with pytest.raises(InvalidActionError):
+    with pytest.raises(InvalidActionError, match="is masked"):
         env.step(3)
     info = env.step(2)[4]
     assert info["action_mask"].tolist() == [1, 1, 0, 0]
@@ -767,7 +767,7 @@ def test_choices_are_asked_once_and_indexed():
 @pytest.mark.parametrize("number", [0, 5])
 def test_no_choices_and_too_many_are_errors(number):
     decide = decision(action_space=spaces.Discrete(4), choices=lambda: range(number))
-    with pytest.raises(MaskError):
+    with pytest.raises(MaskError, match="choices"):
         single_env(calling(decide), decide).reset()
 
 
@@ -956,3 +956,30 @@ def test_differences_outside_any_environment_are_zero():
 def test_difference_needs_a_callable():
     with pytest.raises(DefinitionError):
         difference(3)
+
+
+# -- what comes back when a decision function was pickled -------------------------------------------
+
+
+@pytest.mark.parametrize(("named", "expected"), [(FIRST, "first"), (Twice.decide, "second")])
+def test_of_several_definitions_of_a_rule_the_same_one_comes_back(named, expected):
+    def call():
+        return Twice().decide()
+
+    env = cloudpickle.loads(cloudpickle.dumps(single_env(calling(call), named)))
+    env.reset()
+    env.step(0)
+    assert env.unwrapped.simulation.log == [expected]
+
+
+def test_what_is_defined_in_this_process_stays_as_it_is():
+    """Whatever was pickled before comes back beside it."""
+    pickled = cloudpickle.dumps(single_env(calling(Twice().decide), Twice.decide))
+    before = Twice.decide, FIRST
+    cloudpickle.loads(pickled)
+    assert (Twice.decide, FIRST) == before
+    for named, expected in ((FIRST, "first"), (Twice.decide, "second")):
+        env = single_env(calling(Twice().decide), named)
+        env.reset()
+        env.step(0)
+        assert env.unwrapped.simulation.log == [expected]

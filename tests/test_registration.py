@@ -17,11 +17,10 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test
 
 from simenv_marl import RULE, SimEnvError, UnknownOptionError, UnknownPointError, register_simulation
-
-from . import many_registered
-from .many_registered import Boat, Voyage
-from .many_worlds import Being, beings
-from .models import calling, decision, define, play, script
+from tests.worlds import many_registered
+from tests.worlds.many_registered import Boat, Voyage
+from tests.worlds.many_worlds import Being, beings
+from tests.worlds.models import calling, decision, define, play, script
 
 ROOT = Path(__file__).parent.parent
 SINGLES = ["manyregistered/SteerBoat-v0", "manyregistered/SetSail-v0"]
@@ -109,9 +108,9 @@ def test_options_are_given_when_it_is_made():
     env.reset()
     assert all(env.step(dict.fromkeys(env.agents, RULE))[3].values())
     assert env.render().shape == (8, 8, 3)
-    with pytest.raises(UnknownOptionError):
+    with pytest.raises(UnknownOptionError, match="there is no option"):
         pettingzoo.make("aec", COOP, speed=3)
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError, match="was raised from"):
         gymnasium.make(JOINT, speed=3)
 
 
@@ -398,7 +397,7 @@ def test_specs_of_pettingzoo_are_strings():
 
 def run_apart(code):
     """Run some code in a process of its own, in which nothing is imported yet."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
         cwd=ROOT,
@@ -416,7 +415,7 @@ def test_in_another_process_by_module_and_id():
     code = f"""
 import gymnasium
 for identity in {many_registered.IDS[:-1]!r}:
-    env = gymnasium.make("tests.many_registered:" + identity)
+    env = gymnasium.make("tests.worlds.many_registered:" + identity)
     env.reset(seed=5)
     env.step(env.action_space.sample())
     env.close()
@@ -431,7 +430,7 @@ print(pettingzoo.make("parallel", {COOP!r}).possible_agents)
 def test_in_another_process_by_its_spec():
     text = gymnasium.make(SINGLES[0], max_steps=2).spec.to_json()
     code = f"""
-import gymnasium, tests.many_registered
+import gymnasium, tests.worlds.many_registered
 from gymnasium.envs.registration import EnvSpec
 env = gymnasium.make(EnvSpec.from_json({text!r}))
 print(env.reset(seed=5)[0].tolist())
@@ -442,7 +441,7 @@ print(env.reset(seed=5)[0].tolist())
 
 def test_in_another_process_by_its_spec_alone():
     """A spec that was written down says all that is needed, as those of other environments do."""
-    text = gymnasium.make(f"tests.many_registered:{SINGLES[0]}").spec.to_json()
+    text = gymnasium.make(f"tests.worlds.many_registered:{SINGLES[0]}").spec.to_json()
     code = f"""
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -459,7 +458,7 @@ def test_vectors_in_processes_of_their_own():
 import gymnasium
 if __name__ == "__main__":
     envs = gymnasium.make_vec(
-        "tests.many_registered:{SINGLES[0]}",
+        "tests.worlds.many_registered:{SINGLES[0]}",
         num_envs=2,
         vectorization_mode="async",
         vector_kwargs={{"context": "spawn"}},
@@ -470,3 +469,33 @@ if __name__ == "__main__":
     print(observations.shape)
 """
     assert run_apart(code) == "(2, 2)"
+
+
+# -- what registered views are given ---------------------------------------------------------------
+
+
+def test_policies_that_are_given_stand_in_place_of_the_rule():
+    sail = Boat.set_sail
+    env = made(SINGLES[0], policies={sail: lambda observation: np.array([1.0], np.float32)})
+    env.reset(seed=1)
+    env.step(np.array([1.0], np.float32))
+    assert 0.89 < env.simulation.boat.place < 1.11
+    envs = gymnasium.make_vec(
+        SINGLES[0], num_envs=2, policies={sail: lambda observation: np.array([1.0], np.float32)}
+    ).unwrapped
+    envs.reset(seed=1)
+    envs.step(np.ones((2, 1), np.float32))
+    assert all(0.89 < simulation.boat.place < 1.11 for simulation in envs.get_attr("simulation"))
+    envs.close()
+
+
+@pytest.mark.parametrize("flatten", [False, True])
+def test_what_is_registered_of_the_joint_view_holds_and_may_be_changed(register, flatten):
+    ids = register(Voyage, name="flat", points=Voyage.points, flatten=flatten)
+    joint = next(identity for identity in ids if "Joint" in identity)
+    for given, expected in (({}, flatten), ({"flatten": not flatten}, not flatten)):
+        space = made(joint, **given).action_space
+        assert isinstance(space, spaces.Box) is expected
+        envs = gymnasium.make_vec(joint, num_envs=2, **given).unwrapped
+        assert isinstance(envs.single_action_space, spaces.Box) is expected
+        envs.close()

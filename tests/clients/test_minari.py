@@ -19,9 +19,8 @@ from simenv_marl import (
     record_dataset,
     save_dataset,
 )
-
-from ..many_worlds import Being, beings
-from ..models import Script, calling, decision, script
+from tests.worlds.many_worlds import Being, beings
+from tests.worlds.models import Script, calling, decision, script
 
 minari = pytest.importorskip("minari")
 
@@ -198,7 +197,7 @@ def test_nothing_is_overwritten_and_nothing_is_run_in_vain():
         record_dataset(NAME, script(never), {ant: ones}, points=ant, seeds=[1])
     with pytest.raises(OptionValueError, match="no name"):
         record_dataset("no name", script(never), {ant: ones}, points=ant, seeds=[1])
-    with pytest.raises(OptionValueError, match="nobody"):
+    with pytest.raises(OptionValueError, match="nothing to write"):
         record_dataset("simenv/none-v0", script(lambda simulation: None), {ant: ones}, points=ant, seeds=[1])
     assert minari.list_local_datasets().keys() == {NAME}
 

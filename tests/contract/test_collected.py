@@ -1,0 +1,480 @@
+"""Whole episodes of all agents as arrays: ``collect_episodes``, beside an AEC environment that is played alike."""
+
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    AgentError,
+    NoDecisionError,
+    OptionValueError,
+    UnknownPointError,
+    Variant,
+    aec_env,
+    collect_episodes,
+    difference,
+)
+from tests.contract.test_simulate_many import by_row
+from tests.worlds import worlds
+from tests.worlds.many_worlds import Announcing, Being, Colony, Other, beings, colony_points, designs, others
+from tests.worlds.models import Script, calling, decision, notes, play, script
+
+some_seeds = st.lists(st.integers(0, 2**31 - 1), max_size=6)
+sizes = st.integers(1, 8)
+
+
+def ones(observations):
+    return np.ones(len(observations), np.int64)
+
+
+def played(env, policies, seed):
+    """What each agent lives through in one episode of an AEC environment: by agent its rows, and its last observation.
+
+    Args:
+        env: The environment.
+        policies: By agent, a policy of observation and info.
+        seed: Of the episode.
+    """
+    rows, last, turn = defaultdict(list), {}, 0
+    try:
+        turns = play(env, lambda agent, env: policies(agent)(*env.last()[::4]), seed=seed)
+    except NoDecisionError:
+        return {}, {}
+    for agent, observation, reward, terminated, truncated, info, action in turns:
+        if rows[agent]:
+            rows[agent][-1] |= {"reward": reward, "elapsed": info.get("elapsed")}
+        if action is None:
+            last[agent] = observation
+            if rows[agent]:
+                rows[agent][-1] |= {"terminated": terminated, "truncated": truncated, "turn of the end": turn}
+            continue
+        rows[agent].append(
+            {
+                "observation": observation,
+                "action": action,
+                "mask": info.get("action_mask"),
+                "time": info.get("time"),
+                "turn": turn,
+                "terminated": False,
+                "truncated": False,
+            }
+        )
+        turn += 1
+    return {agent: own for agent, own in rows.items() if own}, last
+
+
+def check(found, episodes):
+    """Compare what was collected under one key with what was played.
+
+    Args:
+        found: What was collected.
+        episodes: Of each episode what ``played`` has returned, but for agents of other keys.
+    """
+    trajectory = row = 0
+    following = found.next_observations
+    for number, (agents, last) in enumerate(episodes):
+        for agent, rows in agents.items():  # in the order of their first decisions
+            assert found.starts[trajectory] == row
+            assert found.lengths[trajectory] == len(rows)
+            assert np.array_equal(found.last_observations[trajectory], last[agent])
+            assert found.last_turns[trajectory] == rows[-1]["turn of the end"]
+            assert found.returns[trajectory] == pytest.approx(sum(row["reward"] for row in rows))
+            for step, expected in enumerate(rows):
+                assert found.names[found.agents[row]] == agent
+                assert found.episodes[row] == number
+                assert (found.steps[row], found.turns[row]) == (step, expected["turn"])
+                assert np.array_equal(found.observations[row], expected["observation"])
+                upcoming = rows[step + 1]["observation"] if step + 1 < len(rows) else last[agent]
+                assert np.array_equal(following[row], upcoming)
+                assert found.by_rule[row] == (expected["action"] is RULE)
+                assert found.by_rule[row] or found.actions[row] == expected["action"]
+                assert found.rewards[row] == expected["reward"]
+                assert found.terminations[row] == expected["terminated"]
+                assert found.truncations[row] == expected["truncated"]
+                if found.action_masks is not None:
+                    assert found.action_masks[row].tolist() == expected["mask"].tolist()
+                if found.times is not None:
+                    assert found.times[row] == expected["time"]
+                    if expected["elapsed"] is None:
+                        assert np.isnan(found.elapsed[row])
+                    else:
+                        assert found.elapsed[row] == expected["elapsed"]
+                row += 1
+            trajectory += 1
+    assert (len(found), len(found.starts)) == (row, trajectory)
+
+
+def only(episodes, chosen):
+    return [({agent: rows for agent, rows in agents.items() if chosen(agent)}, last) for agents, last in episodes]
+
+
+# -- it is what an AEC environment is -------------------------------------------------------------
+
+
+@given(designs, some_seeds, sizes, st.booleans(), st.none() | st.integers(1, 12))
+@settings(max_examples=60)
+def test_colonies_are_as_in_an_aec_environment(design, seeds, size, announcing, most):
+    """Births and deaths, agents that are announced, limits of steps; some left to the rule now and then."""
+    points = colony_points(overseen=bool(design.overseen))
+    kind = Announcing if announcing else Colony
+
+    def policy(observation, info):
+        number = int(observation.sum()) % 6
+        return RULE if number == 5 else number
+
+    policies = dict.fromkeys(points, by_row(policy))
+    found = collect_episodes(
+        lambda: kind(design), policies, points=points, seeds=seeds, batch_size=size, max_steps=most
+    )  # fmt: skip
+    env = aec_env(lambda: kind(design), points, max_steps=most)
+    episodes = [played(env, lambda agent: policy, seed) for seed in seeds]
+    assert found.keys() == points.keys()
+    act, *oversee = points  # as long as the environment is there, the class has others in their place
+    check(found[act], only(episodes, lambda agent: agent != "overseer_0"))
+    if design.overseen:
+        check(found[oversee[0]], only(episodes, lambda agent: agent == "overseer_0"))
+
+
+@given(worlds.designs(), some_seeds, sizes)
+@settings(max_examples=80)
+def test_worlds_are_as_in_an_aec_environment(design, seeds, size):
+    points = worlds.points_of(design)
+
+    def simulation():
+        return worlds.World(design, points)
+
+    answered = {points[number]: by_row(worlds.advised) for number in range(len(points)) if number not in design.rules}
+    found = collect_episodes(
+        simulation, answered, points=points, seeds=seeds, batch_size=size, max_steps=design.max_steps
+    )  # fmt: skip
+    rules = {points[number]: RULE for number in design.rules}
+    env = aec_env(simulation, points, policies=rules, max_steps=design.max_steps)
+    episodes = [played(env, lambda agent: worlds.advised, seed) for seed in seeds]
+    for number, point in enumerate(points):
+        if point in answered:
+            check(found[point], only(episodes, lambda agent, number=number: agent.split("_")[1] == str(number)))
+
+
+def test_agents_under_their_own_keys():
+    def main(simulation):
+        for number in (0, 1, 2, 1, 0):
+            simulation.log.append(Being(number).act())
+
+    points = beings(observation_space_mapping=lambda being: [being.number, 0], removed_by=())
+    policies = {Being.act: ones, "being_1": lambda observations: [2] * len(observations), "being_2": RULE}
+    found = collect_episodes(script(main), policies, points=points, seeds=[3, 4])
+    assert list(found) == [Being.act, "being_1", "being_2"]
+    assert found["being_2"].by_rule.tolist() == [True] * 2
+    assert found["being_2"].observations.tolist() == [[2, 0]] * 2
+    assert found["being_1"].names == ("being_1",)
+    assert found["being_1"].actions.tolist() == [2] * 4
+    assert found["being_1"].seeds == (3, 4)
+    assert found[Being.act].names == ("being_0",)
+    assert found[Being.act].observations.tolist() == [[0, 0]] * 4
+
+
+def test_nobody_else_is_an_agent():
+    asked = []
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", reward_mapping=lambda: asked.append(1) or 0.0)
+    found = collect_episodes(calling(ant, bee, ant), {"ant_0": ones}, points=[ant, bee], seeds=[1])
+    assert found["ant_0"].turns.tolist() == [0, 1]
+    assert asked == []
+
+
+def test_differences_count_for_each_agent():
+    levels = iter(range(0, 1000, 7))
+    ant = decision(agent="ant_0", reward_mapping=difference(lambda: next(levels)))
+    found = collect_episodes(calling(ant, ant, ant), {ant: ones}, seeds=[1])
+    assert found[ant].rewards.tolist() == [7.0, 7.0, 7.0]
+
+
+def test_ends():
+    ant = decision(agent="ant_0")
+    found = collect_episodes(calling(ant, ant), {ant: ones}, seeds=range(2))[ant]
+    assert found.terminations.tolist() == [False, True] * 2
+    assert not found.truncations.any()
+    found = collect_episodes(calling(ant, ant, ends=TRUNCATED), {ant: ones}, seeds=range(2))[ant]
+    assert found.truncations.tolist() == [False, True] * 2
+    assert not found.terminations.any()
+    found = collect_episodes(calling(ant, ant, ant), {ant: ones}, seeds=range(2), max_steps=2)[ant]
+    assert found.truncations.tolist() == [False, True] * 2
+
+
+# -- what arrays there are ------------------------------------------------------------------------
+
+
+def test_shapes_and_dtypes():
+    class Timed(Script):
+        def time(self):
+            return len(self.log) * 2
+
+    def main(simulation):
+        simulation.log += [ant()]
+        simulation.log += [ant()]
+
+    ant = decision(
+        agent="ant_0",
+        observation_space=spaces.Box(0, 9, (2, 3), np.float32),
+        observation_space_mapping=lambda: np.ones((2, 3)),
+        action_mask_mapping=lambda: [0, 1] + [0] * 8,
+    )
+    found = collect_episodes(lambda: Timed(main), {ant: ones}, seeds=range(3))[ant]
+    shapes = {
+        "observations": ((6, 2, 3), np.float32),
+        "next_observations": ((6, 2, 3), np.float32),
+        "last_observations": ((3, 2, 3), np.float32),
+        "actions": ((6,), np.int64),
+        "rewards": ((6,), np.float64),
+        "terminations": ((6,), np.bool_),
+        "truncations": ((6,), np.bool_),
+        "action_masks": ((6, 10), np.int8),
+        "times": ((6,), np.float64),
+        "elapsed": ((6,), np.float64),
+        "episodes": ((6,), np.int64),
+        "agents": ((6,), np.int64),
+        "steps": ((6,), np.int64),
+        "turns": ((6,), np.int64),
+        "by_rule": ((6,), np.bool_),
+        "starts": ((3,), np.int64),
+        "lengths": ((3,), np.int64),
+        "last_turns": ((3,), np.int64),
+        "returns": ((3,), np.float64),
+    }
+    for name, (shape, dtype) in shapes.items():
+        array = getattr(found, name)
+        assert (array.shape, array.dtype) == (shape, dtype), name
+    assert found.times.tolist() == [0, 2] * 3
+    assert found.elapsed.tolist() == [2, 2] * 3
+    assert len(found) == 6
+    assert "6 decisions" in repr(found)
+
+
+def test_policies_can_tell_decisions_apart():
+    ant = decision(agent="ant_0")
+    bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 1)
+
+    def policy(observations, infos, identities):
+        assert len(observations) == len(infos) == len(identities)
+        return [RULE] * len(identities), {
+            "seeds": [seed for seed, _ in identities],
+            "turns": [t for _, t in identities],
+        }
+
+    def optional(observations, infos, identities=None):
+        assert identities is None
+        return [RULE] * len(observations)
+
+    for size in (1, 3):
+        found = collect_episodes(calling(ant, bee, ant), {ant: policy, bee: optional}, seeds=[7, 5, 9], batch_size=size)
+        own = found[ant]
+        assert own.extras["seeds"].tolist() == [own.seeds[episode] for episode in own.episodes] == [7, 7, 5, 5, 9, 9]
+        assert own.extras["turns"].tolist() == own.turns.tolist() == [0, 2] * 3
+
+
+def test_spaces_are_those_of_the_decision_point():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", action_space=spaces.Discrete(3))
+    found = collect_episodes(calling(ant), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
+    assert found[ant].action_space == spaces.Discrete(10)
+    assert found[bee].action_space == spaces.Discrete(3)  # which has never decided
+    assert found[ant].observation_space.shape == (2,)
+    unborn = collect_episodes(script(lambda s: None), {"being_3": ones}, points=beings(), seeds=[1])
+    assert unborn["being_3"].action_space is None
+
+
+def test_composite_spaces():
+    ant = decision(
+        agent="ant_0",
+        observation_space=spaces.Dict(a=spaces.Discrete(5), b=spaces.Tuple([spaces.Box(0, 9, (2,)), spaces.Text(5)])),
+        observation_space_mapping=lambda: {"a": 3, "b": ([1, 2], "ant")},
+        action_space=spaces.Dict(c=spaces.Box(0, 9, (2,)), d=spaces.MultiDiscrete([3, 3])),
+    )
+    answers = iter([[{"c": np.array([1, 2], np.float32), "d": np.array([0, 2])}, RULE], RULE])
+    found = collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=range(2))[ant]
+    assert found.observations["a"].tolist() == [3] * 4
+    assert found.observations["b"][0].shape == (4, 2)
+    assert found.next_observations["b"][1].tolist() == ["ant"] * 4
+    assert found.actions["c"].tolist() == [[1, 2], [0, 0], [0, 0], [0, 0]]
+    assert found.actions["d"].tolist() == [[0, 2], [0, 0], [0, 0], [0, 0]]
+    assert found.by_rule.tolist() == [False, True, True, True]
+
+
+def test_masks_of_several_parts():
+    ant = decision(
+        agent="ant_0",
+        action_space=spaces.MultiDiscrete([2, 3]),
+        action_mask_mapping=lambda: ([0, 1], [1, 0, 0]),
+    )
+    found = collect_episodes(calling(ant, ant), {ant: lambda observations: [[1, 0]]}, seeds=[1])[ant]
+    assert found.action_masks[0].tolist() == [[0, 1]] * 2
+    assert found.action_masks[1].tolist() == [[1, 0, 0]] * 2
+    assert found.actions.tolist() == [[1, 0]] * 2
+
+
+def test_scalars_for_boxes_of_one_element():
+    ant = decision(agent="ant_0", action_space=spaces.Box(0, 9, (1,), np.float32))
+    found = collect_episodes(calling(ant), {ant: lambda observations: np.array([0.5, 1.5])}, seeds=range(2))[ant]
+    assert found.actions.tolist() == [[0.5], [1.5]]
+    assert found.actions.dtype == np.float32
+
+
+def test_what_policies_do_to_their_observations_is_not_seen():
+    ant = decision(agent="ant_0")
+
+    def policy(observations):
+        observations[:] = 99
+        return ones(observations)
+
+    assert collect_episodes(calling(ant), {ant: policy}, seeds=[1])[ant].observations.tolist() == [[1.0, 2.0]]
+
+
+def test_extras_stand_row_by_row():
+    def policy(observations, infos):
+        numbers = observations[:, 0] * 10 + observations[:, 1]
+        return ones(observations), {"values": numbers, "logits": np.stack([numbers] * 3, axis=1).astype(np.float32)}
+
+    def main(simulation):
+        for _ in range(1 + simulation.seed % 3):
+            for number in (0, 1):
+                being = Being(number)
+                being.health = simulation.seed
+                being.act()
+
+    points = beings(observation_space_mapping=lambda being: [being.number, being.health], removed_by=())
+    found = collect_episodes(script(main), {Being.act: policy}, points=points, seeds=[5, 1, 3], batch_size=2)[Being.act]
+    assert found.extras["values"].tolist() == (found.observations @ [10, 1]).tolist()
+    assert found.extras["logits"].shape == (len(found), 3)
+    assert found.extras["logits"].dtype == np.float32
+
+
+def test_extras_may_be_tensors_and_buffers_that_are_used_again():
+    class Tensor:
+        """Becomes an array as those of torch do, which know no copies."""
+
+        def __init__(self, array):
+            self.array = array
+
+        def __array__(self, dtype=None):
+            return self.array if dtype is None else self.array.astype(dtype)
+
+    buffer = np.zeros(1, np.float32)
+    ant = decision(agent="ant_0")
+
+    def policy(observations):
+        buffer[:] += 1
+        return ones(observations), {"tensors": Tensor(buffer), "arrays": buffer}
+
+    found = collect_episodes(calling(ant, ant, ant), {ant: policy}, seeds=[1])[ant]
+    assert found.extras["tensors"].tolist() == found.extras["arrays"].tolist() == [1, 2, 3]
+    assert found.extras["tensors"].dtype == np.float32
+
+
+@pytest.mark.parametrize("values", [[1.0], 1.0, [1.0, 2.0, 3.0]])
+def test_extras_that_do_not_fit(values):
+    ant = decision(agent="ant_0")
+    with pytest.raises(OptionValueError, match="2 decisions"):
+        collect_episodes(calling(ant), {ant: lambda observations: ([1, 1], {"values": values})}, seeds=range(2))
+
+
+def test_extras_that_are_not_always_there():
+    ant = decision(agent="ant_0")
+    answers = iter([([1], {"values": [0.5]}), [1]])
+    with pytest.raises(OptionValueError, match="values"):
+        collect_episodes(calling(ant, ant), {ant: lambda observations: next(answers)}, seeds=[1])
+
+
+def test_episodes_in_which_nobody_decides():
+    ant, bee = decision(agent="ant_0", action_space=spaces.Box(0, 1, (2,))), decision(agent="bee_0")
+
+    def main(simulation):
+        if simulation.seed % 2:
+            bee()
+
+    found = collect_episodes(script(main), {ant: ones, bee: ones}, points=[ant, bee], seeds=range(4))
+    assert found[bee].episodes.tolist() == [1, 3]
+    nothing = found[ant]
+    assert len(nothing) == 0
+    assert nothing.observations.shape == nothing.next_observations.shape == (0, 2)
+    assert nothing.actions.shape == (0, 2)
+    assert nothing.seeds == (0, 1, 2, 3)
+    assert len(collect_episodes(script(main), {ant: ones}, seeds=[])[ant]) == 0
+
+
+def test_what_is_collected_of_each_simulation():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+
+    def main(simulation):
+        for _ in range(simulation.seed):  # the last seeds are the first to end
+            ant()
+
+    found = collect_episodes(
+        script(main),
+        {ant: ones, bee: ones},
+        points=[ant, bee],
+        seeds=[4, 0, 2],
+        collect=lambda simulation: simulation.seed,
+    )
+    assert found[ant].collected == (4, 0, 2)
+    assert found[bee].collected == (4, 0, 2)  # who has never decided
+    assert collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1])[ant].collected is None
+    with pytest.raises(OptionValueError, match="collect"):
+        collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1], collect=3)
+
+
+def test_one_name_at_points_whose_spaces_differ():
+    definitions = beings() | others(
+        agent=lambda other: f"being_{other.number}",
+        observation_space=spaces.Discrete(3),
+        observation_space_mapping=lambda other: 1,
+    )
+
+    def main(simulation):
+        (Being if simulation.seed else Other)(0).act()
+
+    with pytest.raises(AgentError, match="being_0"):
+        collect_episodes(script(main), {"being_0": ones}, points=definitions, seeds=range(2))
+
+
+def test_variants_own_policies_answer_for_no_agents():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    variant = Variant("own", calling(ant, bee), points=[ant, bee], policies={bee: lambda observation: 5})
+    found = collect_episodes(variant, {ant: ones}, seeds=range(2))
+    assert list(found) == [ant]
+    assert found[ant].turns.tolist() == [0, 0]
+
+
+def test_errors_unwind_all_and_say_of_which_seed():
+    ended = []
+
+    def main(simulation):
+        try:
+            for _ in range(simulation.seed):
+                ant()
+        finally:
+            ended.append(simulation.seed)
+
+    def paid():
+        paid.number += 1
+        return 1.0 if paid.number < 8 else float("nan")
+
+    paid.number = 0
+    ant = decision(agent="ant_0", reward_mapping=paid)
+    with pytest.raises(ValueError, match="not finite") as caught:
+        collect_episodes(script(main), {ant: ones}, seeds=[7, 8, 9])
+    assert "seed" in notes(caught.value)
+    assert sorted(ended) == [7, 8, 9]
+
+
+@pytest.mark.parametrize("policies", [None, [1], {"nobody": ones}])
+def test_policies_that_cannot_be(policies):
+    ant = decision(agent="ant_0")
+    if policies is None:
+        assert collect_episodes(calling(ant), {}, points=ant, seeds=[1]) == {}
+        return
+    with pytest.raises((OptionValueError, UnknownPointError), match=r"policies|nobody"):
+        collect_episodes(calling(ant), policies, points=ant, seeds=[1])

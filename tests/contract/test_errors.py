@@ -1,0 +1,737 @@
+"""Sections 5.8 and 11 of the contract: errors surface as themselves, say where, and leave the next reset working."""
+
+import inspect
+import pickle
+import re
+import threading
+
+import pytest
+from gymnasium import spaces
+
+import simenv_marl
+from simenv_marl import (
+    RULE,
+    ClosedError,
+    EpisodeOverError,
+    InvalidActionError,
+    NotResetError,
+    ReentrancyError,
+    ResetNeededError,
+    SimEnvError,
+    WrongThreadError,
+    aec_env,
+    errors,
+    single_env,
+)
+from tests.worlds.models import Script, calling, culprits, decision, decisions, define, notes, play, script
+
+# -- the tree -------------------------------------------------------------------------------------
+
+LEAVES = [value for value in vars(errors).values() if inspect.isclass(value) and issubclass(value, SimEnvError)]
+BUILTINS = (ValueError, TypeError, LookupError, RuntimeError, AssertionError, ImportError)
+
+
+def test_there_is_one_root():
+    assert len(LEAVES) > 10
+    assert SimEnvError.__mro__ == (SimEnvError, Exception, BaseException, object)
+    for error in LEAVES:
+        if error is not SimEnvError:
+            assert issubclass(error, BUILTINS)
+
+
+def test_all_errors_are_public():
+    for error in LEAVES:
+        assert getattr(simenv_marl, error.__name__) is error
+        assert error.__name__ in simenv_marl.__all__
+        assert error.__doc__
+
+
+def test_what_is_exported_is_there():
+    for name in simenv_marl.__all__:
+        assert hasattr(simenv_marl, name)
+
+
+@pytest.mark.parametrize("error", LEAVES)
+def test_errors_survive_pickling_their_notes_included(error):
+    made = error("what, with what, what to do")
+    made.add_note("decision 3")
+    copied = pickle.loads(pickle.dumps(made))
+    assert type(copied) is error
+    assert copied.args == made.args
+    assert str(copied) == str(made)
+    assert copied.__notes__ == ["decision 3"]
+
+
+def test_raised_errors_survive_pickling():
+    decide = decision()
+    env = single_env(calling(decide), decide)
+    env.reset(seed=77)
+    with pytest.raises(InvalidActionError, match="is not in its action space") as caught:
+        env.step(99)
+    copied = pickle.loads(pickle.dumps(caught.value))
+    assert str(copied) == str(caught.value)
+    assert "99" in str(copied)
+    assert "Discrete(10)" in str(copied)
+    assert notes(copied) == notes(caught.value)
+
+
+# -- using an environment at the wrong time -------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [aec_env, single_env])
+def test_steps_before_reset_after_the_end_and_after_close_are_errors_of_their_own(make):
+    decide = decision()
+    env = make(calling(decide), decide)
+    with pytest.raises(NotResetError, match="reset"):
+        env.step(1)
+    env.reset()
+    env.step(1)
+    if make is aec_env:
+        env.step(None)
+    for _ in range(2):
+        with pytest.raises(EpisodeOverError, match="reset"):
+            env.step(1)
+    env.close()
+    for _ in range(2):
+        with pytest.raises(ClosedError, match="reset"):
+            env.step(1)
+    env.reset()
+    env.step(1)
+    kinds = {NotResetError, EpisodeOverError, ClosedError}
+    assert all(issubclass(kind, ResetNeededError) and issubclass(kind, RuntimeError) for kind in kinds)
+
+
+def test_looking_before_reset_after_the_end_and_after_close_are_errors_too():
+    decide = decision()
+    env = aec_env(calling(decide), decide)
+    looks = [env.last, lambda: env.observe("choose_0")]
+    for look in looks:
+        with pytest.raises(NotResetError, match="no episode yet"):
+            look()
+    env.reset()
+    env.step(1)
+    env.step(None)
+    with pytest.raises(EpisodeOverError, match="begin the next one"):
+        env.last()
+    env.close()
+    for look in looks:
+        with pytest.raises(ClosedError, match="call reset"):
+            look()
+
+
+@pytest.mark.parametrize("make", [aec_env, single_env])
+def test_closing_in_mid_episode_is_an_error_of_its_own_too(make):
+    decide = decision()
+    env = make(calling(decide, decide), decide)
+    env.reset()
+    env.close()
+    with pytest.raises(ClosedError, match="call reset"):
+        env.step(1)
+    env.close()
+    env.reset()
+    env.step(1)
+
+
+@pytest.mark.parametrize("make", [aec_env, single_env])
+def test_closing_what_was_never_reset(make):
+    decide = decision()
+    env = make(calling(decide), decide)
+    env.close()
+    with pytest.raises(ClosedError, match="call reset"):
+        env.step(1)
+
+
+@pytest.mark.parametrize("make", [aec_env, single_env])
+def test_agents_books_are_empty_after_an_error_and_after_close(make):
+    decide = decision(lambda: 1 / 0, agent="choose_0")
+    env = make(calling(decide), decide)
+    env.reset()
+    with pytest.raises(ZeroDivisionError):
+        env.step(RULE)
+    with pytest.raises(EpisodeOverError, match="begin the next one"):
+        env.step(1)
+    if make is aec_env:
+        assert env.agents == []
+        assert env.rewards == env.terminations == env.truncations == env.infos == {}
+    env.reset()
+    if make is aec_env:
+        assert env.agents == ["choose_0"]
+        env.close()
+        assert env.agents == []
+
+
+# -- errors of the model and of its mappings ------------------------------------------------------
+
+
+class Culprit(Exception):
+    """An error that nobody but the tests raises."""
+
+
+class Bomb:
+    """Explodes at the given one of its calls; is defused after that."""
+
+    def __init__(self, at, value=None):
+        self.at, self.value, self.calls = at, value, 0
+
+    def culprit(self):
+        self.calls += 1
+        if self.calls == self.at:
+            raise Culprit("boom")
+
+    def __call__(self, *args, **kwargs):
+        self.culprit()
+        return self.value(*args, **kwargs) if callable(self.value) else self.value
+
+
+def play_to_the_end(env, seed, answered):
+    """Play an episode of either view; write down each answer just before it is given."""
+    env.reset(seed=seed)
+    while True:
+        answered.append(True)
+        result = env.step(1)
+        if any(env.terminations.values()) if result is None else result[2]:
+            return
+
+
+def surfaces(env, *, seed=4711):
+    """Play until the bomb explodes; return the error, and how many answers were given before."""
+    answered = []
+    with pytest.raises(Culprit) as caught:
+        play_to_the_end(env, seed, answered)
+    error = caught.value
+    assert type(error) is Culprit
+    assert error.args == ("boom",)
+    assert culprits(error)[-1] == "culprit"
+    assert str(seed) in notes(error)
+    assert isinstance(pickle.loads(pickle.dumps(error)), Culprit)
+    return error, len(answered)
+
+
+def goes_on(env):
+    """The episode is over, and the next reset works."""
+    with pytest.raises(ResetNeededError, match="call reset"):
+        env.step(1)
+    play_to_the_end(env, 1, [])
+
+
+CHANGES = {
+    "observation_space_mapping": [0.0, 0.0],
+    "reward_mapping": 0.0,
+    "action_mask_mapping": [1] * 10,
+    "agent": "culprit_0",
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize("at", [1, 3, 5])
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_errors_in_mappings_surface_as_themselves(name, at, view):
+    if name == "agent" and (view is single_env or at == 5):
+        return
+    bomb = Bomb(at, CHANGES[name])
+    decide = decision(**{"agent": "culprit_0", name: bomb})
+    env = view(calling(*[decide] * 4), decide)
+    error, answered = surfaces(env)
+    assert answered == at - 1  # the fifth is that of the end
+    if name != "agent":
+        assert "culprit_0" in notes(error)
+        if at < 5:
+            assert re.search(rf"decision {at}\b", notes(error))
+    goes_on(env)
+
+
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_errors_in_the_action_mapping_surface_as_themselves(view):
+    bomb = Bomb(2, lambda action: action)
+    decide = decision(action_space_mapping=bomb, agent="culprit_0")
+    env = view(calling(*[decide] * 3), decide)
+    error, answered = surfaces(env)
+    assert answered == 2
+    assert "culprit_0" in notes(error)
+    assert re.search(r"decision 2\b", notes(error))
+    env.reset()
+    env.step(1)
+
+
+@pytest.mark.parametrize("kind", ["rule", "apply", "model", "choices"])
+@pytest.mark.parametrize("at", [1, 3])
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_errors_in_the_model_surface_as_themselves(kind, at, view):
+    bomb = Bomb(at, [1, 2])
+    if kind == "rule":
+        inactive = decision(lambda: bomb())
+        decide = decision(agent="culprit_0")
+        calls = [call for _ in range(4) for call in (decide, inactive)]
+    elif kind == "apply":
+        decide = decision(agent="culprit_0", apply=bomb)
+        calls = [decide] * 4
+    elif kind == "model":
+        decide = decision(agent="culprit_0")
+        calls = [call for _ in range(4) for call in (decide, bomb)]
+    else:
+        decide = decision(agent="culprit_0", choices=bomb)
+        calls = [decide] * 4
+    env = view(calling(*calls), decide)
+    error, answered = surfaces(env)
+    assert answered == (at - 1 if kind == "choices" else at)
+    assert "culprit_0" in notes(error)
+    assert re.search(rf"decision {at}\b", notes(error)), notes(error)
+    goes_on(env)
+
+
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_errors_before_the_first_decision_surface_from_reset(view):
+    bomb, decide = Bomb(1), decision()
+    env = view(calling(bomb, decide), decide)
+    _, answered = surfaces(env)
+    assert answered == 0
+    goes_on(env)
+
+
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_errors_after_the_last_decision_surface_from_step(view):
+    bomb, decide = Bomb(1), decision(agent="culprit_0")
+    env = view(calling(decide, bomb), decide)
+    error, answered = surfaces(env)
+    assert answered == 1
+    assert "culprit_0" in notes(error)
+    goes_on(env)
+
+
+def test_errors_in_policies_surface_as_themselves():
+    for policy_of in (lambda bomb: lambda observation: bomb(), lambda bomb: lambda observation, info: bomb()):
+        bomb = Bomb(2, 1)
+        one, two = decision(agent="one_0"), decision(agent="culprit_0")
+        env = aec_env(calling(*[one, two] * 3), [one, two], policies={two: policy_of(bomb)})
+        error, answered = surfaces(env)
+        assert answered == 2
+        assert "culprit_0" in notes(error)
+        goes_on(env)
+
+
+def test_errors_in_reset_surface_as_themselves():
+    class Resetting(Script):
+        def reset(self, seed=None, options=None):
+            super().reset(seed, options)
+            bomb()
+
+    bomb, decide = Bomb(2), decision()
+    for view in (aec_env, single_env):
+        bomb.calls = 0
+        env = view(lambda: Resetting(lambda simulation: decide()), decide)
+        env.reset()
+        _, answered = surfaces(env)
+        assert answered == 0
+        goes_on(env)
+
+
+@pytest.mark.parametrize("trigger", ["close", "reset"])
+def test_errors_in_stop_surface_as_themselves(trigger):
+    unwound = []
+
+    class Stopping(Script):
+        def stop(self):
+            bomb()
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            unwound.append(True)
+
+    decide = decision(agent="culprit_0")
+    for view in (aec_env, single_env):
+        bomb = Bomb(1)
+        env = view(lambda: Stopping(main), decide)
+        env.reset(seed=4711)
+        unwound.clear()
+        with pytest.raises(Culprit) as caught:
+            getattr(env, trigger)()
+        assert culprits(caught.value)[-1] == "culprit"
+        assert "4711" in notes(caught.value)
+        assert unwound == [True]
+        goes_on(env)
+
+
+@pytest.mark.parametrize("trigger", ["close", "reset"])
+def test_errors_while_unwinding_surface_as_themselves(trigger):
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            bomb()
+
+    decide = decision(agent="culprit_0")
+    for view in (aec_env, single_env):
+        bomb = Bomb(1)
+        env = view(script(main), decide)
+        env.reset(seed=4711)
+        with pytest.raises(Culprit) as caught:
+            getattr(env, trigger)()
+        assert culprits(caught.value)[-1] == "culprit"
+        assert "4711" in notes(caught.value)
+        goes_on(env)
+
+
+def test_errors_in_expected_calls_surface_as_themselves():
+    class Foreseeing(Script):
+        def expected_calls(self, point):
+            bomb()
+            return []
+
+    bomb, decide = Bomb(1), decision()
+    for view in (aec_env, single_env):
+        bomb.calls = 0
+        env = view(lambda: Foreseeing(lambda simulation: decide()), decide)
+        surfaces(env)
+        goes_on(env)
+
+
+def test_errors_in_rendering_surface_as_themselves():
+    class Rendering(Script):
+        def render(self, mode):
+            bomb()
+
+    bomb, decide = Bomb(1), decision()
+    env = single_env(lambda: Rendering(lambda simulation: decide()), decide, render_mode="ansi")
+    env.reset()
+    with pytest.raises(Culprit) as caught:
+        env.render()
+    assert culprits(caught.value)[-1] == "culprit"
+    env.step(1)  # nothing has happened to the episode
+
+
+def test_an_error_in_a_mapping_unwinds_the_simulation_and_is_not_seen_by_it():
+    seen = []
+
+    def main(simulation):
+        try:
+            decide()
+            decide()
+        except Exception as error:
+            seen.append(error)
+        finally:
+            seen.append("unwound")
+
+    decide = decision(observation_space_mapping=Bomb(2, [0, 0]))
+    env = single_env(script(main), decide)
+    env.reset()
+    with pytest.raises(Culprit):
+        env.step(1)
+    assert seen == ["unwound"]
+
+
+def test_mappings_never_run_inside_the_models_own_try():
+    def main(simulation):
+        try:
+            decide()
+        except Culprit:
+            simulation.log.append("caught what it does not know")
+
+    for name, value in {**CHANGES, "action_space_mapping": 1}.items():
+        if name != "agent":
+            decide = decision(**{name: Bomb(1, value)})
+            env = single_env(script(main), decide)
+            with pytest.raises(Culprit):
+                play_to_the_end(env, 1, [])
+
+
+def test_the_model_may_catch_the_errors_of_its_own_rule_and_of_apply():
+    def main(simulation):
+        for _ in range(2):
+            try:
+                simulation.log.append(decide())
+            except Culprit:
+                simulation.log.append("caught")
+
+    decide = decision(lambda: bomb(), apply=lambda action: bomb())
+    for action in (1, RULE):
+        bomb = Bomb(1, "value")
+        env = single_env(script(main), decide)
+        env.reset()
+        env.step(action)
+        env.step(action)
+        assert env.unwrapped.simulation.log == ["caught", "value"]
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, GeneratorExit, StopIteration, BaseException])
+def test_exceptions_of_every_kind_surface_as_themselves(kind):
+    raised = kind("really")
+
+    def culprit():
+        raise raised
+
+    decide = decision(culprit)
+    for env in (aec_env(calling(decide), decide), single_env(calling(decide), decide)):
+        env.reset()
+        with pytest.raises(kind) as caught:
+            env.step(RULE)
+        assert caught.value is raised
+        assert culprits(raised)[-1] == "culprit"
+        env.reset()
+        env.step(1)
+
+
+def test_causes_and_contexts_are_kept():
+    def culprit():
+        try:
+            raise KeyError("inner")
+        except KeyError as error:
+            raise Culprit("outer") from error
+
+    decide = decision(culprit)
+    env = single_env(calling(decide), decide)
+    env.reset()
+    with pytest.raises(Culprit) as caught:
+        env.step(RULE)
+    assert isinstance(caught.value.__cause__, KeyError)
+
+
+def test_an_error_of_another_errors_handler_is_not_blamed_on_the_environment():
+    decide = decision(lambda: 1 / 0)
+    env = single_env(calling(decide), decide)
+    env.reset()
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(RULE)
+    assert caught.value.__context__ is None
+
+
+def test_notes_name_agent_decision_and_seed_of_the_episode():
+    def culprit(name):
+        if name == "c":
+            raise Culprit("boom")
+        return 0
+
+    decide = decision(culprit, agent=lambda name: f"agent_{name}")
+    env = aec_env(calling(*[lambda name=name: decide(name) for name in "abac"]), decide)
+    for seed in (31, 62):
+        with pytest.raises(Culprit) as caught:
+            play(env, RULE, seed=seed)
+        told = notes(caught.value)
+        assert "agent_c" in told
+        assert str(seed) in told
+        assert re.search(r"decision 4\b", told), told
+        assert caught.value.__notes__ == [told]  # one note of one environment
+
+
+class Being:
+    """Has a mapping that fails at its second decision; a method, as most decisions are."""
+
+    def __init__(self, name):
+        self.name, self.decisions = name, 0
+
+    def observe(self):
+        self.decisions += 1
+        if self.name == "b" and self.decisions == 2:
+            raise Culprit("boom")
+        return [self.decisions, 0]
+
+    @define(agent=lambda self: f"being_{self.name}", observation_space_mapping=observe)
+    def choose(self):
+        return 0
+
+    @define(agent="alone_0", observation_space_mapping=observe)
+    def choose_alone(self):
+        return 0
+
+
+@pytest.mark.parametrize(("point", "agent"), [(Being.choose, "being_b"), (Being.choose_alone, "alone_0")])
+def test_notes_of_errors_at_later_decisions_of_methods(point, agent):
+    def main(simulation):
+        beings = [Being("a"), Being("b")]
+        for number in (1, 0, 0, 0, 1):
+            point(beings[number])
+
+    env = aec_env(script(main), point)
+    with pytest.raises(Culprit) as caught:
+        play(env, 1, seed=17)
+    assert agent in notes(caught.value)
+    assert "17" in notes(caught.value)
+    assert re.search(r"decision 5\b", notes(caught.value))
+
+
+def test_drawn_seeds_are_told_too_and_reproduce_the_error():
+    seeds = []
+
+    class Seeded(Script):
+        def reset(self, seed=None):
+            super().reset(seed)
+            seeds.append(seed)
+
+    decide = decision(lambda: 1 / 0)
+    env = single_env(lambda: Seeded(lambda simulation: decide()), decide)
+    env.reset()
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(RULE)
+    assert str(seeds[-1]) in notes(caught.value)
+
+
+# -- reentrancy -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("what", "where"),
+    [("step", where) for where in ("rule", "observation_space_mapping", "reward_mapping", "apply", "policy")]
+    + [(what, where) for what in ("reset", "close") for where in ("rule", "observation_space_mapping")],
+)
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing(where, what, view):
+    seen = []
+    armed = [False]
+
+    def use(*args):
+        if armed[0]:
+            armed[0] = False
+            with pytest.raises(ReentrancyError, match="the environment was used"):
+                env.step(1) if what == "step" else getattr(env, what)()
+            seen.append(what)
+        return 1
+
+    changes = {}
+    if where in ("observation_space_mapping", "reward_mapping"):
+        changes[where] = lambda: use() and ([0, 0] if where[0] == "o" else 1.0)
+    elif where == "apply":
+        changes["apply"] = use
+    decide = decision(agent="a_0", **changes)
+    other = decision(lambda: use() if where == "rule" else 0, agent="other_0")
+    policies = {"other_0": use if where == "policy" else RULE}
+    env = view(calling(*[decide, other] * 3), [decide, other], policies=policies)
+    env.reset()
+    armed[0] = True
+    flags = []
+    for _ in range(3):
+        result = env.step(1)
+        flags.append(env.terminations["a_0"] if view is aec_env else result[2])
+    assert seen == [what]
+    assert flags == [False, False, True]
+    assert env.unwrapped.simulation.log[::2] == [1, 1, 1]
+    env.close()
+    env.reset()
+    env.step(1)
+
+
+@pytest.mark.parametrize("where", ["reset", "rule", "observation_space_mapping", "policy"])
+@pytest.mark.parametrize("what", ["step", "reset", "close"])
+@pytest.mark.parametrize("view", [aec_env, single_env])
+def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_nothing(where, what, view):
+    raised = []
+
+    class Resetting(Script):
+        def reset(self, seed=None):
+            super().reset(seed)
+            if where == "reset":
+                use()
+
+    def use(*args):
+        if not raised:
+            raised.append(None)
+            with pytest.raises(SimEnvError, match="reset") as caught:
+                env.step(1) if what == "step" else getattr(env, what)()
+            raised.append(type(caught.value))
+        return 1
+
+    changes = {"observation_space_mapping": lambda: use() and [0, 0]} if where.startswith("obs") else {}
+    decide = decision(agent="a_0", **changes)
+    other = decision(lambda: use() if where == "rule" else 1, agent="other_0")
+
+    def main(simulation):
+        for _ in range(2):
+            simulation.log.append((other(), decide()))
+
+    policies = {"other_0": use if where == "policy" else RULE}
+    env = view(lambda: Resetting(main), [decide, other], policies=policies)
+    env.reset()
+    assert raised[1] is ReentrancyError or (what == "step" and issubclass(raised[1], ResetNeededError))
+    env.step(3)
+    env.step(4)
+    assert env.unwrapped.simulation.episodes == 1
+    assert env.unwrapped.simulation.log == [(1, 3), (1, 4)]
+    env.close()
+
+
+# -- threads --------------------------------------------------------------------------------------
+
+
+def in_a_thread(function):
+    """Run a function in a thread; return what it has returned or raised."""
+    outcome = []
+
+    def run():
+        try:
+            outcome.append(function())
+        except BaseException as error:
+            outcome.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    return outcome[0]
+
+
+@pytest.mark.greenlet("threads of their own may be used from any other")
+@pytest.mark.parametrize("view", [aec_env, single_env])
+@pytest.mark.parametrize("what", ["step", "reset", "close"])
+def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_nothing(what, view):
+    unwound = []
+
+    def main(simulation):
+        try:
+            for _ in range(3):
+                simulation.log.append(decide())
+        finally:
+            unwound.append(True)
+
+    decide = decision()
+    env = view(script(main), decide)
+    env.reset()
+    env.step(1)
+    error = in_a_thread(lambda: env.step(5) if what == "step" else getattr(env, what)())
+    assert isinstance(error, WrongThreadError)
+    assert isinstance(error, RuntimeError)
+    assert 'driver="thread"' in str(error)
+    assert not unwound
+    env.step(2)
+    assert env.unwrapped.simulation.log == [1, 2]
+    env.close()
+    assert unwound == [True]
+
+
+def test_an_episode_may_run_in_any_thread_from_its_reset_on():
+    decide = decision(agent="a_0")
+    env = aec_env(calling(*[decide] * 3), decide)
+    assert decisions(in_a_thread(lambda: play(env, 1))) == ["a_0"] * 3
+    assert decisions(play(env, 1)) == ["a_0"] * 3
+    assert decisions(in_a_thread(lambda: play(env, 1))) == ["a_0"] * 3
+
+
+def test_threads_with_environments_of_their_own_do_not_meet():
+    decide = decision(observation_space=spaces.Discrete(100), observation_space_mapping=lambda: 1)
+    barrier = threading.Barrier(4)
+    logs = {}
+
+    def work(number):
+        env = single_env(calling(*[decide] * 50), decide)
+        barrier.wait()
+        for _ in range(3):
+            env.reset()
+            while not env.step(number)[2]:
+                pass
+        logs[number] = env.unwrapped.simulation.log
+        assert decide() == "rule"
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert logs == {number: [number] * 50 for number in range(4)}
+
+
+def test_a_suspended_simulation_leaves_other_threads_and_the_users_own_calls_alone():
+    decide = decision()
+    env = single_env(calling(decide, decide), decide)
+    env.reset()
+    assert decide() == "rule"
+    assert in_a_thread(decide) == "rule"
+    env.step(1)
+    assert decide() == "rule"

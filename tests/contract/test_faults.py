@@ -1,0 +1,503 @@
+"""Whatever fails, wherever: it surfaces as itself, nothing hangs or stays behind, and the next episode is as ever."""
+
+import gc
+import os
+import random
+import sys
+import warnings
+import weakref
+from dataclasses import dataclass
+from itertools import count
+
+import greenlet
+import pytest
+from gymnasium import spaces
+
+import simenv_marl
+from simenv_marl import RULE, ResetNeededError, aec_env, joint_env, parallel_env, single_env
+from tests.core.test_threads import in_a_thread
+from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play
+
+# -- a model that may fail anywhere ---------------------------------------------------------------
+
+
+class Beast:
+    """One of those that decide one by one."""
+
+    def __init__(self, farm, number):
+        self.farm, self.number = farm, number
+
+    def move(self):
+        self.farm.burn("rule")
+        return self.farm.random.randrange(5)
+
+
+class Farm:
+    """A simulation that raises ``error`` at a given place, once it has come by often enough."""
+
+    def __init__(self):
+        self.place, self.fuse, self.error = None, 0, None
+
+    def burn(self, place):
+        if place == self.place:
+            self.fuse -= 1
+            if self.fuse == 0:
+                raise self.error
+
+    def reset(self, seed=None):
+        self.burn("reset")
+        self.random = random.Random(seed)
+        self.now, self.log = 0, []
+        self.herd = [Beast(self, number) for number in range(3)]
+
+    def run(self):
+        try:
+            for _ in range(3):
+                self.burn("run")
+                self.log.append(self.plan())
+                self.now += 1
+                for beast in list(self.herd):
+                    self.log.append(beast.move())
+                self.log.append(self.pick())
+                self.log.append(self.work())
+                if self.now == 2:
+                    self.remove(self.herd[0])
+        finally:
+            self.burn("finally")
+
+    def plan(self):
+        self.burn("rule")
+        return self.random.randrange(10)
+
+    def pick(self):
+        self.burn("rule")
+        return 0
+
+    def work(self):
+        self.burn("rule")
+        return self.random.randrange(3)
+
+    def remove(self, beast):
+        self.herd.remove(beast)
+
+    def stop(self):
+        self.burn("stop")
+
+    def time(self):
+        self.burn("time")
+        return float(self.now)
+
+    def expected_calls(self, point):
+        self.burn("expected_calls")
+        return [(beast,) for beast in self.herd] if point.endswith("move") else []
+
+    render_modes = ("human",)
+
+    def render(self, mode):
+        self.burn("render")
+
+
+ORIGINALS = {name: vars(owner)[name] for owner in (Farm, Beast) for name in ("plan", "pick", "work", "move", "remove")
+             if name in vars(owner)}  # fmt: skip
+
+
+def at(place, value):
+    """A mapping that may fail, with that value."""
+
+    def mapping(*args):
+        thing = args[-1]
+        (thing.farm if isinstance(thing, Beast) else thing).burn(place)
+        return value(*args) if callable(value) else value
+
+    return mapping
+
+
+def apply(action, farm):
+    farm.burn("apply")
+    return action + farm.random.randrange(3)
+
+
+def policy_of(holder):
+    def policy(observation):
+        holder[0].burn("policy")
+        return 2
+
+    return policy
+
+
+PLACE = f"{__name__}.Farm"
+POINTS = {
+    f"{PLACE}.plan": define(
+        agent="planner",
+        observation_space_mapping=at("observation", [0, 0]),
+        reward_mapping=at("reward", 1.0),
+        action_mask_mapping=at("mask", [1] * 10),
+        apply=apply,
+    ),
+    f"{__name__}.Beast.move": define(
+        agent=at("agent", lambda beast: f"beast_{beast.number}"),
+        observation_space_mapping=at("observation", [0, 0]),
+        reward_mapping=at("reward", 1.0),
+        removed_by={f"{PLACE}.remove": lambda farm, beast: at("removed_by", f"beast_{beast.number}")(beast)},
+    ),
+    f"{PLACE}.pick": define(
+        agent="picker", choices=at("choices", lambda farm: list(range(farm.now + 1))), action_space=spaces.Discrete(5)
+    ),
+    f"{PLACE}.work": define(agent="worker", observation_space_mapping=at("observation", [0, 0])),
+}
+PLACES = (
+    "reset", "run", "finally", "rule", "apply", "observation", "reward", "mask", "agent", "removed_by", "choices",
+    "policy", "stop", "time", "expected_calls", "render", "before", "after", "instead",
+)  # fmt: skip
+VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
+
+
+def handler(place):
+    def handle(farm, **_):
+        farm.burn(place)
+        return 0  # of which only ``instead`` makes use
+
+    return handle
+
+
+def farm_env(view, place=None):
+    """An environment of a farm, in which that place is come by."""
+    holder = []
+    work = f"{PLACE}.work"
+    options = {"policies": {work: RULE}}
+    if place == "policy":
+        options["policies"][work] = policy_of(holder)
+    if place in ("before", "after", "instead"):
+        options["plugins"] = [(handler(place), work, place)]
+    if place == "render":
+        options["render_mode"] = "human"
+    points = POINTS
+    if view is single_env:
+        points = {f"{PLACE}.plan": POINTS[f"{PLACE}.plan"], work: POINTS[work]}
+    elif view is joint_env:
+        options["possible_agents"] = {f"{__name__}.Beast.move": [f"beast_{number}" for number in range(3)]}
+    env = view(Farm, points, **options)
+    holder.append(env.unwrapped.simulation)
+    return env
+
+
+def run(env, view, seed=11):
+    """Play an episode, every third decision by its rule; return what it was like."""
+    told = []
+    answers = (RULE if number % 3 == 0 else 0 for number in count())
+    if view is aec_env:
+        told = [turn[:6] for turn in play(env, lambda agent, env: next(answers), seed=seed)]
+    elif view is parallel_env:
+        env.reset(seed=seed)
+        while env.agents:
+            told.append(env.step({agent: next(answers) for agent in env.agents}))
+    else:
+        env.reset(seed=seed)
+        ended = False
+        while not ended:
+            action = next(answers)
+            if view is joint_env and action is not RULE:
+                action = dict.fromkeys(env.action_space, 0)
+            *step, info = env.step(action)
+            ended = step[2] or step[3]
+            told.append((*step, info))
+    return str(told), list(env.unwrapped.simulation.log)
+
+
+def cut_short(env, view):
+    """Begin an episode, go on a little, and close it."""
+    env.reset(seed=11)
+    env.step(dict.fromkeys(env.agents, RULE) if view is parallel_env else RULE)
+    env.close()
+
+
+def nothing_is_left():
+    """In this thread nothing runs, and what was patched is as it was."""
+    assert nobody_is_asked()
+    for owner in (Farm, Beast):
+        for name, original in ORIGINALS.items():
+            if name in vars(owner):
+                assert vars(owner)[name] is original
+
+
+# -- errors of every kind -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FrozenError(Exception):
+    value: int
+
+
+class SlottedError(Exception):
+    __slots__ = ()
+
+
+class UnannotatedError(Exception):
+    def add_note(self, note):
+        raise TypeError("no notes, please")
+
+
+class BaseError(BaseException):
+    pass
+
+
+def in_circles():
+    """An error that is its own cause, by way of another."""
+    error, other = ValueError("one"), ValueError("other")
+    error.__cause__, other.__cause__ = other, error
+    return error
+
+
+def with_foreign_notes():
+    error = ValueError("noted")
+    error.__notes__ = "a string"
+    return error
+
+
+ERRORS = {
+    "KeyboardInterrupt": KeyboardInterrupt,
+    "SystemExit": lambda: SystemExit(3),
+    "GeneratorExit": GeneratorExit,
+    "GreenletExit": greenlet.GreenletExit,
+    "StopIteration": lambda: StopIteration("value"),
+    "StopAsyncIteration": StopAsyncIteration,
+    "MemoryError": MemoryError,
+    "RecursionError": RecursionError,
+    "group": lambda: ExceptionGroup("several", [ValueError(), KeyError()]),
+    "base group": lambda: BaseExceptionGroup("several", [KeyboardInterrupt()]),
+    "frozen": lambda: FrozenError(1),
+    "slotted": SlottedError,
+    "unannotated": UnannotatedError,
+    "foreign notes": with_foreign_notes,
+    "base": BaseError,
+    "circular": in_circles,
+    "warning": lambda: UserWarning("as an error"),
+}
+
+
+@VIEWS
+@pytest.mark.parametrize("place", PLACES)
+def test_any_error_anywhere_surfaces_as_itself_and_leaves_no_trace(view, place):
+    if view is single_env and place in ("agent", "removed_by", "choices", "expected_calls"):
+        return
+    fresh = run(farm_env(view, place), view)
+    env = farm_env(view, place)
+    farm = env.unwrapped.simulation
+    times = [1] if place in ("reset", "finally", "stop", "removed_by", "apply") else [1, 3]
+    for kind, make in ERRORS.items():
+        for fuse in times:
+            env.close()
+            farm.place, farm.fuse, farm.error = place, fuse, make()
+            with pytest.raises(type(farm.error)) as caught:
+                (cut_short if place in ("stop", "finally") else run)(env, view)
+            assert caught.value is farm.error, kind
+            assert "burn" in culprits(farm.error)
+            if kind != "foreign notes" and place != "render":
+                assert "seed 11" in notes(farm.error), kind
+            env.close()
+            farm.place = farm.error = None
+            del caught
+            nothing_is_left()
+            assert run(env, view) == fresh, kind
+    env.close()
+    nothing_is_left()
+    gone = weakref.ref(farm)
+    del env, farm
+    gc.collect()
+    assert gone() is None
+
+
+# -- interrupts -----------------------------------------------------------------------------------
+
+_PACKAGE = os.path.dirname(simenv_marl.__file__)
+
+
+def interrupt_at(number, function, *args):
+    """Call a function; raise a KeyboardInterrupt where Python looks for signals in this package, the given time.
+
+    That is where a function begins, and where a call of a builtin has returned.
+
+    Returns:
+        Where that was, None if it never was; and what the function has raised.
+    """
+    left, where, raised = number, None, None
+
+    def look(frame, event, arg):
+        nonlocal left, where
+        if event not in ("call", "c_return") or not frame.f_code.co_filename.startswith(_PACKAGE):
+            return
+        if frame.f_code.co_name in ("__exit__", "let_go"):
+            return  # where a ``with`` or ``finally`` ends: there nobody can help it
+        left -= 1
+        if left == 0:
+            sys.setprofile(None)
+            where = f"{os.path.basename(frame.f_code.co_filename)}:{frame.f_lineno} {event} {frame.f_code.co_name}"
+            raise KeyboardInterrupt
+
+    before = sys.getprofile()
+    sys.setprofile(look)
+    try:
+        function(*args)
+    except BaseException as error:
+        raised = error
+    finally:
+        sys.setprofile(before)
+    return where, raised
+
+
+@VIEWS
+def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view, monkeypatch):
+    monkeypatch.setattr("simenv_marl.core.threads.SECONDS_TO_UNWIND", 0.05)
+    decide = decision()
+
+    class Model(Script):
+        def reset(self, seed=None, options=None):
+            super().reset(seed, options)
+            decide()
+
+        def expected_calls(self, point):
+            return [()]
+
+    def main(simulation):
+        for _ in range(2):
+            simulation.log.append(decide())
+
+    def whole_run(env):
+        env.reset(seed=1)
+        for _ in range(2):
+            env.step({"choose_0": 3} if view in (parallel_env, joint_env) else 3)
+        if view is aec_env:
+            env.step(None)
+        env.reset(seed=2)
+        env.close()
+
+    for number in count(1):
+        env = view(lambda: Model(main), decide)
+        where, raised = interrupt_at(number, whole_run, env)
+        if where is None:
+            assert raised is None
+            break
+        assert type(raised) is KeyboardInterrupt, where
+        del raised
+        assert nobody_is_asked(), where
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)  # a thread that was never begun cannot be unwound
+            whole_run(env)
+            log = env.unwrapped.simulation.log
+            env.reset(seed=1)
+            env.step({"choose_0": 3} if view in (parallel_env, joint_env) else 3)
+            assert env.unwrapped.simulation.log == [3], (where, log)
+            env.close()
+        assert in_a_thread(env.close) is None, where  # nothing of it is left to this one
+    assert number > 100
+
+
+# -- the end of the stack -------------------------------------------------------------------------
+
+
+def deep_down(function, room):
+    """Call a function where there is room for so many more calls only."""
+
+    def down(left):
+        return function() if left <= 0 else down(left - 1)
+
+    here, frame = 0, sys._getframe()
+    while frame is not None:
+        here, frame = here + 1, frame.f_back
+    return down(sys.getrecursionlimit() - here - room)
+
+
+@VIEWS
+def test_an_environment_survives_the_end_of_its_users_stack(view):
+    decide = decision()
+
+    class Model(Script):
+        def expected_calls(self, point):
+            return [()]
+
+    def main(simulation):
+        try:
+            for _ in range(3):
+                simulation.log.append(decide())
+        finally:
+            simulation.log.append("unwound")
+
+    def step():
+        env.step({"choose_0": 3} if view in (parallel_env, joint_env) else 3)
+
+    env = view(lambda: Model(main), decide)
+    ends = set()
+    for room in range(1, 60):
+        env.reset()
+        log = env.unwrapped.simulation.log
+        for what in (step, env.reset, env.close):
+            try:
+                deep_down(what, room)
+                ends.add("went well")
+            except RecursionError:
+                ends.add("came to the end")
+            except ResetNeededError:
+                ends.add("was over")
+        env.reset()
+        assert log[-1] == "unwound"
+        for _ in range(3):
+            step()
+        assert env.unwrapped.simulation.log == [3, 3, 3, "unwound"]
+        assert nobody_is_asked()
+    assert ends >= {"went well", "came to the end"}
+
+
+@VIEWS
+@pytest.mark.parametrize("where", ["observation", "reward", "action", "rule", "model", "finally"])
+def test_a_runaway_recursion_surfaces_as_itself(view, where):
+    armed = []
+
+    def run_away():
+        return run_away() + 1
+
+    def at_place(place, value):
+        def mapping(*args):
+            if place in armed:
+                armed.remove(place)
+                run_away()
+            return value
+
+        return mapping
+
+    decide = decision(
+        lambda: at_place("rule", 0)(),
+        agent="choose_0",
+        observation_space_mapping=at_place("observation", [0, 0]),
+        reward_mapping=at_place("reward", 0.0),
+        action_space_mapping=at_place("action", 0),
+    )
+
+    class Model(Script):
+        def expected_calls(self, point):
+            return [()]
+
+    def main(simulation):
+        try:
+            for _ in range(3):
+                decide()
+                at_place("model", 0)()
+        finally:
+            at_place("finally", 0)()
+
+    def step(action=3):
+        action = RULE if where == "rule" else action
+        env.step({"choose_0": action} if view in (parallel_env, joint_env) and action is not RULE else action)
+
+    env = view(lambda: Model(main), decide)
+    for _ in range(2):
+        env.reset(seed=5)
+        step()
+        armed.append(where)
+        with pytest.raises(RecursionError) as caught:
+            env.close() if where == "finally" else step()
+        assert "run_away" in culprits(caught.value)  # a tracer may be the one that finds no room
+        assert "seed 5" in notes(caught.value)
+        env.reset()
+        for _ in range(3):
+            step()
+    env.close()

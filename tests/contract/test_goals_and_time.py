@@ -1,0 +1,760 @@
+"""What the views tell beside observations: goals, masks, the time, the state and pictures."""
+
+import math
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import api_test
+from pettingzoo.test.render_test import render_test
+from pettingzoo.utils import wrappers
+
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    DefinitionError,
+    InvalidActionError,
+    NotResetError,
+    ObservationError,
+    OptionValueError,
+    ViewError,
+    aec_env,
+    generate_env,
+    joint_env,
+    parallel_env,
+    simulate,
+    single_env,
+)
+from tests.worlds.many_worlds import Being, beings
+from tests.worlds.models import calling, decision, define, play, rewards_of, script
+
+VIEWS = {"aec": aec_env, "parallel": parallel_env, "single": single_env, "joint": joint_env}
+EVERY_VIEW = pytest.mark.parametrize("make", VIEWS.values(), ids=VIEWS.keys())
+
+
+# -- goals ----------------------------------------------------------------------------------------
+
+
+class Walker:
+    """Walks on a plane, and wants to come to some place."""
+
+    def __init__(self, seed):
+        rng = np.random.default_rng(seed)
+        self.place, self.goal, self.steps = np.zeros(2), rng.integers(-3, 4, 2).astype(float), 0
+
+    def walk(self, pace):
+        return np.array([pace, 0.0])
+
+
+class Walk:
+    def reset(self, seed=None):
+        self.walker = Walker(seed)
+
+    def run(self):
+        for _ in range(8):
+            self.walker.place += self.walker.walk(0.5)
+            self.walker.steps += 1
+        return TRUNCATED
+
+
+def distance(achieved, desired, info):
+    return -np.linalg.norm(achieved - desired, axis=-1)
+
+
+GOAL = {
+    "agent": "walker_0",
+    "observation_space": spaces.Box(-20, 20, (3,), np.float32),
+    "observation_space_mapping": lambda walker, pace: [*walker.place, walker.steps],
+    "action_space": spaces.Box(-1, 1, (2,), np.float32),
+    "action_space_mapping": lambda action: action.astype(float),
+    "reward_mapping": lambda walker, pace: distance(np.float32(walker.place), np.float32(walker.goal), None),
+    "goal_space": spaces.Box(-20, 20, (2,), np.float32),
+    "achieved_goal_mapping": lambda walker, pace: walker.place,
+    "desired_goal_mapping": lambda walker, pace: walker.goal,
+    "compute_reward": distance,
+}
+
+
+def goals(**changes):
+    return {Walker.walk: define(**GOAL | changes)}
+
+
+def test_observations_of_goals():
+    env = single_env(Walk, goals())
+    assert isinstance(env.observation_space, spaces.Dict)
+    assert set(env.observation_space.spaces) == {"observation", "achieved_goal", "desired_goal"}
+    assert env.observation_space["achieved_goal"] == env.observation_space["desired_goal"] == GOAL["goal_space"]
+    observation, _ = env.reset(seed=3)
+    assert observation in env.observation_space
+    assert observation["desired_goal"].tolist() == env.simulation.walker.goal.tolist()
+    observation, reward, *_ = env.step(np.array([0.5, -1], np.float32))
+    assert observation["achieved_goal"].tolist() == [0.5, -1]
+    assert observation["observation"].tolist() == [0.5, -1, 1]
+    assert observation["achieved_goal"].dtype == np.float32
+    assert type(reward) is float
+
+
+def test_goals_are_the_users_own():
+    env = single_env(Walk, goals())
+    first, _ = env.reset(seed=3)
+    first["desired_goal"][:] = 9
+    first["achieved_goal"][:] = 9
+    assert env.simulation.walker.place.tolist() == [0, 0]
+    second, *_ = env.step(np.zeros(2, np.float32))
+    assert second["desired_goal"].tolist() == env.simulation.walker.goal.tolist()
+    assert first["achieved_goal"].tolist() == [9, 9]
+
+
+def test_rewards_are_computed_anew_for_other_goals():
+    env = single_env(Walk, goals())
+    env.reset(seed=3)
+    told = [env.step(env.action_space.sample()) for _ in range(8)]
+    assert told[-1][2:4] == (False, True)
+    achieved = np.stack([observation["achieved_goal"] for observation, *_ in told])
+    desired = np.stack([observation["desired_goal"] for observation, *_ in told])
+    infos = np.array([info for *_, info in told])
+    rewards = env.compute_reward(achieved, desired, infos)
+    assert rewards.shape == (8,)
+    assert rewards.tolist() == [reward for _, reward, *_ in told]
+    relabelled = env.compute_reward(achieved, np.repeat(achieved[-1:], 8, 0), infos)
+    assert relabelled[-1] == 0.0
+    assert (relabelled <= 0).all()
+    for (observation, reward, _, _, info), batched in zip(told, rewards, strict=True):
+        one = env.compute_reward(observation["achieved_goal"], observation["desired_goal"], info)
+        assert type(one) is float
+        assert one == reward == batched
+
+
+def test_goals_as_stable_baselines_checks_them():
+    env = single_env(Walk, goals())
+    observation, _ = env.reset(seed=1)
+    observation, reward, _, _, info = env.step(env.action_space.sample())
+    achieved, desired = np.array(observation["achieved_goal"]), np.array(observation["desired_goal"])
+    assert env.compute_reward(achieved, desired, info) == reward
+    rewards = env.compute_reward(np.array([achieved] * 2), np.array([desired] * 2), np.array([info] * 2))
+    assert rewards.shape == (2,)
+    assert rewards[0] == reward
+
+
+def test_gymnasiums_check_of_goals():
+    check_env(single_env(Walk, goals()), skip_render_check=True)
+    check_env(generate_env(Walk, goals())(), skip_render_check=True)
+    check_env(single_env(Walk, goals(goal_space=spaces.Box(-20, 20, (2,), np.float64))), skip_render_check=True)
+
+
+def test_goals_need_all_of_their_parts():
+    for part in ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward"):
+        with pytest.raises(DefinitionError, match=part):
+            goals(**{part: None})
+    with pytest.raises(DefinitionError, match="must be a gymnasium space"):
+        goals(goal_space=(2,))
+    with pytest.raises(DefinitionError, match="compute_reward must be callable"):
+        goals(compute_reward=3)
+
+
+def test_goals_that_do_not_fit_their_space():
+    env = single_env(Walk, goals(achieved_goal_mapping=lambda walker, pace: [1, 2, 3]))
+    with pytest.raises(ObservationError, match="its space Box"):
+        env.reset()
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
+def test_other_views_observe_no_goals(make):
+    env = make(Walk, goals())
+    if make is joint_env:
+        assert env.observation_space["walker_0"] == GOAL["observation_space"]
+    else:
+        assert env.observation_space("walker_0") == GOAL["observation_space"]
+
+
+def test_goals_and_masks():
+    """A mask in the observation stays where it belongs."""
+    space = spaces.Dict({"place": spaces.Box(-20, 20, (2,), np.float32), "action_mask": spaces.MultiBinary(3)})
+    changes = {
+        "observation_space": space,
+        "observation_space_mapping": lambda walker, pace: {"place": walker.place},
+        "action_space": spaces.Discrete(3),
+        "action_space_mapping": lambda action: np.array([action - 1.0, 0]),
+        "action_mask_mapping": lambda walker, pace: [1, 0, 1],
+    }
+    env = single_env(Walk, goals(**changes))
+    observation, info = env.reset()
+    assert observation in env.observation_space
+    assert info["action_mask"].tolist() == [1, 0, 1]
+    assert observation["observation"]["action_mask"].tolist() == [1, 0, 1]
+    with pytest.raises(InvalidActionError, match="is masked"):
+        env.step(1)
+
+
+def test_goals_and_masks_in_infos():
+    changes = {
+        "action_space": spaces.Discrete(3),
+        "action_space_mapping": lambda action: np.array([action - 1.0, 0]),
+        "action_mask_mapping": lambda walker, pace: [1, 0, 1],
+    }
+    env = single_env(Walk, goals(**changes))
+    _, info = env.reset()
+    assert info["action_mask"].tolist() == [1, 0, 1]
+    observation, *_ = env.step(2)
+    assert observation["achieved_goal"].tolist() == [1, 0]
+
+
+def test_goals_within_gymnasiums_wrappers():
+    env = gymnasium.wrappers.FlattenObservation(single_env(Walk, goals()))
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == (7,)
+    vector = gymnasium.vector.SyncVectorEnv([lambda: single_env(Walk, goals())] * 2)
+    observations, _ = vector.reset(seed=0)
+    assert observations["achieved_goal"].shape == (2, 2)
+    vector.close()
+
+
+def test_with_rule_throughout_goals_change_nothing():
+    plain = Walk()
+    plain.reset(4)
+    plain.run()
+    env = single_env(Walk, goals())
+    env.reset(seed=4)
+    while not any(env.step(RULE)[2:4]):
+        pass
+    assert env.simulation.walker.place.tolist() == plain.walker.place.tolist()
+
+
+# -- masks ----------------------------------------------------------------------------------------
+
+
+def test_masks_on_request():
+    """The method that sb3-contrib's MaskablePPO calls before each step, through whatever wrappers there are."""
+    legal = iter([[1, 0], [0, 1], [1, 1]])
+    ant = decision(agent="ant_0", action_space=spaces.Discrete(2), action_mask_mapping=lambda: next(legal))
+    env = gymnasium.wrappers.RecordEpisodeStatistics(single_env(calling(ant, ant), ant))
+    masks = env.get_wrapper_attr("action_masks")
+    with pytest.raises(NotResetError, match="no episode yet"):
+        masks()
+    env.reset()
+    assert masks().dtype == np.bool_
+    assert masks().tolist() == [True, False]
+    env.step(0)
+    assert masks().tolist() == [False, True]
+    env.step(1)
+    assert masks().tolist() == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("space", "number"), [(spaces.Discrete(3, start=2), 3), (spaces.MultiDiscrete([2, 3]), 5)], ids=str
+)
+def test_masks_on_request_where_everything_is_legal(space, number):
+    ant = decision(agent="ant_0", action_space=space)
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True] * number
+
+
+def test_masks_on_request_of_choices_and_of_several_parts():
+    ant = decision(agent="ant_0", choices=lambda: "ab", action_space=spaces.Discrete(4))
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True, True, False, False]
+    ant = decision(
+        agent="ant_0",
+        action_space=spaces.MultiDiscrete([2, 3]),
+        action_mask_mapping=lambda: ([1, 0], [0, 1, 1]),
+    )
+    env = single_env(calling(ant), ant)
+    env.reset()
+    assert env.action_masks().tolist() == [True, False, False, True, True]
+
+
+def test_continuous_actions_have_no_masks():
+    env = single_env(Walk, goals())
+    env.reset()
+    with pytest.raises(ViewError, match="masks of Discrete and MultiDiscrete"):
+        env.action_masks()
+
+
+def masks(**changes):
+    return {"action_mask_mapping": lambda *_: [1] * 4 + [0] * 6, **changes}
+
+
+@EVERY_VIEW
+def test_masks_in_every_view(make):
+    ant = decision(agent="ant_0", **masks())
+    env = make(calling(ant, ant), ant)
+    result = env.reset(seed=1)
+    told = {aec_env: lambda: env.infos["ant_0"], joint_env: lambda: {"action_mask": result[1]["action_mask"]["ant_0"]}}
+    told |= {parallel_env: lambda: result[1]["ant_0"], single_env: lambda: result[1]}
+    mask = told[make]()["action_mask"]
+    assert mask.tolist() == [1] * 4 + [0] * 6
+    assert mask.dtype == np.int8
+    together = make in (parallel_env, joint_env)
+    with pytest.raises(InvalidActionError, match="is masked"):
+        env.step({"ant_0": 4} if together else 4)
+    mask[:] = 1  # the user's own
+    with pytest.raises(InvalidActionError, match="is masked"):
+        env.step({"ant_0": 4} if together else 4)
+    env.step({"ant_0": 3} if together else 3)
+    assert env.simulation.log == [3]
+
+
+@EVERY_VIEW
+def test_choices_in_every_view(make):
+    lists = iter([["a", "b"], ["c"]])
+    ant = decision(agent="ant_0", choices=lambda: offered[-1], action_space=spaces.Discrete(3))
+    offered = []
+
+    def main(simulation):
+        for choices in lists:
+            offered.append(choices)
+            simulation.log.append(ant())
+
+    env = make(script(main), ant)
+    env.reset()
+    together = make in (parallel_env, joint_env)
+    with pytest.raises(InvalidActionError, match="is masked"):
+        env.step({"ant_0": 2} if together else 2)
+    env.step({"ant_0": 1} if together else 1)
+    assert env.simulation.log == ["b"]
+    with pytest.raises(InvalidActionError, match="is masked"):
+        env.step({"ant_0": 1} if together else 1)
+    env.step({"ant_0": 0} if together else 0)
+    assert env.simulation.log == ["b", "c"]
+
+
+def test_masks_of_several_parts():
+    space = spaces.MultiDiscrete([2, 3])
+    ant = decision(
+        agent="ant_0",
+        action_space=space,
+        action_space_mapping=lambda action: action.tolist(),
+        action_mask_mapping=lambda: ([1, 0], [0, 1, 1]),
+    )
+    env = parallel_env(calling(ant, ant), ant)
+    _, infos = env.reset()
+    mask = infos["ant_0"]["action_mask"]
+    assert [part.tolist() for part in mask] == [[1, 0], [0, 1, 1]]
+    assert space.contains(space.sample(mask))
+    with pytest.raises(InvalidActionError, match="is masked"):
+        env.step({"ant_0": np.array([1, 1])})
+    env.step({"ant_0": np.array([0, 2])})
+    assert env.simulation.log == [[0, 2]]
+
+
+def announcing(main):
+    class Announcing:
+        def reset(self, seed=None):
+            self.beings, self.log, self.clock = [Being(number) for number in range(3)], [], 0
+
+        def run(self):
+            return main(self)
+
+        def expected_calls(self, point):
+            return [(being,) for being in self.beings]
+
+        def time(self):
+            return self.clock
+
+    return Announcing
+
+
+def one_after_the_other(simulation):
+    for number, being in enumerate(simulation.beings * 2):
+        simulation.clock = number * number
+        simulation.log.append(being.act())
+    simulation.clock = 100
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_masks_of_those_who_are_announced(make):
+    env = make(announcing(one_after_the_other), beings(**masks()))
+    result = env.reset()
+    infos = env.infos if make is aec_env else result[1]
+    for number in range(3):
+        assert infos[f"being_{number}"]["action_mask"].tolist() == [1] * 4 + [0] * 6
+
+
+# -- time -----------------------------------------------------------------------------------------
+
+
+class Clock:
+    """Decisions at given times."""
+
+    def __init__(self, *calls, end):
+        self.calls, self.end = calls, end
+
+    def reset(self):
+        self.now = -1.0
+
+    def run(self):
+        for time, decide in self.calls:
+            self.now = time
+            decide()
+        self.now = self.end
+
+    def time(self):
+        return self.now
+
+
+def times(turns, agent):
+    return [(turn.info["time"], turn.info["elapsed"]) for turn in turns if turn.agent == agent]
+
+
+def test_the_time_and_what_has_gone_by_since_the_agents_decision_before():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    env = aec_env(lambda: Clock((0, ant), (2, bee), (2.5, ant), (7, ant), (7, bee), end=11), [ant, bee])
+    for _ in range(2):
+        turns = play(env, 1)
+        assert times(turns, "ant_0") == [(0, 0), (2.5, 2.5), (7, 4.5), (11, 4)]
+        assert times(turns, "bee_0") == [(2, 0), (7, 5), (11, 4)]
+    assert {type(value) for turn in turns for value in turn.info.values()} == {float}
+
+
+def test_the_time_of_the_single_view():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    env = single_env(lambda: Clock((np.int64(1), ant), (2, bee), (3, ant), end=4), ant)
+    assert env.reset()[1] == {"time": 1.0, "elapsed": 0.0}
+    assert env.step(1)[-1] == {"time": 3.0, "elapsed": 2.0}
+    assert env.step(RULE)[-1] == {"time": 4.0, "elapsed": 1.0}
+
+
+def test_an_action_that_is_refused_takes_no_time():
+    ant = decision(agent="ant_0")
+    env = single_env(lambda: Clock((1, ant), (3, ant), end=4), ant)
+    env.reset()
+    with pytest.raises(InvalidActionError, match="is not in its action space"):
+        env.step(10)
+    assert env.step(1)[-1] == {"time": 3.0, "elapsed": 2.0}
+
+
+def test_a_semi_markov_discount():
+    """What the docs say the time is for: rewards of long decisions count for longer."""
+    ant = decision(agent="ant_0", reward_mapping=lambda: 1.0)
+    env = single_env(lambda: Clock((0, ant), (1, ant), (4, ant), end=6), ant)
+    env.reset()
+    discount, total, over = 1.0, 0.0, False
+    while not over:
+        _, reward, over, _, info = env.step(1)
+        discount *= 0.5 ** info["elapsed"]
+        total += discount * reward
+    assert total == 0.5**1 + 0.5**4 + 0.5**6
+
+
+def test_the_time_of_the_dead():
+    def main(simulation):
+        one, two, _ = simulation.beings
+        one.act()
+        simulation.clock = 3
+        two.act()
+        simulation.clock = 5
+        one.leave()
+        simulation.clock = 8
+        two.act()
+
+    turns = play(aec_env(announcing(main), beings()), 1)
+    ends = {turn.agent: turn.info for turn in turns if turn.terminated}
+    assert ends["being_0"] == {"time": 5.0, "elapsed": 5.0}
+    assert times(turns, "being_1") == [(3, 0), (8, 5), (8, 0)]
+
+
+def test_the_time_in_turns():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    env = parallel_env(lambda: Clock((0, ant), (2, bee), (3, ant), (7, bee), end=11), [ant, bee])
+    _, infos = env.reset()
+    assert (infos["ant_0"]["time"], infos["ant_0"]["elapsed"]) == (0, 0)
+    told = []
+    while env.agents:
+        agent = next(agent for agent in env.agents if infos[agent]["deciding"])
+        *_, infos = env.step({agent: 1})
+        told.append({name: (info.get("time"), info.get("elapsed")) for name, info in infos.items()})
+    assert told == [
+        {"ant_0": (2, 2), "bee_0": (2, 0)},
+        {"ant_0": (3, 3), "bee_0": (3, 1)},
+        {"ant_0": (7, 4), "bee_0": (7, 5)},
+        {"ant_0": (11, 8), "bee_0": (11, 4)},
+    ]
+
+
+def test_the_time_of_rounds_in_which_all_are_known():
+    env = parallel_env(announcing(one_after_the_other), beings())
+    _, infos = env.reset()
+    assert {(info["time"], info["elapsed"]) for info in infos.values()} == {(0.0, 0.0)}
+    *_, infos = env.step(dict.fromkeys(env.agents, 1))
+    assert {info["time"] for info in infos.values()} == {9.0}
+    assert infos["being_0"]["elapsed"] == 9.0
+    assert all(0 < info["elapsed"] <= 9 for info in infos.values())
+
+
+def test_time_has_gone_by_for_those_who_act_as_soon_as_they_are_seen():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    env = parallel_env(lambda: Clock((0, ant), (5, bee), (7, ant), end=9), [ant, bee])
+    env.reset()
+    *_, infos = env.step({"ant_0": 1, "bee_0": 1})
+    assert infos["ant_0"]["elapsed"] == 7.0
+    assert infos["bee_0"]["time"] == 7.0
+    assert infos["bee_0"]["elapsed"] > 0  # since 5, when it decided, or since 0, when its action was chosen
+
+
+def test_the_time_of_the_joint_view():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    env = joint_env(lambda: Clock((0, ant), (5, bee), (7, ant), end=9), [ant, bee])
+    _, info = env.reset()
+    assert info["time"] == 0.0
+    assert env.step({"ant_0": 1, "bee_0": 1})[-1]["time"] == 7.0
+
+
+def test_policies_know_the_time():
+    ant, seen = decision(agent="ant_0"), []
+    simulate(lambda: Clock((1, ant), (3, ant), end=4), {ant: lambda observation, info: seen.append(dict(info)) or 1})
+    assert [info["time"] for info in seen] == [1.0, 3.0]
+
+
+@pytest.mark.parametrize("action", [1, RULE])
+def test_policies_know_how_much_time_has_gone_by(action):
+    """Since the decision before, whether the policy has taken that or left it to the rule."""
+    ant, seen = decision(agent="ant_0"), []
+
+    def policy(observation, info):
+        seen.append(info["elapsed"])
+        return action
+
+    simulate(lambda: Clock((1, ant), (3, ant), (7, ant), end=8), {ant: policy})
+    assert seen == [0.0, 2.0, 4.0]
+
+
+def test_without_a_clock_there_is_no_time():
+    ant = decision(agent="ant_0")
+    assert single_env(calling(ant), ant).reset()[1] == {}
+
+
+# -- the state ------------------------------------------------------------------------------------
+
+
+class Counted:
+    """A simulation that tells its state."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def reset(self):
+        self.numbers = np.array([0, 0])
+
+    def run(self):
+        for number in range(3):
+            self.numbers[0] = number
+            self.numbers[1] += self.function()
+
+    def state(self):
+        return self.numbers
+
+
+@EVERY_VIEW
+def test_the_state_is_a_copy_of_the_simulations(make):
+    ant = decision(agent="ant_0")
+    env = make(lambda: Counted(ant), ant)
+    env.reset()
+    state = env.state()
+    assert state.tolist() == [0, 0]
+    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    assert state.tolist() == [0, 0]
+    assert env.state().tolist() == [1, 4]
+    state = env.state()
+    state[:] = 9
+    assert env.simulation.numbers.tolist() == [1, 4]
+    assert env.state_space is None
+
+
+@EVERY_VIEW
+def test_the_state_is_in_its_space(make):
+    ant, space = decision(agent="ant_0"), spaces.Box(-9, 9, (2,), np.float32)
+    env = make(lambda: Counted(ant), ant, state_space=space)
+    assert env.state_space == space
+    env.reset()
+    state = env.state()
+    assert state.dtype == np.float32
+    assert state in env.state_space
+
+
+def test_states_that_cannot_be():
+    ant = decision(agent="ant_0")
+    env = parallel_env(lambda: Counted(ant), ant, state_space=spaces.Box(-9, 9, (3,), np.float32))
+    env.reset()
+    with pytest.raises(ObservationError, match="the observation has shape"):
+        env.state()
+    with pytest.raises(OptionValueError, match="must be a gymnasium space"):
+        aec_env(lambda: Counted(ant), ant, state_space=3)
+    env = parallel_env(calling(ant), ant)
+    env.reset()
+    with pytest.raises(NotImplementedError):
+        env.state()
+
+
+def seeing(number):
+    """What is observed: a pair, or one of three."""
+    return {
+        "agent": ("ant_0", "bee_0")[number],
+        "observation_space": (spaces.Box(0, 9, (2,), np.float32), spaces.Discrete(3))[number],
+        "observation_space_mapping": (lambda: [1, 2], lambda: 2)[number],
+    }
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_the_state_may_be_what_all_observe(make):
+    ant, bee = decision(**seeing(0)), decision(**seeing(1))
+    env = make(calling(ant, bee), [ant, bee], state_space="observations")
+    assert (env.state_space.low.tolist(), env.state_space.high.tolist()) == ([0] * 5, [9, 9, 1, 1, 1])
+    assert env.state_space is env.state_space
+    with pytest.raises(NotResetError, match="no episode yet"):
+        env.state()
+    env.reset()
+    assert env.state().tolist() == [1, 2, 1, 0, 0]  # the second has not been observed yet
+    env.step({"ant_0": 4} if make is parallel_env else 4)
+    state = env.state()
+    assert state.tolist() == [1, 2, 0, 0, 1]
+    assert state in env.state_space
+    while env.agents:
+        env.step(RULE)
+    assert env.state().tolist() == [1, 2, 0, 0, 1]
+
+
+@pytest.mark.parametrize("make", [single_env, joint_env])
+def test_the_state_may_be_what_one_observes(make):
+    ant = decision(**seeing(0))
+    env = make(calling(ant), ant, state_space="observations")
+    env.reset()
+    assert env.state().tolist() == [1, 2]
+    assert env.state() in env.state_space
+
+
+def test_states_of_observations_that_cannot_be():
+    for space in (spaces.Sequence(spaces.Discrete(3)), spaces.Graph(spaces.Discrete(3), None)):
+        ant = decision(agent="ant_0", observation_space=space)
+        with pytest.raises(ViewError, match="flattened"):
+            _ = aec_env(calling(ant), ant, state_space="observations").state_space
+    with pytest.raises(ViewError, match="possible_agents"):
+        parallel_env(announcing(one_after_the_other), beings(), state_space="observations")
+    with pytest.raises(OptionValueError, match="must be a gymnasium space"):
+        aec_env(calling(ant), ant, state_space="rewards")
+
+
+# -- pictures -------------------------------------------------------------------------------------
+
+
+class Painted(Counted):
+    """A simulation that can be rendered."""
+
+    def render(self, mode):
+        if mode == "rgb_array":
+            return np.full((4, 6, 3), self.numbers[1], np.uint8)
+        if mode == "human":
+            print(f"now {self.numbers[1]}")
+            return None
+        return f"now {self.numbers[1]}"
+
+
+def painted(make=aec_env, **options):
+    ant = decision(agent="ant_0")
+    return make(lambda: Painted(ant), ant, **options)
+
+
+@EVERY_VIEW
+def test_rendering(make):
+    env = painted(make, render_mode="ansi")
+    assert env.render_mode == "ansi"
+    assert env.metadata["render_modes"] == ["ansi", "human", "rgb_array"]
+    env.reset()
+    assert env.render() == "now 0"
+    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    assert env.render() == "now 4"
+    env = painted(make, render_mode="rgb_array")
+    env.reset()
+    picture = env.render()
+    assert picture.shape == (4, 6, 3)
+    assert picture.dtype == np.uint8
+    env.close()
+
+
+@EVERY_VIEW
+def test_rendering_for_people(make, capsys):
+    env = painted(make, render_mode="human")
+    env.reset()
+    assert capsys.readouterr().out == "now 0\n"
+    env.step({"ant_0": 4} if make in (parallel_env, joint_env) else 4)
+    assert capsys.readouterr().out == "now 4\n"
+    assert env.render() is None
+    assert capsys.readouterr().out == "now 4\n"
+
+
+@EVERY_VIEW
+def test_rendering_that_cannot_be(make):
+    with pytest.raises(OptionValueError, match="is not one of the simulation's"):
+        painted(make, render_mode="video")
+    ant = decision(agent="ant_0")
+    with pytest.raises(OptionValueError, match="is not one of the simulation's"):
+        make(lambda: Counted(ant), ant, render_mode="ansi")
+    env = painted(make)
+    env.reset()
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
+
+
+def test_what_is_rendered_runs_the_rule():
+    ant = decision(agent="ant_0")
+
+    class Curious(Painted):
+        def render(self, mode):
+            return ant()
+
+    env = aec_env(lambda: Curious(lambda: ant() and 1), ant, render_mode="ansi")
+    env.reset()
+    assert env.render() == "rule"
+    assert env.agent_selection == "ant_0"
+
+
+@pytest.mark.parametrize("make", [single_env, joint_env])
+def test_gymnasium_collects_pictures(make):
+    env = gymnasium.wrappers.RenderCollection(painted(make, render_mode="rgb_array"))
+    env.reset()
+    for _ in range(2):
+        env.step({"ant_0": 4} if make is joint_env else 4)
+    assert [frame.max() for frame in env.render()] == [0, 4, 8]
+
+
+@pytest.mark.parametrize("make", [single_env, joint_env])
+@pytest.mark.parametrize("mode", ["ansi", "rgb_array", None])
+def test_gymnasiums_check_with_pictures(make, mode):
+    with warnings.catch_warnings():
+        # Other render modes can be tested on registered environments alone.
+        warnings.filterwarnings("ignore", message=".*Not able to test alternative render modes")
+        check_env(painted(make, render_mode=mode), skip_render_check=mode is None)
+
+
+def test_pettingzoo_renders(capsys):
+    with warnings.catch_warnings():
+        # PettingZoo's test renders pictures in one mode after the other.
+        warnings.filterwarnings("ignore", message=".*")
+        render_test(lambda render_mode: painted(render_mode=render_mode))
+    env = wrappers.CaptureStdoutWrapper(painted(render_mode="human"))
+    env.reset()
+    assert env.render() == "now 0\n"
+    api_test(painted(render_mode="ansi"), num_cycles=5)
+    capsys.readouterr()
+
+
+# -- all of it ------------------------------------------------------------------------------------
+
+
+def test_rewards_and_infos_of_a_simulation_that_tells_everything():
+    class Everything(Painted):
+        def time(self):
+            return float(self.numbers[0])
+
+        def expected_calls(self, point):
+            return [()]
+
+    ant = decision(agent="ant_0", reward_mapping=lambda: 2.0, **masks())
+    turns = play(aec_env(lambda: Everything(ant), ant, render_mode="ansi"), 3)
+    assert rewards_of(turns, "ant_0") == [2.0, 2.0, 2.0]
+    assert all(math.isfinite(turn.info["time"]) and "action_mask" in turn.info for turn in turns)
+    assert [turn.info["elapsed"] for turn in turns] == [0.0, 1.0, 1.0, 0.0]

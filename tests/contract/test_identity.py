@@ -1,0 +1,250 @@
+"""An environment never changes what it is made of: random models of processes, in random use, in all views."""
+
+import gc
+from collections import Counter
+
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simenv_marl import (
+    RULE,
+    InvalidActionError,
+    ResetNeededError,
+    SimEnvError,
+    aec_env,
+    joint_env,
+    parallel_env,
+    simulate,
+    single_env,
+)
+from tests.worlds import random_worlds
+from tests.worlds.models import play
+from tests.worlds.random_worlds import PLAN, POINTS, ROSTER, Yard, advised, designs, outcome, plain, seeds
+
+VIEWS = (aec_env, parallel_env, joint_env, single_env)
+
+
+def seeing(machine_or_yard, *args, **kwargs):
+    """A handler that changes nothing."""
+
+
+PLUGINS = [
+    (seeing, f"{random_worlds.__name__}.{target}", position)
+    for target, position in (
+        ("Yard.note", "before"), ("Yard.note", "after"), ("Yard.plan", "before"), ("Yard.plan", "after"),
+        ("Machine.load", "after"), ("Machine.pace", "before"), ("Machine.work", "before_next"),
+        ("Machine.work", "after_next"), ("Yard.scrap", "before"), ("Yard.manage", "after_next"),
+    )
+]  # fmt: skip
+OPTIONS = st.sampled_from([{}, {"plugins": PLUGINS}, {"global_rng": True}, {"state_space": spaces.Box(0, 1e4, (2,))}])
+
+
+def made(view, design, **options):
+    """An environment of a yard."""
+    if view is joint_env:
+        options["possible_agents"] = ROSTER
+    return view(lambda: Yard(design), PLAN if view is single_env else POINTS, render_mode="ansi", **options)
+
+
+def played(env, seed):
+    """Play an environment as advised, a parallel one in turns; return who has decided, and what each was paid."""
+    decided, totals = [], Counter()
+    if hasattr(env, "last"):
+        env.reset(seed=seed)
+        for agent in env.agent_iter():
+            observation, reward, terminated, truncated, _ = env.last()
+            totals[agent] += reward
+            action = None if terminated or truncated else advised(observation)
+            if action is not None:
+                decided.append(agent)
+            env.step(action)
+        return decided, totals
+    observations, infos = env.reset(seed=seed)
+    while env.agents:
+        given = {agent: advised(observations[agent]) for agent in env.agents if infos[agent]["deciding"]}
+        observations, rewards, _, _, infos = env.step(given)
+        for agent, reward in rewards.items():
+            totals[agent] += reward
+        decided += [agent for agent in given if infos[agent]["acted"]]
+    return decided, totals
+
+
+# -- one model, many readings ---------------------------------------------------------------------
+
+
+@given(designs, seeds, OPTIONS)
+@settings(max_examples=150)
+def test_with_rule_throughout_every_view_is_the_plain_run(design, seed, options):
+    expected = outcome(plain(design, seed))
+    for view in VIEWS:
+        env = made(view, design, **options)
+        if view is aec_env:
+            play(env, RULE, seed=seed)
+        elif view is parallel_env:
+            env.reset(seed=seed)
+            while env.agents:
+                env.step(dict.fromkeys(env.agents, RULE))
+        else:
+            env.reset(seed=seed)
+            while not any(env.step(RULE)[2:4]):
+                pass
+        assert outcome(env.unwrapped.simulation) == expected, view
+        env.close()
+    assert outcome(simulate(lambda: Yard(design), points=POINTS, seed=seed, **options)) == expected
+    assert outcome(simulate(lambda: Yard(design), dict.fromkeys(POINTS, RULE), seed=seed, **options)) == expected
+
+
+@given(designs, seeds, OPTIONS)
+@settings(max_examples=150)
+def test_the_views_agree_in_decisions_rewards_and_outcome(design, seed, options):
+    aec, turns = made(aec_env, design, **options), made(parallel_env, design, **options)
+    decided, totals = played(aec, seed)
+    expected = outcome(aec.unwrapped.simulation)
+    policies = dict.fromkeys(POINTS, advised)
+    assert outcome(simulate(lambda: Yard(design), policies, points=POINTS, seed=seed, **options)) == expected
+    decided_in_turns, totals_in_turns = played(turns, seed)
+    assert (decided_in_turns, outcome(turns.simulation)) == (decided, expected)
+    assert {agent: totals_in_turns[agent] for agent in totals} == totals
+
+
+@given(designs, seeds)
+@settings(max_examples=100)
+def test_policies_for_the_others_are_as_good_as_their_user(design, seed):
+    everybody = made(aec_env, design)
+    _, totals = played(everybody, seed)
+    others = {name: advised for name in POINTS if name not in PLAN}
+    env = single_env(lambda: Yard(design), POINTS, policies=others)
+    observation, _ = env.reset(seed=seed)
+    total, ended = 0.0, False
+    while not ended:
+        observation, reward, terminated, truncated, _ = env.step(advised(observation))
+        total += reward
+        ended = terminated or truncated
+    assert outcome(env.unwrapped.simulation) == outcome(everybody.unwrapped.simulation)
+    assert total == totals["planner"]
+
+
+# -- random use -----------------------------------------------------------------------------------
+
+
+class Player:
+    """Uses an environment, and keeps what it was told and what it has answered."""
+
+    def __init__(self, view, design, options):
+        self.view, self.design, self.options = view, design, options
+        self.env = made(view, design, **options)
+        self.seed, self.actions, self.told = None, [], []
+        self.over = True
+
+    def reset(self, seed):
+        self.seed, self.actions = seed, []
+        self.told = [str(self.env.reset(seed=seed)), *self.look()]
+        self.over = False
+
+    def step(self, action):
+        """Take a step; those that decide take an integer, or the rule."""
+        if self.over:
+            return
+        self.actions.append(action)
+        env = self.env
+        if self.view is aec_env:
+            result = env.step(None if self.ended() else action)
+            self.over = not env.agents
+        elif self.view is parallel_env:
+            result = env.step(dict.fromkeys(env.agents[: 1 + len(self.actions) % 4], action))
+            self.over = not env.agents
+        else:
+            joint = self.view is joint_env and action is not RULE
+            result = env.step(dict.fromkeys(env.action_space, action) if joint else action)
+            self.over = result[2] or result[3]
+        self.told += [str(result), *self.look()]
+
+    def ended(self):
+        """Whether the episode of the agent that is selected has ended."""
+        return self.env.terminations[self.env.agent_selection] or self.env.truncations[self.env.agent_selection]
+
+    def look(self):
+        """Look at everything that there is to be seen; nothing changes for that."""
+        env, seen = self.env, []
+        if self.view is aec_env and env.agents:
+            seen += [env.agent_selection, str(env.last()), str(env.rewards), str(env.infos)]
+            seen += [str(env.observe(agent)) for agent in env.agents]
+        return [*seen, str(env.unwrapped.state()), env.render()]
+
+    def err(self):
+        """Do what is refused."""
+        actions = ["nonsense", -1, None]
+        if self.view is aec_env and not self.over and self.ended():
+            actions = ["nonsense"]  # None is its legal action
+        for action in actions:
+            with pytest.raises(InvalidActionError if not self.over else SimEnvError):
+                self.env.step(action)
+
+    def close(self):
+        self.env.close()
+        self.over, self.seed = True, None
+        with pytest.raises(ResetNeededError, match="call reset"):
+            self.env.step(RULE)
+
+    def replayed(self):
+        """The same in an environment of its own, where nobody looks and nothing else happens."""
+        other = Player(self.view, self.design, self.options)
+        other.reset(self.seed)
+        for action in self.actions:
+            other.step(action)
+        assert other.told == self.told
+        return other
+
+    def check(self):
+        """What was told so far, and what the model has come to, is what it would have been alone."""
+        if self.seed is not None:
+            other = self.replayed()
+            ours, theirs = self.env.unwrapped.simulation, other.env.unwrapped.simulation
+            assert (ours.trace, ours.random.getstate()) == (theirs.trace, theirs.random.getstate())
+            other.env.close()
+
+
+uses = st.lists(
+    st.tuples(
+        st.integers(0, 2),
+        st.sampled_from(["step", "step", "step", "rule", "rule", "reset", "close", "look", "err", "plain", "gc"]),
+        st.integers(0, 9),
+    ),
+    min_size=5,
+    max_size=40,
+)
+
+
+@given(designs, st.lists(st.tuples(st.sampled_from(VIEWS), OPTIONS), min_size=3, max_size=3), uses)
+@settings(max_examples=200)
+def test_whatever_is_done_with_some_environments_each_is_as_if_it_were_alone(design, kinds, sequence):
+    players = [Player(view, design, options) for view, options in kinds]
+    for which, what, number in sequence:
+        player = players[which]
+        if what in ("step", "rule"):
+            if player.seed is None:
+                player.reset(number)
+            player.step(RULE if what == "rule" else number)
+        elif what == "reset":
+            player.check()
+            player.reset(number)
+        elif what == "close":
+            player.check()
+            player.close()
+        elif what == "look":
+            before = player.env.unwrapped.simulation.__dict__.get("trace", [])[:]
+            if player.seed is not None and not player.over:
+                assert player.look() == player.look()
+                assert player.env.unwrapped.simulation.trace == before
+        elif what == "err":
+            player.err()
+        elif what == "plain":
+            assert outcome(plain(design, number)) == outcome(plain(design, number))
+        else:
+            gc.collect(0)
+    for player in players:
+        if not player.over:
+            player.check()
+        player.env.close()

@@ -1,0 +1,535 @@
+"""Mesa's own example models, unmodified: births and deaths in the hundreds, addressed by names from outside.
+
+They are made and run in other ways since Mesa 3.5, which is nobody's business beyond the section that makes them.
+"""
+
+import gc
+import warnings
+from collections import Counter
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from mesa import Agent
+from mesa.examples.advanced.pd_grid.agents import PDAgent
+from mesa.examples.advanced.pd_grid.model import PdGrid
+from mesa.examples.advanced.wolf_sheep import model as wolf_sheep
+from mesa.examples.advanced.wolf_sheep.agents import GrassPatch, Sheep, Wolf
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+
+from simenv_marl import RULE, TRUNCATED, AgentError, aec_env, difference, joint_env, make_step, parallel_env, simulate
+from tests.worlds.models import play
+
+EXAMPLES = "mesa.examples.advanced"
+UNTOUCHED = [
+    (owner, name, vars(owner)[name])
+    for owner, name in ((Wolf, "move"), (Sheep, "move"), (Agent, "remove"), (PDAgent, "step"))
+]
+
+# -- the models of either line of Mesa ------------------------------------------------------------
+
+SCENARIOS = hasattr(wolf_sheep, "WolfSheepScenario")
+"""Whether models take scenarios and keep their own time, as from Mesa 3.5 on."""
+
+
+def wolves_and_sheep(seed, size):
+    """Returns WolfSheep, what runs it for a while and knows the time, and what holds the events that are to come."""
+    if SCENARIOS:
+        model = wolf_sheep.WolfSheep(wolf_sheep.WolfSheepScenario(rng=seed, **size))
+        return model, model, model._event_list
+    from mesa.experimental.devs import ABMSimulator
+
+    simulator = ABMSimulator()
+    return wolf_sheep.WolfSheep(simulator=simulator, seed=seed, **size), simulator, simulator.event_list
+
+
+def dilemma(width, order, seed):
+    return PdGrid(width, width, activation_order=order, **{"rng" if SCENARIOS else "seed": seed})
+
+
+def advances_in_its_step(prisoner):
+    """Whether the rule carries out what it has decided; else the model has it done."""
+    return not SCENARIOS and prisoner.model.activation_order != "Simultaneous"
+
+
+# -- wolves and sheep -----------------------------------------------------------------------------
+
+
+class Pasture:
+    """WolfSheep for some ticks, with everything noted that there is to know of it."""
+
+    ticks, size = 25, {}
+
+    def reset(self, seed=None):
+        self.model, self.clock, self.event_list = wolves_and_sheep(seed, self.size)
+        self.states = [self.state_of_everything()]
+
+    def run(self):
+        for _ in range(self.ticks):
+            self.clock.run_for(1)
+            self.states.append(self.state_of_everything())
+        return TRUNCATED
+
+    def time(self):
+        return self.clock.time
+
+    def animals(self, kind):
+        return self.model.agents_by_type.get(kind, ())
+
+    def events(self):
+        """What is to come, in its order: the ids count all events of the process."""
+        events = sorted(self.event_list._events, key=lambda event: event.unique_id)
+        return [(event.time, event.priority) for event in events]
+
+    def state_of_everything(self):
+        model = self.model
+        return (
+            [(a.unique_id, a.energy, a.cell.coordinate) for kind in (Wolf, Sheep) for a in self.animals(kind)],
+            [patch.fully_grown for patch in model.agents_by_type[GrassPatch]],
+            {cell.coordinate: [a.unique_id for a in cell.agents] for cell in model.grid},
+            self.events(),
+            model.random.getstate(),
+            model.rng.bit_generator.state,
+            [counts[-1] for counts in model.datacollector.model_vars.values()],
+        )
+
+
+class AnnouncedPasture(Pasture):
+    def expected_calls(self, point):
+        return [(animal,) for animal in self.animals(Wolf if ".Wolf." in point else Sheep)]
+
+
+class Meadow(Pasture):
+    """A small one."""
+
+    ticks, size = 8, {"width": 6, "height": 6, "initial_sheep": 14, "initial_wolves": 6}
+
+
+class AnnouncedMeadow(Meadow, AnnouncedPasture):
+    pass
+
+
+def go(action, animal):
+    cells = list(animal.cell.neighborhood)
+    animal.cell = cells[action % len(cells)]
+
+
+def energy(animal):
+    assert animal.cell is not None, "an animal that is gone is not to be looked at"
+    return animal.energy
+
+
+def animals(kind, **changes):
+    return make_step(
+        **{
+            "observation_space": spaces.Box(-1e3, 1e3, (3,), np.float32),
+            "observation_space_mapping": lambda animal: [energy(animal), *animal.cell.coordinate],
+            "action_space": spaces.Discrete(4),
+            "apply": go,
+            "reward_mapping": energy,
+            "agent": lambda animal: f"{kind}_{animal.unique_id}",
+            "removed_by": "mesa.agent.Agent.remove",
+        }
+        | changes
+    )
+
+
+def herd(**changes):
+    return {
+        f"{EXAMPLES}.wolf_sheep.agents.Wolf.move": animals("wolf", **changes),
+        f"{EXAMPLES}.wolf_sheep.agents.Sheep.move": animals("sheep", **changes),
+    }
+
+
+# -- prisoners ------------------------------------------------------------------------------------
+
+
+class Prison:
+    """PdGrid for some ticks, of 400 agents."""
+
+    ticks, width, order = 6, 20, "Random"
+
+    def reset(self, seed=None):
+        self.model = dilemma(self.width, self.order, seed)
+        self.states = [self.state_of_everything()]
+
+    def run(self):
+        for _ in range(self.ticks):
+            self.model.step()
+            self.states.append(self.state_of_everything())
+        return TRUNCATED
+
+    def state_of_everything(self):
+        model = self.model
+        return (
+            [(a.unique_id, a.move, a.next_move, a.score, a.cell.coordinate) for a in model.agents],
+            model.random.getstate(),
+            model.rng.bit_generator.state,
+            model.datacollector.model_vars["Cooperating_Agents"][-1],
+        )
+
+
+class AnnouncedPrison(Prison):
+    def expected_calls(self, point):
+        return [(prisoner,) for prisoner in self.model.agents]
+
+
+class Cell(AnnouncedPrison):
+    """A small one."""
+
+    ticks, width = 4, 5
+
+
+def play_dilemma(action, prisoner):
+    prisoner.next_move = "CD"[action]
+    if advances_in_its_step(prisoner):
+        prisoner.advance()
+
+
+def prisoners(**changes):
+    definition = make_step(
+        **{
+            "observation_space": spaces.Box(0, 1e4, (3,), np.float32),
+            "observation_space_mapping": lambda prisoner: [
+                prisoner.score,
+                1 + prisoner.is_cooroperating,
+                sum(other.is_cooroperating for other in prisoner.cell.neighborhood.agents),
+            ],
+            "action_space": spaces.Discrete(2),
+            "apply": play_dilemma,
+            "reward_mapping": difference(lambda prisoner: prisoner.score),
+            "agent": lambda prisoner: f"prisoner_{prisoner.unique_id}",
+        }
+        | changes
+    )
+    return {f"{EXAMPLES}.pd_grid.agents.PDAgent.step": definition}
+
+
+def roster(width):
+    return [f"prisoner_{number}" for number in range(1, width * width + 1)]
+
+
+# -- with RULE throughout -------------------------------------------------------------------------
+
+
+def plain_run(simulation, seed):
+    simulation = simulation()
+    simulation.reset(seed)
+    simulation.run()
+    return simulation
+
+
+def in_turns(env, seed):
+    env.reset(seed=seed)
+    for agent in env.agent_iter():
+        env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
+
+
+def in_rounds(env, seed):
+    """Plays it; returns the number of rounds and of actions that were dropped."""
+    env.reset(seed=seed)
+    rounds = dropped = 0
+    while env.agents:
+        actions = dict.fromkeys(env.agents, RULE)
+        *_, infos = env.step(actions)
+        rounds += 1
+        dropped += sum(not infos[agent]["acted"] for agent in actions)
+    return rounds, dropped
+
+
+def all_alike(states, others):
+    """Whether two runs are the same; says where they differ first."""
+    assert len(states) == len(others)
+    for tick, (state, other) in enumerate(zip(states, others, strict=True)):
+        for part, (one, another) in enumerate(zip(state, other, strict=True)):
+            assert one == another, f"part {part} at tick {tick}"
+    return True
+
+
+@pytest.mark.parametrize("seed", [5, 11])
+@pytest.mark.parametrize("simulation", [Pasture, AnnouncedPasture])
+def test_wolves_and_sheep_with_rule_throughout_are_the_plain_run(simulation, seed):
+    plain = plain_run(simulation, seed)
+    assert len({tuple(state[-1]) for state in plain.states}) > 20  # it is a lively run
+    env = aec_env(simulation, herd())
+    in_turns(env, seed)
+    assert all_alike(env.simulation.states, plain.states)
+    env.close()
+    env = parallel_env(simulation, herd())
+    rounds, dropped = in_rounds(env, seed)
+    assert all_alike(env.simulation.states, plain.states)
+    if simulation is AnnouncedPasture:
+        assert (rounds, dropped) == (Pasture.ticks, 0)
+    else:
+        assert rounds > Pasture.ticks  # each birth needs a return
+    env.close()
+
+
+@pytest.mark.parametrize("order", PdGrid.activation_regimes)
+def test_prisoners_with_rule_throughout_are_the_plain_run(order):
+    class Ordered(Prison):
+        pass
+
+    class AnnouncedOrdered(AnnouncedPrison):
+        pass
+
+    Ordered.order = AnnouncedOrdered.order = order
+    plain = plain_run(Ordered, 3)
+    for simulation in (Ordered, AnnouncedOrdered):
+        env = aec_env(simulation, prisoners())
+        in_turns(env, 3)
+        assert all_alike(env.simulation.states, plain.states)
+        env = parallel_env(simulation, prisoners())
+        rounds, dropped = in_rounds(env, 3)
+        assert all_alike(env.simulation.states, plain.states)
+        if simulation is AnnouncedOrdered:
+            assert (rounds, dropped) == (Prison.ticks, 0)
+    env = parallel_env(Ordered, prisoners(), possible_agents=roster(20))
+    assert in_rounds(env, 3) == (Prison.ticks, 0)
+    assert all_alike(env.simulation.states, plain.states)
+
+
+def test_one_joint_agent_for_400_prisoners():
+    plain = plain_run(AnnouncedPrison, 3)
+    env = joint_env(AnnouncedPrison, prisoners())
+    assert set(env.action_space.spaces) == set(roster(20))
+    env.reset(seed=3)
+    rounds, total = 0, 0.0
+    over = False
+    while not over:
+        _, reward, terminated, truncated, info = env.step(RULE)
+        rounds, total, over = rounds + 1, total + reward, terminated or truncated
+        assert all(info["acted"].values())
+    assert (rounds, terminated, truncated) == (Prison.ticks, False, True)
+    assert all_alike(env.simulation.states, plain.states)
+    # Each prisoner is paid what it has won since it was known, which is since the beginning.
+    assert total == pytest.approx(sum(score for *_, score, _ in plain.states[-1][0]))
+
+
+def test_simulate_without_policies_is_the_plain_run():
+    simulation = simulate(Pasture, points=herd(), seed=5)
+    assert all_alike(simulation.states, plain_run(Pasture, 5).states)
+    simulation = simulate(Prison, points=prisoners(), seed=5)
+    assert all_alike(simulation.states, plain_run(Prison, 5).states)
+
+
+def test_the_models_are_as_they_were():
+    env = aec_env(Meadow, herd())
+    env.reset(seed=5)
+    beside = plain_run(Meadow, 5)  # while the environment stands in mid-episode
+    in_turns(env, 5)
+    assert all_alike(env.simulation.states, beside.states)
+    env.close()
+    del env
+    gc.collect()
+    for owner, name, function in UNTOUCHED:
+        assert vars(owner)[name] is function
+
+
+def test_side_by_side_they_do_not_touch_each_other():
+    plain = [plain_run(Meadow, 5), plain_run(Meadow, 6), plain_run(Cell, 5), plain_run(Meadow, 7)]
+    envs = [
+        aec_env(Meadow, herd()),
+        parallel_env(AnnouncedMeadow, herd()),
+        parallel_env(Cell, prisoners()),
+        aec_env(AnnouncedMeadow, {name: definition for name, definition in herd().items() if ".Wolf." in name}),
+    ]
+    for env, seed in zip(envs, (5, 6, 5, 7), strict=True):
+        env.reset(seed=seed)
+    while any(env.agents for env in envs):
+        for env in envs:
+            if env.agents and hasattr(env, "agent_selection"):
+                agent = env.agent_selection
+                env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
+            elif env.agents:
+                env.step(RULE)
+    for env, simulation in zip(envs, plain, strict=True):
+        assert all_alike(env.simulation.states, simulation.states)
+
+
+# -- births and deaths ----------------------------------------------------------------------------
+
+
+def names(state):
+    """Who lives, by its id."""
+    return {unique_id for unique_id, *_ in state[0]}
+
+
+def number_of(agent):
+    return int(agent.partition("_")[2])
+
+
+def test_everybody_who_dies_terminates_once_and_the_others_are_truncated():
+    env = aec_env(Pasture, herd())
+    turns = play(env, seed=5)
+    states = env.simulation.states
+    ends = [turn for turn in turns if turn.terminated or turn.truncated]
+    assert max(Counter(turn.agent for turn in ends).values()) == 1
+    survivors = names(states[-1])
+    assert {number_of(turn.agent) for turn in ends if turn.truncated} <= survivors
+    dead = {number_of(turn.agent) for turn in ends if turn.terminated}
+    assert not dead & survivors
+    decided = {turn.agent for turn in turns}
+    assert {turn.agent for turn in ends} == decided
+    assert len(dead) > 20
+    assert len(decided) > 200  # 150 there were first
+    # After its end nobody is heard of again.
+    last = {turn.agent: place for place, turn in enumerate(turns)}
+    assert all(turns[last[turn.agent]] is turn for turn in ends)
+
+
+def test_deaths_in_rounds():
+    env = parallel_env(AnnouncedPasture, herd())
+    env.reset(seed=5)
+    ended = {}
+    for tick in range(1, Pasture.ticks + 1):
+        before = names(env.simulation.states[-1])
+        assert {number_of(agent) for agent in env.agents} == before
+        observations, rewards, terminations, truncations, infos = env.step(dict.fromkeys(env.agents, RULE))
+        after = names(env.simulation.states[tick])
+        assert {number_of(agent) for agent, end in terminations.items() if end} == before - after
+        assert {number_of(agent) for agent, end in truncations.items() if end} == (
+            after & before if tick == Pasture.ticks else set()
+        )
+        assert {number_of(agent) for agent in observations} >= before
+        assert set(observations) == set(rewards) == set(infos)
+        for agent in terminations:
+            assert agent not in ended
+            if terminations[agent]:
+                ended[agent] = observations[agent]
+        energies = {unique_id: energy for unique_id, energy, _ in env.simulation.states[tick][0]}
+        for agent, observation in observations.items():
+            if number_of(agent) in energies:
+                # Its energy at the end of the tick: the first of the next one only stands there and decides.
+                assert observation[0] == np.float32(energies[number_of(agent)])
+                assert infos[agent]["time"] == (tick if tick == Pasture.ticks else tick + 1)
+    assert env.agents == []
+    sheep = [observation for agent, observation in ended.items() if agent.startswith("sheep")]
+    assert any(observation[0] >= 0 for observation in sheep)  # eaten: not all have starved
+    assert all(observation[0] >= -1 for observation in ended.values())
+
+
+def test_the_time_of_the_pasture():
+    turns = play(aec_env(Meadow, herd()), seed=5)
+    for turn in turns:
+        assert turn.info["elapsed"] in (0.0, 1.0)
+    assert {turn.info["time"] for turn in turns} == set(map(float, range(1, Meadow.ticks + 1)))
+
+
+def test_the_environment_keeps_no_animal():
+    """The model counts on whoever is removed being gone."""
+    env = aec_env(Pasture, herd())
+    env.reset(seed=5)
+    seen = set()
+    for agent in env.agent_iter():
+        if env.simulation.model.steps > 10:
+            break
+        seen.add(agent)
+        env.step(None if env.terminations[agent] else RULE)
+    model = env.simulation.model
+    gc.collect()
+    living = {id(animal) for kind in (Wolf, Sheep) for animal in model.agents_by_type[kind]}
+    there = [thing for thing in gc.get_objects() if type(thing) in (Wolf, Sheep) and thing.model is model]
+    assert {id(animal) for animal in there} == living
+    env.close()
+
+
+def test_actions_are_carried_out():
+    """Everybody goes where it is sent, in turns and in rounds alike."""
+
+    def where_to(agent, tick):
+        return (number_of(agent) + tick) % 4
+
+    def move(action, animal):
+        went.append((animal.unique_id, action))
+        go(action, animal)
+
+    went = []
+    env = aec_env(AnnouncedMeadow, herd(apply=move))
+    env.reset(seed=5)
+    for agent in env.agent_iter():
+        ended = env.terminations[agent] or env.truncations[agent]
+        env.step(None if ended else where_to(agent, env.simulation.model.steps))
+    in_turn, went = went, []
+    states = env.simulation.states
+    env = parallel_env(AnnouncedMeadow, herd(apply=move))
+    env.reset(seed=5)
+    while env.agents:
+        env.step({agent: where_to(agent, env.simulation.model.steps) for agent in env.agents})
+    assert len(in_turn) > 100
+    assert in_turn == went
+    assert all_alike(env.simulation.states, states)
+    wolves = simulate(
+        AnnouncedMeadow,
+        {f"{EXAMPLES}.wolf_sheep.agents.Wolf.move": lambda observation: 0},
+        points=herd(),
+        seed=5,
+    )
+    assert len(wolves.states) == Meadow.ticks + 1
+    assert wolves.states[-1] != states[-1]
+
+
+def test_a_roster_of_those_who_are_there_first():
+    first = [f"sheep_{number}" for number in range(1, 15)] + [f"wolf_{number}" for number in range(15, 21)]
+    by_point = {
+        name: [agent for agent in first if agent.startswith(kind)]
+        for kind, name in zip(("wolf", "sheep"), herd(), strict=True)
+    }
+    env = aec_env(Meadow, herd(), possible_agents=by_point, undeclared="rule")
+    assert sorted(env.possible_agents) == sorted(first)
+    turns = play(env, seed=5)
+    assert {turn.agent for turn in turns} == set(first)
+    assert all_alike(env.simulation.states, plain_run(Meadow, 5).states)
+    env = aec_env(Meadow, herd(), possible_agents=by_point)
+    with pytest.raises(AgentError, match="not declared"):
+        play(env, seed=5)
+
+
+def test_without_removals_the_dead_end_with_the_episode():
+    env = aec_env(Meadow, herd(removed_by=()))
+    turns = play(env, seed=5)
+    assert all_alike(env.simulation.states, plain_run(Meadow, 5).states)
+    assert not any(turn.terminated for turn in turns)
+    assert {turn.agent for turn in turns if turn.truncated} == {turn.agent for turn in turns}
+
+
+# -- PettingZoo's and Gymnasium's tests -----------------------------------------------------------
+
+UNKNOWN_ROSTER = r"This environment does not have possible_agents defined\."
+
+
+def test_api_of_wolves_and_sheep():
+    for simulation in (Meadow, AnnouncedMeadow):
+        with pytest.warns(UserWarning, match=UNKNOWN_ROSTER) as caught:
+            api_test(aec_env(simulation, herd()), num_cycles=20)
+        assert len(caught) == 1
+
+
+def test_seeds_of_wolves_and_sheep():
+    for simulation in (Meadow, AnnouncedMeadow):
+        seed_test(lambda simulation=simulation: aec_env(simulation, herd()), num_cycles=20)
+        parallel_seed_test(lambda simulation=simulation: parallel_env(simulation, herd()), num_cycles=20)
+
+
+def test_parallel_api_of_wolves_and_sheep():
+    for simulation in (Meadow, AnnouncedMeadow):
+        with warnings.catch_warnings():
+            # Of every environment without a roster, and at the end of each of its episodes.
+            warnings.filterwarnings("ignore", message=UNKNOWN_ROSTER)
+            warnings.filterwarnings("ignore", message="No agents present")
+            parallel_api_test(parallel_env(simulation, herd()), num_cycles=50)
+
+
+def test_api_of_prisoners():
+    api_test(aec_env(Prison, prisoners(), possible_agents=roster(20)), num_cycles=2)
+    seed_test(lambda: aec_env(Prison, prisoners(), possible_agents=roster(20)), num_cycles=2)
+
+
+def test_parallel_api_of_prisoners():
+    parallel_api_test(parallel_env(AnnouncedPrison, prisoners(), possible_agents=roster(20)), num_cycles=20)
+    parallel_seed_test(lambda: parallel_env(Prison, prisoners(), possible_agents=roster(20)), num_cycles=20)
+
+
+def test_gymnasiums_check_of_joint_prisoners():
+    check_env(joint_env(Cell, prisoners()), skip_render_check=True)

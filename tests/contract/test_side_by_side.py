@@ -1,0 +1,820 @@
+"""Section 5.10 of the contract, and models that switch stacks of their own: SimPy, generators, greenlets, asyncio."""
+
+import asyncio
+import contextvars
+import decimal
+import gc
+import logging
+import random
+import subprocess
+import sys
+import warnings
+from textwrap import dedent
+
+import greenlet
+import pytest
+import simpy
+from gymnasium import spaces
+
+from simenv_marl import RULE, aec_env, generate_env, single_env
+from tests.worlds.models import Script, calling, decision, decisions, define, play, rewards_of, script, stacks
+
+VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
+
+
+# -- interleaved ----------------------------------------------------------------------------------
+
+
+class Account:
+    """Spends; its state is its own."""
+
+    def __init__(self, seed):
+        self.random, self.money, self.spent = random.Random(seed), 100, []
+
+    @define(
+        observation_space_mapping=lambda self: [self.money, len(self.spent)],
+        reward_mapping=lambda self: self.money / 8,
+        agent="spender_0",
+    )
+    def spend(self):
+        return self.random.randrange(3)
+
+    @define(observation_space_mapping=lambda self: [self.money, 0], agent="earner_0", reward_mapping=lambda self: 1)
+    def earn(self):
+        return self.random.randrange(5)
+
+
+class Banking(Script):
+    def __init__(self):
+        super().__init__(None)
+
+    def run(self):
+        self.account = account = Account(self.seed)
+        for _ in range(12):
+            if account.random.random() < 0.7:
+                account.spent.append(account.spend())
+                account.money -= account.spent[-1]
+            else:
+                account.money += account.earn()
+        return account.money
+
+
+def trace(env, seed, action_of):
+    """Everything that an episode tells, step by step."""
+    env.reset(seed=seed)
+    for agent in env.agent_iter():
+        observation, *rest = env.last()
+        ended = rest[1] or rest[2 - 1]
+        action = None if ended else action_of()
+        yield agent, observation.tolist(), rest, action
+        env.step(action)
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_interleaved_environments_do_what_each_does_alone(number):
+    points = [Account.spend, Account.earn]
+
+    def actions(seed):
+        source = random.Random(seed)
+        return lambda: RULE if source.random() < 0.3 else source.randrange(10)
+
+    alone = [list(trace(aec_env(Banking, points), seed, actions(seed))) for seed in range(number)]
+    env_class = generate_env(Banking, points)
+    together = [[] for _ in range(number)]
+    running = [(n, trace(env_class(), n, actions(n))) for n in range(number)]
+    order = random.Random(1)
+    while running:
+        n, episode = order.choice(running)
+        try:
+            together[n].append(next(episode))
+        except StopIteration:
+            running.remove((n, episode))
+    assert together == alone
+
+
+def test_some_may_run_their_rule_and_others_be_decided():
+    one = aec_env(Banking, Account.spend)
+    two = aec_env(Banking, Account.earn)
+    three = aec_env(Banking, [Account.spend, Account.earn])
+    envs = [one, two, three]
+    for env in envs:
+        env.reset(seed=4)
+    while any(env.agents for env in envs):
+        for env in envs:
+            if env.agents:
+                env.step(None if env.last()[2] else RULE)
+    plain = Banking()
+    plain.reset(4)
+    plain.run()
+    assert [env.unwrapped.simulation.account.spent for env in envs] == [plain.account.spent] * 3
+    assert [env.unwrapped.simulation.account.money for env in envs] == [plain.account.money] * 3
+
+
+def test_the_plain_model_runs_between_steps_as_ever():
+    env = single_env(Banking, Account.spend)
+    env.reset(seed=1)
+    plain, again = Banking(), Banking()
+    for simulation in (plain, again):
+        simulation.reset(3)
+        simulation.run()
+        env.step(1)
+    assert plain.account.spent == again.account.spent
+
+
+# -- nested ---------------------------------------------------------------------------------------
+
+
+def inner_env():
+    return single_env(calling(*[INNER] * 3), INNER)
+
+
+INNER = decision(lambda: "inner rule", agent="inner_0", reward_mapping=lambda: 1)
+
+
+def run_inner(env, action):
+    env.reset()
+    while not env.step(action)[2]:
+        pass
+    return env.unwrapped.simulation.log
+
+
+@pytest.mark.parametrize("action", [4, RULE])
+@pytest.mark.parametrize("also_outer", [False, True])
+def test_a_rule_may_run_an_environment_of_its_own(action, also_outer):
+    inner = inner_env()
+    outer = decision(lambda: list(run_inner(inner, action)), agent="outer_0")
+    points = [outer, INNER] if also_outer else [outer]
+    env = aec_env(calling(outer, INNER, outer), points)
+    turns = play(env, {"outer_0": RULE, "inner_0": 9})
+    # What the inner environment decides is no decision of the outer one, even where that has the same point.
+    assert decisions(turns) == (["outer_0", "inner_0", "outer_0"] if also_outer else ["outer_0", "outer_0"])
+    expected = [action if action == 4 else "inner rule"] * 3
+    assert env.unwrapped.simulation.log == [expected, 9 if also_outer else "inner rule", expected]
+
+
+def test_an_inner_environment_may_stay_suspended_while_the_outer_one_is():
+    inner = inner_env()
+
+    def rule():
+        if not hasattr(inner, "begun"):
+            inner.begun = True
+            inner.reset()
+            return "reset"
+        return inner.step(len(inner.unwrapped.simulation.log))[2]
+
+    outer = decision(rule, agent="outer_0")
+    env = aec_env(calling(*[outer] * 4), outer)
+    play(env, RULE)
+    assert env.unwrapped.simulation.log == ["reset", False, False, True]
+    assert inner.unwrapped.simulation.log == [0, 1, 2]
+
+
+def test_an_inner_environment_may_be_stepped_from_inside_and_from_outside_in_turn():
+    inner = single_env(calling(*[INNER] * 6), INNER)
+    outer = decision(lambda: inner.step(1)[2], agent="outer_0")
+    env = single_env(calling(*[outer] * 3), outer)
+    inner.reset()
+    env.reset()
+    for _ in range(3):
+        inner.step(2)
+        env.step(RULE)
+    assert inner.unwrapped.simulation.log == [2, 1] * 3
+    inner.reset()
+    inner.step(3)
+    inner.close()
+
+
+def test_an_inner_environment_may_be_made_reset_and_closed_inside():
+    def rule():
+        inner = inner_env()
+        inner.reset()
+        inner.step(5)
+        log = list(inner.unwrapped.simulation.log)
+        inner.close()
+        return log, INNER()
+
+    outer = decision(rule, agent="outer_0")
+    env = aec_env(calling(outer, outer), [outer, INNER])
+    turns = play(env, {"outer_0": RULE, "inner_0": 9})
+    assert decisions(turns) == ["outer_0", "inner_0"] * 2
+    assert env.unwrapped.simulation.log == [([5], 9)] * 2
+
+
+@pytest.mark.parametrize("source", ["class", "factory", "generate_env"])
+def test_decisions_while_an_inner_simulation_is_made_reset_or_stopped_are_nobodys(source):
+    seen = []
+
+    class Inner(Script):
+        def __init__(self):
+            super().__init__(lambda simulation: INNER())
+            seen.append(("made", INNER()))
+
+        def reset(self, seed=None):
+            super().reset(seed)
+            seen.append(("reset", INNER()))
+
+        def stop(self):
+            seen.append(("stopped", INNER()))
+
+        def render(self, mode):
+            seen.append(("rendered", INNER()))
+
+    def rule():
+        if source == "generate_env":
+            inner = generate_env(lambda: Inner(), INNER)(render_mode="ansi")
+        else:
+            inner = single_env(Inner if source == "class" else lambda: Inner(), INNER, render_mode="ansi")
+        inner.reset()
+        inner.render()
+        inner.reset()
+        inner.close()
+
+    outer = decision(rule, agent="outer_0")
+    env = aec_env(calling(outer, INNER), [outer, INNER])
+    assert decisions(play(env, {"outer_0": RULE, "inner_0": 9})) == ["outer_0", "inner_0"]
+    done = [what for what, _ in seen if what != "made"]
+    assert done == ["reset", "rendered", "stopped", "reset", "stopped"]
+    assert {value for _, value in seen} == {"inner rule"}
+
+
+def test_an_inner_environment_may_be_abandoned_inside():
+    unwound = []
+
+    def main(simulation):
+        try:
+            INNER()
+        finally:
+            unwound.append(INNER())
+
+    def rule():
+        inner = single_env(script(main), INNER)
+        inner.reset()
+        del inner
+        gc.collect()
+        return INNER()
+
+    outer = decision(rule, agent="outer_0")
+    env = aec_env(calling(outer), [outer, INNER])
+    assert decisions(play(env, {"outer_0": RULE, "inner_0": 9})) == ["outer_0", "inner_0"]
+    assert env.unwrapped.simulation.log == [9]
+    assert not unwound
+
+
+@pytest.mark.parametrize(
+    "name", ["observation_space_mapping", "reward_mapping", "action_space_mapping", "agent", "policy"]
+)
+def test_mappings_and_policies_may_run_an_environment_of_their_own(name):
+    inner, logs = inner_env(), []
+    value = {"observation_space_mapping": [0, 0], "reward_mapping": 0, "agent": "outer_0"}.get(name, 7)
+
+    def nested(*args):
+        logs.append(list(run_inner(inner, 4)))
+        return value
+
+    other = decision(agent="other_0")
+    outer = decision(**{"agent": "outer_0"} | ({} if name == "policy" else {name: nested}))
+    policies = {outer: nested} if name == "policy" else None
+    env = aec_env(calling(outer, other, outer, INNER), [outer, other, INNER], policies=policies)
+    play(env, 7)
+    assert env.unwrapped.simulation.log == [7, 7, 7, 7]
+    assert logs
+    assert all(log == [4, 4, 4] for log in logs)
+
+
+def test_environments_nest_deeply():
+    def nested(depth):
+        decide = decision(lambda: nested(depth - 1) if depth else 0, agent="a_0", reward_mapping=lambda: 1.0)
+        env = single_env(calling(decide, decide), decide)
+        env.reset()
+        total = 0
+        while True:
+            _, reward, terminated, *_ = env.step(RULE)
+            total += reward + env.unwrapped.simulation.log[-1]
+            if terminated:
+                return total
+
+    assert nested(5) == sum(2.0**n for n in range(1, 7))
+
+
+def test_errors_of_an_inner_environment_pass_through_both():
+    bad = decision(lambda: 1 / 0, agent="bad_0")
+    inner = single_env(calling(bad), bad)
+    outer = decision(lambda: run_inner(inner, RULE), agent="outer_0")
+    env = single_env(calling(outer, outer), outer)
+    for _ in range(2):
+        env.reset(seed=111)
+        with pytest.raises(ZeroDivisionError) as caught:
+            env.step(RULE)
+        assert "bad_0" in caught.value.__notes__[0]
+        assert "outer_0" in caught.value.__notes__[1]
+    env.reset()
+    env.step(1)
+
+
+def test_a_suspended_nest_is_collected():
+    before = stacks()
+    unwound = []
+
+    class Nest(Script):
+        def run(self):
+            self.inner = single_env(script(inside), INNER)
+            self.inner.reset()
+            try:
+                outer()
+            finally:
+                unwound.append("outer")
+
+    def inside(simulation):
+        try:
+            INNER()
+        finally:
+            unwound.append("inner")
+
+    outer = decision(agent="outer_0")
+    env = single_env(lambda: Nest(None), outer)
+    env.reset()
+    del env
+    assert stacks(before) == before
+    assert sorted(unwound) == ["inner", "outer"]
+
+
+def test_environments_may_be_stepped_from_greenlets_of_the_user():
+    decide = decision()
+    env = single_env(calling(*[decide] * 6), decide)
+    env.reset()
+    main = greenlet.getcurrent()
+
+    def work(number):
+        while True:
+            main.switch(env.step(number)[2])
+
+    workers = [greenlet.greenlet(work) for _ in range(3)]
+    ended = [worker.switch(number) for _ in range(2) for number, worker in enumerate(workers)]
+    assert ended == [False] * 5 + [True]
+    assert env.unwrapped.simulation.log == [0, 1, 2, 0, 1, 2]
+
+
+# -- SimPy ----------------------------------------------------------------------------------------
+
+
+class Shop:
+    """Customers queue for a till; how long each is served is decided inside a process."""
+
+    def __init__(self, env):
+        self.env, self.till, self.log = env, simpy.Resource(env), []
+
+    @define(
+        observation_space_mapping=lambda self, customer: [self.env.now, customer],
+        reward_mapping=lambda self, customer: self.env.now,
+        agent="clerk_0",
+    )
+    def service_time(self, customer):
+        return 1 + customer % 2
+
+    @define(observation_space_mapping=lambda self: [self.env.now, 0], agent="manager_0")
+    def pause(self):
+        yield self.env.timeout(1)
+        return "rested"
+
+    def customer(self, number):
+        yield self.env.timeout(number)
+        with self.till.request() as request:
+            yield request
+            yield self.env.timeout(self.service_time(number))
+        self.log.append((number, self.env.now))
+
+    def manager(self):
+        for _ in range(2):
+            yield self.env.timeout(2)
+            result = yield self.env.process(self.pause())
+            self.log.append((result, self.env.now))
+            self.log.append(((yield from self.pause()), self.env.now))
+
+
+class Shopping(Script):
+    def __init__(self):
+        super().__init__(None)
+
+    def run(self):
+        env = simpy.Environment()
+        self.shop = Shop(env)
+        for number in range(4):
+            env.process(self.shop.customer(number))
+        env.process(self.shop.manager())
+        env.run()
+        self.log = self.shop.log
+
+
+def test_decisions_inside_simpy_processes():
+    points = [Shop.service_time, Shop.pause]
+    plain = Shopping()
+    plain.reset()
+    plain.run()
+    env = aec_env(Shopping, points)
+    turns = play(env, RULE)
+    assert env.unwrapped.simulation.log == plain.log
+    assert decisions(turns).count("clerk_0") == decisions(turns).count("manager_0") == 4
+    turns = play(env, 3)
+    assert [entry for entry in env.unwrapped.simulation.log if entry[0] in range(4) and entry[0] != 3] == [
+        (0, 3),
+        (1, 6),
+        (2, 9),
+    ]
+    assert rewards_of(turns, "clerk_0") == [3.0, 6.0, 9.0, 12.0]
+
+
+@pytest.mark.parametrize("number", [1, 3, 30])
+@pytest.mark.parametrize("how", ["close", "reset", "collect", "error"])
+def test_simpy_models_unwind(how, number):
+    unwound = []
+    decide = decision(lambda: 1 / 0)
+
+    def process(env, number):
+        try:
+            yield env.timeout(1)
+            decide()
+        finally:
+            unwound.append(number)
+
+    def main(simulation):
+        env = simpy.Environment()
+        env.run(env.all_of([env.process(process(env, n)) for n in range(number)]))
+
+    before = stacks()
+    gym = single_env(script(main), decide)
+    gym.reset()
+    if how == "error":
+        # SimPy keeps the error of a process until those that wait for it are told.
+        for n in range(number):
+            assert len(unwound) == n
+            if n < number - 1:
+                gym.step(RULE)
+            else:
+                with pytest.raises(ZeroDivisionError):
+                    gym.step(RULE)
+    elif how != "collect":
+        getattr(gym, how)()
+        assert sorted(unwound) == list(range(number))
+        gym.close()
+    del gym
+    gc.collect()
+    assert set(unwound) == set(range(number))
+    assert stacks(before) == before
+
+
+# -- generators and greenlets of the model --------------------------------------------------------
+
+
+def test_decisions_inside_generators_of_the_model():
+    decide = decision(lambda: 1)
+
+    def producer():
+        total = 0
+        while total < 5:
+            total += decide()
+            yield total
+
+    def main(simulation):
+        for total in producer():
+            simulation.log.append((total, decide()))
+
+    env = single_env(script(main), decide)
+    env.reset()
+    for action in (2, 5, 3, 7):
+        env.step(action)
+    assert env.unwrapped.simulation.log == [(2, 5), (5, 7)]
+
+
+@pytest.mark.parametrize("how", ["end", "close", "collect"])
+def test_greenlets_of_the_model_may_decide(how):
+    use_greenlets_of_the_model(how)
+
+
+@pytest.mark.greenlet("what the error's frames hold outlives the simulation's thread, where alone it could unwind")
+def test_greenlets_of_the_model_unwind_when_the_error_that_holds_them_is_gone():
+    use_greenlets_of_the_model("error")
+
+
+def use_greenlets_of_the_model(how):
+    before = stacks()
+    decide = decision(lambda name: name, agent=lambda name: f"{name}_0")
+    unwound = []
+
+    def worker(name):
+        parent = greenlet.getcurrent().parent
+        try:
+            for _ in range(2):
+                parent.switch(decide(name))
+            if how == "error":
+                raise ZeroDivisionError
+        finally:
+            unwound.append(name)
+
+    def main(simulation):
+        workers = {name: greenlet.greenlet(worker) for name in "ab"}
+        for _ in range(3):
+            for name, work in workers.items():
+                simulation.log.append(work.switch(name))
+            simulation.log.append(decide("m"))
+
+    env = aec_env(script(main), decide)
+    env.reset()
+    order = []
+    error = None
+    for number in range(9 if how == "end" else 7 if how == "error" else 4):
+        order.append(env.agent_selection)
+        try:
+            env.step(None if env.terminations[env.agent_selection] else number)
+        except ZeroDivisionError as raised:
+            error = raised
+            break
+    if how == "end":
+        assert order[:7] == ["a_0", "b_0", "m_0"] * 2 + ["m_0"]
+        assert env.unwrapped.simulation.log == [0, 1, 2, 3, 4, 5, None, None, 6]
+    elif how == "error":
+        assert error is not None
+    elif how == "close":
+        env.close()
+    error = None
+    del env
+    assert stacks(before) == before
+    assert sorted(unwound) == ["a", "b"]
+
+
+# -- asyncio --------------------------------------------------------------------------------------
+
+
+class Office:
+    """Clerks work concurrently on one event loop; each decides how many rounds a task takes."""
+
+    @define(agent="clerk_0")
+    async def rounds(self, number):
+        await asyncio.sleep(0)
+        return number % 3
+
+    @define(agent="boss_0")
+    def bonus(self, number):
+        return 1
+
+    async def clerk(self, number, log):
+        rounds = await self.rounds(number)
+        for _ in range(rounds):
+            await asyncio.sleep(0)
+        log.append((number, rounds, self.bonus(number)))
+
+    async def work(self, number, log):
+        await asyncio.gather(*[self.clerk(n, log) for n in range(number)])
+
+
+@pytest.fixture
+def _no_loop_stays_behind(caplog):
+    # asyncio logs, whenever it is collected, each task whose exception nobody has asked for.
+    with caplog.at_level(logging.CRITICAL, logger="asyncio"):
+        yield
+        asyncio._set_running_loop(None)  # a failed test is no reason for others to fail
+        gc.collect()
+
+
+def office(number=4):
+    return script(lambda simulation: asyncio.run(Office().work(number, simulation.log)))
+
+
+@pytest.mark.usefixtures("_no_loop_stays_behind")
+def test_decisions_inside_coroutines():
+    plain = office()()
+    plain.reset()
+    plain.run()
+    env = aec_env(office(), [Office.rounds, Office.bonus])
+    turns = play(env, RULE)
+    assert env.unwrapped.simulation.log == plain.log
+    assert sorted(decisions(turns)) == ["boss_0"] * 4 + ["clerk_0"] * 4
+    play(env, {"clerk_0": iter([3, 2, 1, 0]), "boss_0": 7})
+    assert env.unwrapped.simulation.log == [(3, 0, 7), (2, 1, 7), (1, 2, 7), (0, 3, 7)]
+
+
+@pytest.mark.usefixtures("_no_loop_stays_behind")
+@VIEWS
+def test_models_that_use_asyncio_run_side_by_side(view):
+    plain = office()()
+    plain.reset()
+    plain.run()
+    policies = {Office.bonus: RULE} if view is single_env else None
+    envs = [view(office(), [Office.rounds, Office.bonus], policies=policies) for _ in range(3)]
+    for env in envs:
+        env.reset()
+    running = list(envs)
+    while running:
+        for env in list(running):
+            result = env.step(RULE)
+            if result[2] if view is single_env else any(env.terminations.values()):
+                running.remove(env)
+    assert [env.unwrapped.simulation.log for env in envs] == [plain.log] * 3
+
+
+@pytest.mark.usefixtures("_no_loop_stays_behind")
+def test_the_user_may_run_an_event_loop_between_steps_of_a_model_that_uses_one():
+    async def use(env):
+        await asyncio.sleep(0)
+        return asyncio.get_running_loop() is not None
+
+    env = single_env(office(), Office.rounds)
+    env.reset()
+    while True:
+        assert asyncio.run(use(env))
+        if env.step(RULE)[2]:
+            break
+    with pytest.raises(RuntimeError):
+        asyncio.get_running_loop()
+    env.reset()
+    env.close()
+    with pytest.raises(RuntimeError):
+        asyncio.get_running_loop()
+
+
+@pytest.mark.usefixtures("_no_loop_stays_behind")
+def test_the_user_may_step_a_model_that_uses_asyncio_from_another_event_loop_each_time():
+    async def step(env):
+        loop = asyncio.get_running_loop()
+        ended = env.step(RULE)[2]
+        assert asyncio.get_running_loop() is loop
+        await asyncio.sleep(0)
+        return ended
+
+    env = single_env(office(), Office.rounds)
+    env.reset()
+    assert [asyncio.run(step(env)) for _ in range(3)] == [False] * 3
+    assert env.step(RULE)[2]
+    with pytest.raises(RuntimeError):
+        asyncio.get_running_loop()
+
+
+def test_the_user_may_use_plain_models_inside_an_event_loop():
+    decide = decision()
+
+    async def use(number):
+        env = single_env(calling(*[decide] * 3), decide)
+        env.reset()
+        while not env.step(number)[2]:
+            await asyncio.sleep(0)
+        return env.unwrapped.simulation.log
+
+    async def gather():
+        return await asyncio.gather(*[use(number) for number in range(3)])
+
+    assert asyncio.run(gather()) == [[0] * 3, [1] * 3, [2] * 3]
+
+
+@pytest.mark.usefixtures("_no_loop_stays_behind")
+def test_models_may_be_the_first_to_import_asyncio():
+    code = """
+        import sys
+        from tests.worlds.models import decision, script
+        from simenv_marl import single_env
+        assert "asyncio" not in sys.modules
+        decide = decision()
+        def main(simulation):
+            import asyncio
+            async def work():
+                for _ in range(2):
+                    await asyncio.sleep(0)
+                    simulation.log.append(decide())
+            asyncio.run(work())
+        env = single_env(script(main), decide)
+        env.reset()
+        import asyncio
+        async def use():
+            return asyncio.get_running_loop().is_running()
+        assert asyncio.run(use())
+        env.step(1)
+        assert asyncio.run(use())
+        env.step(2)
+        print(env.unwrapped.simulation.log)
+    """
+    result = subprocess.run([sys.executable, "-c", dedent(code)], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (0, "[1, 2]\n"), result.stderr
+
+
+@pytest.mark.parametrize("number", [2, 30])
+@pytest.mark.parametrize("how", ["close", "reset"])
+def test_models_that_use_asyncio_unwind(number, how):
+    env = single_env(office(number), Office.rounds)
+    env.reset()
+    env.step(1)
+    getattr(env, how)()
+    env.close()
+    # The first clerk, who has got its decision, may come to its end; nobody else got one.
+    assert {number for number, *_ in env.unwrapped.simulation.log} <= {0}
+    with pytest.raises(RuntimeError):
+        asyncio.get_running_loop()
+    with pytest.raises(RuntimeError):
+        asyncio.get_event_loop_policy().get_event_loop()
+
+
+# -- state of the interpreter ---------------------------------------------------------------------
+
+
+def test_context_variables_of_the_user_are_seen_and_those_of_the_model_are_its_own():
+    variable = contextvars.ContextVar("variable", default="nobody's")
+    seen = []
+
+    def main(simulation):
+        for number in range(3):
+            seen.append(variable.get())
+            variable.set(f"the model's {number}")
+            decide()
+
+    decide = decision()
+    env = single_env(script(main), decide)
+    token = variable.set("the user's")
+    try:
+        env.reset()
+        env.step(1)
+        assert variable.get() == "the user's"
+    finally:
+        variable.reset(token)
+    env.step(1)
+    env.step(1)
+    assert seen == ["the user's", "the model's 0", "the model's 1"]
+    assert variable.get() == "nobody's"
+
+
+def test_decimal_contexts_and_handled_errors_do_not_leak():
+    def main(simulation):
+        with decimal.localcontext() as context:
+            context.prec = 3
+            try:
+                raise KeyError("the model's")
+            except KeyError:
+                decide()
+                simulation.log.append(decimal.Decimal(1) / 3)
+                simulation.log.append(sys.exc_info()[0])
+                decide()
+
+    decide = decision()
+    env = single_env(script(main), decide)
+    env.reset()
+    assert decimal.getcontext().prec == 28
+    assert sys.exc_info() == (None, None, None)
+    try:
+        raise ValueError("the user's")
+    except ValueError:
+        env.step(1)
+        assert sys.exc_info()[0] is ValueError
+    assert env.unwrapped.simulation.log == [decimal.Decimal("0.333"), KeyError]
+    assert decimal.getcontext().prec == 28
+    env.close()
+
+
+def test_models_may_recurse_as_deeply_as_without_an_environment():
+    decide = decision()
+
+    def dive(depth):
+        return decide() if depth == 0 else dive(depth - 1)
+
+    depth = sys.getrecursionlimit() - 200
+    env = single_env(calling(*[lambda: dive(depth)] * 2), decide)
+    env.reset()
+    env.step(1)
+    env.step(2)
+    assert env.unwrapped.simulation.log == [1, 2]
+
+
+def test_a_runaway_recursion_of_the_model_is_its_error():
+    def runaway():
+        return runaway()
+
+    decide = decision(runaway)
+    env = single_env(calling(decide), decide)
+    env.reset()
+    with pytest.raises(RecursionError):
+        env.step(RULE)
+    env.reset()
+    env.step(1)
+
+
+def test_many_environments_may_be_suspended_at_once():
+    decide = decision(observation_space=spaces.Discrete(1000), observation_space_mapping=lambda: 1)
+    env_class = generate_env(calling(*[decide] * 3), decide)
+    envs = [env_class() for _ in range(300)]
+    for env in envs:
+        env.reset()
+    for step in range(3):
+        for number, env in enumerate(envs):
+            assert env.step((number + step) % 10)[2] == (step == 2)
+    assert all(
+        env.unwrapped.simulation.log == [(number + step) % 10 for step in range(3)] for number, env in enumerate(envs)
+    )
+
+
+@pytest.mark.usefixtures("_no_loop_stays_behind")
+def test_nothing_warns():
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for source, points in ((office(), [Office.rounds]), (Shopping, [Shop.pause]), (Banking, [Account.earn])):
+            env = aec_env(source, points)
+            play(env, 1, seed=0)
+            env.reset(seed=1)  # of others, a banker might never earn
+            env.close()
+            del env
+        gc.collect()
+    assert [str(warning.message) for warning in caught] == []

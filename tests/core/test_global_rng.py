@@ -1,0 +1,290 @@
+"""``global_rng=True``: global generators of its own for each environment, and untouched ones for everybody else."""
+
+import random
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    OptionValueError,
+    WrongThreadError,
+    aec_env,
+    joint_env,
+    parallel_env,
+    simulate,
+    single_env,
+)
+from simenv_marl.core import rng
+from tests.worlds.models import decision, define, play
+
+
+class Casino:
+    """Draws from everything that is global, in every part of it."""
+
+    def __init__(self):
+        self.luck = (random.random(), np.random.random())
+
+    def reset(self, seed=None):
+        self.seed = seed
+        self.log = [random.random(), np.random.random(), random.gauss(0, 1), np.random.standard_normal()]
+
+    def run(self):
+        for _ in range(6):
+            self.log.append(self.bet(random.randrange(10)))
+            self.log.append(random.gauss(0, 1))
+            self.log.append(np.random.normal())
+        return TRUNCATED
+
+    def bet(self, card):
+        return random.choice("abc") + str(np.random.randint(100))
+
+
+BET = f"{__name__}.Casino.bet"
+POINTS = {BET: define(agent="player_0", observation_space_mapping=lambda casino, card: [card, np.random.random()])}
+BOTH_STATES = pytest.mark.parametrize("state", [rng.SwiftState, rng.PortableState])
+
+
+def world():
+    """The state of all global generators."""
+    numpy_state = np.random.get_state(legacy=False)
+    return (
+        random.getstate(),
+        numpy_state["state"]["key"].tolist(),
+        numpy_state["state"]["pos"],
+        numpy_state["has_gauss"],
+        numpy_state["gauss"],
+    )
+
+
+@pytest.fixture(params=[rng.SwiftState, rng.PortableState])
+def _states(request, monkeypatch):
+    monkeypatch.setattr(rng, "_State", request.param)
+    monkeypatch.setattr(rng, "_owners", [rng._Owner()])
+
+
+@pytest.fixture(autouse=True)
+def _kept():
+    """Leaves the generators as they were, with a normally distributed number kept in both."""
+    before = world()
+    random.gauss(0, 1)
+    np.random.standard_normal()
+    yield
+    random.setstate(before[0])
+    del before
+
+
+def plain(seed):
+    """What a run without the library draws when both generators were seeded so."""
+    casino = Casino()
+    random.seed(seed)
+    np.random.seed(seed)
+    casino.reset(seed)
+    casino.run()
+    return casino.log
+
+
+def test_here_states_are_copied_swiftly():
+    assert rng._State is rng.SwiftState
+
+
+@pytest.mark.usefixtures("_states")
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+@pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
+def test_an_environment_draws_as_the_plain_run_with_its_seed(make, driver):
+    points = {BET: define(agent="player_0")}
+    log = plain(7)
+    random.seed(99)
+    np.random.seed(99)
+    before = world()
+    env = make(Casino, points, global_rng=True, driver=driver)
+    for _ in range(2):
+        env.reset(seed=7)
+        assert world() == before
+        while env._session.episode is not None and not env._session.episode.over:
+            random.setstate(before[0])  # whatever its user draws meanwhile
+            env.step(RULE)
+            assert world() == before
+        assert env.unwrapped.simulation.log == log
+    env.reset(seed=7)
+    env.close()
+    assert world() == before
+
+
+@pytest.mark.usefixtures("_states")
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+def test_interleaved_environments_are_as_reproducible_as_alone(driver):
+    def run(env, seed):
+        env.reset(seed=seed)
+        seen = []
+        for _ in range(6):
+            seen.append(env.last()[0].tolist())
+            env.step(RULE)
+            yield
+        yield seen, list(env.simulation.log)
+
+    def alone(seed):
+        *_, found = run(aec_env(Casino, POINTS, global_rng=True, driver=driver), seed)
+        return found
+
+    expected = [alone(seed) for seed in (1, 2, 1)]
+    runs = [run(aec_env(Casino, POINTS, global_rng=True, driver=driver), seed) for seed in (1, 2, 1)]
+    found = []
+    for steps in range(7):
+        found = [next(each) for each in runs]
+        np.random.seed(steps)  # the user draws as well
+    assert found == expected
+    assert expected[0] == expected[2] != expected[1]
+
+
+def test_an_episode_without_a_seed_is_that_of_the_seed_that_it_drew():
+    env = aec_env(Casino, POINTS, global_rng=True)
+    play(env)
+    assert env.simulation.log[:4] == plain(env.simulation.seed)[:4]
+    assert env.provenance()["options"] == {"global_rng": True}
+
+
+def test_without_it_generators_are_everybodys():
+    random.seed(5)
+    env = aec_env(Casino, POINTS)
+    env.reset(seed=7)
+    random.seed(5)
+    env.step(RULE)
+    first = env.simulation.log[-1]
+    random.seed(5)
+    env.step(RULE)
+    assert env.simulation.log[-1] != plain(7)[-1]
+    assert first is not None
+
+
+def test_simulate_leaves_its_users_generators_alone():
+    before = world()
+    seen = simulate(Casino, {BET: lambda observation: int(observation[0])}, points=POINTS, seed=3, global_rng=True)
+    assert world() == before
+    again = simulate(Casino, {BET: lambda observation: int(observation[0])}, points=POINTS, seed=3, global_rng=True)
+    assert seen.log == again.log
+
+
+def test_errors_give_the_generators_back():
+    before = world()
+    ant = decision(agent="ant_0", observation_space_mapping=lambda: 1 / 0)
+
+    class Broken(Casino):
+        def run(self):
+            random.random()
+            ant()
+
+    env = aec_env(Broken, ant, global_rng=True)
+    with pytest.raises(ZeroDivisionError):
+        env.reset(seed=1)
+    assert world() == before
+    env = aec_env(Casino, POINTS, global_rng=True)
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="action"):
+        env.step(77)
+    assert world() == before
+    del env
+    assert world() == before
+
+
+def test_models_that_seed_the_generators_themselves():
+    class Seeding(Casino):
+        def run(self):
+            random.seed(1)
+            np.random.seed(1)
+            self.log.append(self.bet(0))
+
+    before = world()
+    logs = []
+    for seed in (1, 2):
+        env = aec_env(Seeding, POINTS, global_rng=True)
+        play(env, RULE, seed=seed)
+        logs.append(env.simulation.log[-1])
+    assert logs[0] == logs[1]
+    assert world() == before
+
+
+def test_other_bit_generators_of_the_user_stay():
+    ours = np.random.get_bit_generator()
+    theirs = np.random.PCG64(3)
+    np.random.set_bit_generator(theirs)
+    try:
+        env = aec_env(Casino, {BET: define(agent="player_0")}, global_rng=True)
+        play(env, RULE, seed=7)
+        assert np.random.get_bit_generator() is theirs
+        assert theirs.state == np.random.PCG64(3).state
+    finally:
+        np.random.set_bit_generator(ours)
+    assert env.simulation.log == plain(7)
+
+
+def test_one_environment_inside_another():
+    inner = aec_env(Casino, POINTS, global_rng=True)
+    inner.reset(seed=2)
+    inner.step(RULE)
+    inner.step(RULE)
+    expected = list(inner.simulation.log)
+
+    def policy(observation):
+        inner.step(RULE)
+        return int(observation[0])
+
+    without = simulate(Casino, {BET: lambda observation: int(observation[0])}, points=POINTS, seed=3, global_rng=True)
+    inner.reset(seed=2)
+    outer = simulate(Casino, {BET: policy}, points=POINTS, seed=3, global_rng=True)
+    assert outer.log == without.log
+    assert inner.simulation.log[: len(expected)] == expected
+
+
+def test_two_at_work_at_once_in_two_threads_are_refused():
+    """There is one state of the global generators in a process, and whoever is at work has it."""
+    other, errors = aec_env(Casino, POINTS, global_rng=True), []
+
+    def work():
+        with pytest.raises(WrongThreadError, match="one state") as caught:
+            other.reset(seed=1)
+        errors.append(caught.value)
+
+    def observe(casino, card):
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join(30)
+        return [card, 0]
+
+    before = world()
+    env = aec_env(Casino, {BET: define(agent="player_0", observation_space_mapping=observe)}, global_rng=True)
+    env.reset(seed=7)
+    env.step(RULE)
+    assert len(errors) == 2
+    other.reset(seed=1)
+    other.close()
+    env.step(RULE)
+    assert env.simulation.log == plain(7)[: len(env.simulation.log)]
+    random.setstate(before[0])
+
+
+def test_only_true_and_false():
+    with pytest.raises(OptionValueError, match="global_rng"):
+        aec_env(Casino, POINTS, global_rng=1)
+
+
+def test_without_the_memory_layout_that_is_expected_the_portable_way_is_taken():
+    code = """
+import _random, sys
+class Other(_random.Random):
+    pass
+import random
+random._inst = None
+import numpy as np
+before = np.random.get_state(legacy=False)["state"]["pos"]
+import ctypes
+ctypes.string_at = lambda *args: b""
+import simenv_marl.core.rng as generators
+print(generators._State.__name__, np.random.get_state(legacy=False)["state"]["pos"] == before)
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert ran.stdout.split() == ["PortableState", "True"], ran.stderr

@@ -1,0 +1,396 @@
+"""What goes through a space: observations are cast to it, actions and masks are checked against it."""
+
+import copy
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import MaskError, ObservationError
+from simenv_marl.core.spaces import (
+    ILLEGAL,
+    action_check,
+    blank,
+    duplicate,
+    mask_allows,
+    mask_cast,
+    observation_cast,
+    open_mask,
+    same,
+)
+
+BOX = spaces.Box(-1.0, 3.0, (2,), np.float32)
+BYTES = spaces.Box(0, 255, (2,), np.uint8)
+DIAL = spaces.Discrete(3, start=5)
+DIALS = spaces.MultiDiscrete([2, 3], start=[0, 4])
+BITS = spaces.MultiBinary(3)
+TREE = spaces.Dict({"box": BOX, "pair": spaces.Tuple((DIAL, spaces.Dict({"bits": BITS})))})
+WORDS = spaces.Text(5)
+
+
+# -- observations ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "expected"),
+    [
+        (BOX, [1, 2], np.array([1, 2], np.float32)),
+        (BOX, np.array([1.5, 9.0]), np.array([1.5, 9.0], np.float32)),
+        (BOX, (True, False), np.array([1, 0], np.float32)),
+        (BYTES, [0, 255], np.array([0, 255], np.uint8)),
+        (BYTES, [1.0, 2.9], np.array([1, 2], np.uint8)),
+        (DIAL, 6, np.int64(6)),
+        (DIAL, 6.0, np.int64(6)),
+        (DIAL, np.array(7), np.int64(7)),
+        (DIALS, [1, 5], np.array([1, 5], np.int64)),
+        (BITS, [True, False, True], np.array([1, 0, 1], np.int8)),
+        (WORDS, "word", "word"),
+    ],
+    ids=str,
+)
+def test_observations_are_cast(space, value, expected):
+    found = observation_cast(space)(value)
+    assert type(found) is type(expected)
+    assert getattr(found, "dtype", None) == getattr(expected, "dtype", None)
+    assert np.array_equal(found, expected)
+
+
+def test_observations_in_observations_are_cast():
+    found = observation_cast(TREE)({"pair": [6.0, {"bits": [1, 0, 0]}], "box": [1, 2]})
+    assert list(found) == ["box", "pair"]
+    assert found["box"].dtype == np.float32
+    assert type(found["pair"]) is tuple
+    assert type(found["pair"][0]) is np.int64
+    assert found["pair"][1]["bits"].dtype == np.int8
+    assert found in TREE
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "match"),
+    [
+        (BOX, [1, 2, 3], r"shape \(3,\)"),
+        (BOX, 1.0, r"shape \(\)"),
+        (BOX, [[1], [2, 3]], "no array"),
+        (BOX, ["a", "b"], "no number"),
+        (BOX, [1j, 2], "no number"),
+        (BYTES, [0, np.nan], "not finite"),
+        (BYTES, [0, np.inf], "not finite"),
+        (BYTES, [0, 256], "cannot hold"),
+        (BYTES, [-1, 0], "cannot hold"),
+        (DIAL, 6.5, "no integer"),
+        (DIAL, "6x", "no integer"),
+        (DIAL, [6, 7], "no integer"),
+        (DIAL, None, "no integer"),
+        (DIAL, np.inf, "no integer"),
+        (TREE, {"box": [1, 2]}, "keys"),
+        (TREE, {"box": [1, 2], "pear": [6, {"bits": [1, 0, 0]}]}, "keys"),
+        (TREE, 3, "keys"),
+        (TREE, {"box": [1, 2], "pair": [6]}, "2 parts"),
+        (TREE, {"box": [1, 2], "pair": {0: 6, 1: 7}}, "2 parts"),
+        (TREE, {"box": [1, 2], "pair": [6, {"bits": [1, 0]}]}, "shape"),
+        (WORDS, "too many words", "not in"),
+        (WORDS, 3, "not in"),
+    ],
+    ids=str,
+)
+def test_what_is_no_observation_is_refused(space, value, match):
+    with pytest.raises(ObservationError, match=match):
+        observation_cast(space)(value)
+
+
+@pytest.mark.parametrize(
+    ("space", "value"),
+    [
+        (BOX, np.array([1, 2], np.float32)),
+        (BOX, np.array([1, 2], np.float64)),
+        (BYTES, np.array([1, 2], np.uint8)),
+        (DIALS, np.array([1, 5], np.int64)),
+        (BITS, np.array([1, 1, 1], np.int8)),
+        (spaces.Dict({"box": BOX}), {"box": np.array([1, 2], np.float32)}),
+        (spaces.Tuple((BOX,)), (np.array([1, 2], np.float32),)),
+    ],
+    ids=str,
+)
+def test_observations_are_shared_with_no_model(space, value):
+    kept = copy.deepcopy(value)
+    found = observation_cast(space)(value)
+    for array in (part for part in leaves(found) if isinstance(part, np.ndarray)):
+        array[...] = 0
+    assert same(kept, value)
+
+
+def leaves(value):
+    """What a nested observation consists of."""
+    if isinstance(value, dict):
+        value = tuple(value.values())
+    return [leaf for part in value for leaf in leaves(part)] if isinstance(value, tuple) else [value]
+
+
+def test_views_of_arrays_are_copied():
+    held = np.zeros((3, 2), np.float32)
+    found = observation_cast(BOX)(held[1])
+    found[:] = 7
+    assert not held.any()
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.arange(3.0),
+        {"a": np.arange(3.0), "b": {"c": np.arange(2)}},
+        (np.arange(3.0), (np.arange(2), 3)),
+        [np.arange(3.0)],
+        {"a": [1, [2]]},
+    ],
+    ids=str,
+)
+def test_duplicates_share_nothing(value):
+    kept = copy.deepcopy(value)
+    found = duplicate(value)
+    assert type(found) is type(value)
+    assert same(found, value)
+    spoil(found)
+    assert same(value, kept)
+    assert not same(found, kept)
+
+
+def spoil(value):
+    """Change all that can be changed in a nested value."""
+    if isinstance(value, np.ndarray):
+        value += 1
+    elif isinstance(value, list) and value and isinstance(value[-1], int):
+        value.append(9)
+    elif not isinstance(value, int | float):
+        for part in value.values() if isinstance(value, dict) else value:
+            spoil(part)
+
+
+@pytest.mark.parametrize("value", [3, 2.5, "word", np.float32(2), np.int8(3)])
+def test_what_never_changes_needs_no_duplicate(value):
+    assert duplicate(value) is value
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        (np.array([1.0, np.nan]), np.array([1.0, np.nan]), True),
+        (np.array([1.0, 2.0]), np.array([1.0, 3.0]), False),
+        (np.array([1, 2]), np.array([1, 2, 3]), False),
+        (np.array(["a"]), np.array(["a"]), True),
+        ({"a": np.array([1])}, {"a": np.array([1])}, True),
+        ({"a": np.array([1])}, {"a": np.array([2])}, False),
+        ({"a": 1}, {"b": 1}, False),
+        ({"a": 1}, {"a": 1, "b": 1}, False),
+        ({"a": 1}, [1], False),
+        ((1, np.array([2])), (1, np.array([2])), True),
+        ((1, 2), (1, 3), False),
+        ((1, 2), (1, 2, 3), False),
+        (3, 3, True),
+        (3, 4, False),
+        ("word", "word", True),
+    ],
+    ids=str,
+)
+def test_same_compares_number_for_number(one, other, expected):
+    assert same(one, other) is expected
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (BOX, np.zeros(2, np.float32)),
+        (spaces.Box(2.0, 3.0, (2,), np.float32), np.full(2, 2, np.float32)),
+        (spaces.Box(-3.0, -2.0, (1,), np.float64), np.full(1, -2.0)),
+        (DIAL, np.int64(5)),
+        (spaces.Discrete(3, start=-7), np.int64(-5)),
+        (spaces.Discrete(9, start=-4), np.int64(0)),
+        (DIALS, np.array([0, 4])),
+        (spaces.MultiDiscrete([2, 2], start=[-5, -1]), np.array([-4, 0])),
+        (BITS, np.zeros(3, np.int8)),
+    ],
+    ids=str,
+)
+def test_blanks_are_zero_clipped_into_their_space(space, expected):
+    found = blank(space)
+    assert found in space
+    assert type(found) is type(expected)
+    assert found.dtype == expected.dtype
+    assert np.array_equal(found, expected)
+
+
+def test_blanks_of_nested_spaces():
+    assert same(blank(TREE), {"box": np.zeros(2), "pair": (5, {"bits": np.zeros(3)})})
+    assert list(blank(TREE)) == ["box", "pair"]
+
+
+def test_the_blank_of_a_space_without_a_zero_is_always_the_same():
+    WORDS.seed(3)
+    state = WORDS.np_random.bit_generator.state
+    assert blank(WORDS) == blank(WORDS)
+    assert blank(WORDS) in WORDS
+    assert WORDS.np_random.bit_generator.state == state
+
+
+# -- actions --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("action", [5, 7, np.int8(6), np.array(6), np.int64(7)], ids=repr)
+def test_actions_of_discrete_spaces_are_python_integers(action):
+    found = action_check(DIAL)(action)
+    assert type(found) is int
+    assert found == int(action)
+
+
+@pytest.mark.parametrize("action", [4, 8, 5.0, "5", None, np.array([5]), [5], np.float32(5), True], ids=repr)
+def test_other_actions_of_discrete_spaces_are_illegal(action):
+    assert action_check(DIAL)(action) is ILLEGAL
+
+
+def test_truth_is_a_number():
+    assert action_check(spaces.Discrete(2))(True) == 1
+    assert action_check(spaces.Discrete(2))(np.bool_(0)) == 0
+
+
+@pytest.mark.parametrize("number", [1, 2, 40])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_actions_of_boxes_are_copies_in_their_dtype(number, dtype):
+    check = action_check(spaces.Box(-1, 1, (number,), dtype))
+    for given in (np.full(number, 0.1, np.float64), np.full(number, 0.1, np.float32), [0.1] * number):
+        found = check(given)
+        assert found.dtype == dtype
+        assert found.shape == (number,)
+        assert np.allclose(found, 0.1)
+        if isinstance(given, np.ndarray):
+            found[:] = 9
+            assert given[0] != 9
+
+
+@pytest.mark.parametrize("number", [1, 2, 40])
+@pytest.mark.parametrize("at", [0, -1])
+@pytest.mark.parametrize("wrong", [1.5, -1.5, np.nan, np.inf])
+def test_each_element_of_a_box_counts(number, at, wrong):
+    check = action_check(spaces.Box(-1, 1, (number,), np.float64))
+    for bound in (-1.0, 1.0):
+        assert check(np.full(number, bound)) is not ILLEGAL
+    action = np.zeros(number)
+    action[at] = wrong
+    for given in (action, action.astype(np.float32), action.tolist()):
+        assert check(given) is ILLEGAL
+
+
+def test_the_sides_of_a_box_count_where_they_are():
+    check = action_check(spaces.Box(np.array([0, 10]), np.array([1, 11]), dtype=np.float64))
+    assert check(np.array([1.0, 10.0])) is not ILLEGAL
+    assert check(np.array([10.0, 1.0])) is ILLEGAL
+
+
+@pytest.mark.parametrize(
+    "action", [[0.0], [0.0, 0.0, 0.0], 0.0, "ab", None, [[0.0, 0.0]], [None, 0.0], [[1], [2, 3]]], ids=repr
+)
+def test_what_is_no_element_of_a_box_is_illegal(action):
+    assert action_check(BOX)(action) is ILLEGAL
+
+
+@pytest.mark.parametrize("action", [0.5, np.float32(0.5), 1, np.array(0.5)], ids=repr)
+def test_the_one_number_of_a_box_comes_out_as_it_went_in(action):
+    assert action_check(spaces.Box(0, 1, (1,), np.float32))(action) is action
+
+
+@pytest.mark.parametrize("action", [1.5, -0.5, np.float32(2), 2, np.array(-1.0), np.nan], ids=repr)
+def test_the_one_number_of_a_box_has_its_bounds(action):
+    assert action_check(spaces.Box(0, 1, (1,), np.float32))(action) is ILLEGAL
+
+
+@pytest.mark.parametrize("bound", [0.1, 0.3, 0.7])
+def test_a_bound_is_legal_in_every_precision(bound):
+    check = action_check(spaces.Box(-bound, bound, (2,), np.float32))
+    for given in (np.float32, np.float64):
+        assert check(np.full(2, bound, given)) is not ILLEGAL
+        assert check(np.full(2, -bound, given)) is not ILLEGAL
+
+
+def test_integers_never_wrap_around():
+    check = action_check(spaces.Box(0, 10, (2,), np.uint8))
+    assert check([256, 0]) is ILLEGAL
+    assert check(np.array([-255, 0])) is ILLEGAL
+    assert check([1.0, 2.0]) is ILLEGAL
+    assert check([10, 0]).dtype == np.uint8
+
+
+def test_other_spaces_are_asked_themselves():
+    check, given = action_check(DIALS), np.array([1, 6])
+    found = check(given)
+    assert found.tolist() == [1, 6]
+    assert found is not given
+    assert check(np.array([2, 6])) is ILLEGAL
+    assert action_check(WORDS)("word") == "word"
+    assert action_check(WORDS)("too many words") is ILLEGAL
+
+
+def test_a_space_that_chokes_has_no_such_element():
+    class Choking(spaces.Space):
+        def contains(self, x):
+            raise RuntimeError("what is that")
+
+    assert action_check(Choking((), np.int8))(3) is ILLEGAL
+
+
+# -- masks ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "given", [[1, 0, 1], (True, False, True), np.array([1.0, 0.0, 1.0]), np.array([1, 0, 1], np.int8)]
+)
+def test_masks_are_new_arrays(given):
+    found = mask_cast(DIAL)(given)
+    assert found.tolist() == [1, 0, 1]
+    assert found.dtype == np.int8
+    found[:] = 0
+    assert list(given) == [1, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        ([1, 0], "shape"),
+        ([1, 0, 1, 1], "shape"),
+        ([[1, 0, 1]], "shape"),
+        (1, "shape"),
+        ([1, 2, 0], "other than 0 and 1"),
+        ([0.5, 1, 0], "other than 0 and 1"),
+        ([0, 0, 0], "no legal action"),
+    ],
+    ids=str,
+)
+def test_what_is_no_mask_is_refused(given, match):
+    with pytest.raises(MaskError, match=match):
+        mask_cast(DIAL)(given)
+    with pytest.raises(MaskError, match=match):
+        mask_cast(DIALS)(([1, 1], given))
+
+
+@pytest.mark.parametrize("given", [([1, 1],), ([1, 1], [1, 1, 1], [1]), np.ones((2, 3)), None], ids=str)
+def test_masks_of_several_numbers_are_tuples(given):
+    with pytest.raises(MaskError, match="2 parts"):
+        mask_cast(DIALS)(given)
+    found = mask_cast(DIALS)([[1, 0], [0, 1, 1]])
+    assert type(found) is tuple
+    assert [part.tolist() for part in found] == [[1, 0], [0, 1, 1]]
+
+
+def test_a_mask_tells_what_is_allowed():
+    mask = np.array([0, 1, 0], np.int8)
+    assert [mask_allows(DIAL, mask, action) for action in (5, 6, 7)] == [False, True, False]
+    masks = (np.array([1, 0], np.int8), np.array([0, 0, 1], np.int8))
+    allowed = [
+        [one, other] for one in (0, 1) for other in (4, 5, 6) if mask_allows(DIALS, masks, np.array([one, other]))
+    ]
+    assert allowed == [[0, 6]]
+
+
+def test_open_masks_allow_everything():
+    assert open_mask(DIAL).tolist() == [1, 1, 1]
+    assert open_mask(DIAL).dtype == np.int8
+    assert [mask.tolist() for mask in open_mask(DIALS)] == [[1, 1], [1, 1, 1]]
+    assert all(mask_allows(DIALS, open_mask(DIALS), np.array([one, other])) for one in (0, 1) for other in (4, 5, 6))
+    assert open_mask(DIAL) is not open_mask(DIAL)

@@ -1,0 +1,493 @@
+"""driver="thread": simulations in threads of their own, and environments that are used from changing threads."""
+
+import asyncio
+import contextvars
+import gc
+import signal
+import sys
+import threading
+import time
+import warnings
+import weakref
+from contextlib import suppress
+from itertools import count
+
+import greenlet
+import numpy as np
+import pytest
+
+from simenv_marl import RULE, ReentrancyError, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl.core import threads
+from tests.worlds.models import calling, decision, notes, play, script
+
+VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
+
+
+def in_a_thread(function, *args):
+    """Run a function in a thread; return what it has returned, or raise what it has raised."""
+    outcome = []
+
+    def run():
+        try:
+            outcome.append((function(*args), None))
+        except BaseException as error:
+            outcome.append((None, error))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    result, error = outcome[0]
+    if error is not None:
+        raise error
+    return result
+
+
+def simulation_threads():
+    return [thread for thread in threading.enumerate() if thread.name == "simulation"]
+
+
+@pytest.fixture(autouse=True)
+def older_threads():
+    """Those that were there before the test. It is to leave no others."""
+    gc.collect()
+    before = simulation_threads()
+    yield before
+    gc.collect()
+    assert simulation_threads() == before
+
+
+# -- where it runs --------------------------------------------------------------------------------
+
+
+def test_the_simulation_has_one_thread_of_its_own_and_mappings_run_in_its_users():
+    seen = {"model": [], "mapping": [], "policy": []}
+
+    def here(where, value):
+        seen[where].append(threading.get_ident())
+        return value
+
+    def main(simulation):
+        for _ in range(3):
+            here("model", decide())
+            here("model", other())
+
+    decide = decision(
+        agent="a_0",
+        observation_space_mapping=lambda: here("mapping", [0, 0]),
+        reward_mapping=lambda: here("mapping", 0.0),
+        action_space_mapping=lambda action: here("mapping", action),
+    )
+    other = decision(agent="b_0")
+    env = aec_env(
+        script(main), [decide, other], policies={"b_0": lambda observation: here("policy", 1)}, driver="thread"
+    )
+    play(env, 1)
+    me = threading.get_ident()
+    assert set(seen["mapping"]) == set(seen["policy"]) == {me}
+    assert len(seen["model"]) == 6
+    assert len(set(seen["model"])) == 1
+    assert me not in seen["model"]
+
+
+def test_the_rule_and_apply_run_in_the_simulations_thread():
+    seen = []
+    applied = decision(apply=lambda action: seen.append(threading.get_ident()))
+    ruled = decision(lambda: seen.append(threading.get_ident()), agent="b_0")
+    env = aec_env(
+        script(lambda simulation: (seen.append(threading.get_ident()), applied(), ruled())),
+        [applied, ruled],
+        driver="thread",
+    )
+    play(env, {"choose_0": 1, "b_0": RULE})
+    assert len(seen) == 3
+    assert set(seen) != {threading.get_ident()}
+    assert len(set(seen)) == 1
+
+
+def test_thread_locals_and_event_loops_are_the_models_own():
+    local = threading.local()
+    local.value = "the user's"
+
+    async def work(simulation):
+        for _ in range(2):
+            await asyncio.sleep(0)
+            simulation.log.append((getattr(local, "value", None), decide()))
+
+    def main(simulation):
+        asyncio.run(work(simulation))
+
+    async def use(env):
+        env.reset()
+        env.step(1)
+        await asyncio.sleep(0)
+        assert env.step(2)[2]
+        return asyncio.get_running_loop()
+
+    decide = decision()
+    env = single_env(script(main), decide, driver="thread")
+    asyncio.run(use(env))
+    assert env.simulation.log == [(None, 1), (None, 2)]
+
+
+def test_context_variables_of_the_user_are_seen():
+    variable = contextvars.ContextVar("variable", default="nobody's")
+    decide = decision(lambda: variable.get())
+    env = single_env(calling(decide, decide), decide, driver="thread")
+    token = variable.set("the user's")
+    env.reset()
+    variable.reset(token)
+    env.step(RULE)
+    env.step(RULE)
+    assert env.simulation.log == ["the user's"] * 2
+
+
+def test_observations_that_the_model_keeps_are_copied_and_fresh_ones_are_nobody_elses():
+    kept = np.zeros(2)
+
+    def main(simulation):
+        for _ in range(3):
+            kept[:] += 1
+            shared()
+            fresh()
+
+    shared = decision(agent="a_0", observation_space_mapping=lambda: kept)
+    fresh = decision(agent="b_0", observation_space_mapping=lambda: kept.copy())
+    env = aec_env(script(main), [shared, fresh], driver="thread")
+    turns = play(env, 1)
+    seen = {agent: [turn.observation for turn in turns if turn.agent == agent] for agent in ("a_0", "b_0")}
+    assert [array.tolist() for array in seen["a_0"]] == [[n, n] for n in (1, 2, 3, 3)]
+    assert [array.tolist() for array in seen["b_0"]] == [[n, n] for n in (1, 2, 3, 3)]
+    everything = [*seen["a_0"], *seen["b_0"], kept]
+    assert not any(np.shares_memory(a, b) for n, a in enumerate(everything) for b in everything[:n])
+
+
+def test_policies_go_back_into_models_in_threads():
+    decide = decision()
+    simulation = simulate(calling(decide, decide), {decide: lambda observation: 4}, driver="thread")
+    assert simulation.log == [4, 4]
+
+
+# -- from any thread ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", [aec_env, parallel_env, single_env, joint_env])
+def test_an_environment_may_be_used_from_a_new_thread_each_time(view):
+    decide = decision(agent="a_0")
+    env = view(calling(*[decide] * 3), decide, driver="thread")
+    action = {aec_env: 1, single_env: 1}.get(view, {"a_0": 1})
+    for _ in range(2):
+        in_a_thread(env.reset)
+        for _ in range(3):
+            in_a_thread(env.step, action)
+        assert env.simulation.log == [1, 1, 1]
+    in_a_thread(env.reset)
+    in_a_thread(env.close)
+    env.reset()
+    assert env.simulation.episodes == 4
+    env.close()
+
+
+def test_an_environment_may_be_dropped_in_any_thread_and_unwinds_at_once():
+    log = []
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            log.append("unwound")
+            decide()
+            log.append("never")
+
+    decide = decision()
+    held = [single_env(script(main), decide, driver="thread")]
+    held[0].reset()
+    reference = weakref.ref(held[0])
+    in_a_thread(held.clear)
+    assert log == ["unwound"]
+    assert reference() is None
+
+
+def test_greenlets_of_the_user_may_step_it_too():
+    decide = decision()
+    env = single_env(calling(*[decide] * 4), decide, driver="thread")
+    env.reset()
+    for number in range(4):
+        greenlet.greenlet(env.step).switch(number)
+    assert env.simulation.log == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("what", ["step", "reset", "close"])
+@VIEWS
+def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what):
+    inside, go_on = threading.Event(), threading.Event()
+
+    def main(simulation):
+        simulation.log.append(decide())
+        inside.set()
+        assert go_on.wait(10)
+        simulation.log.append(decide())
+
+    decide = decision()
+    env = view(script(main), decide, driver="thread")
+    env.reset()
+    stepping = threading.Thread(target=env.step, args=(1,))
+    stepping.start()
+    assert inside.wait(10)
+    with pytest.raises(ReentrancyError, match="another thread"):
+        env.step(2) if what == "step" else getattr(env, what)()
+    go_on.set()
+    stepping.join()
+    env.step(3)
+    assert env.simulation.log == [1, 3]
+    assert env.simulation.episodes == 1
+
+
+def test_many_threads_at_once_get_a_step_each_or_none():
+    decide = decision(observation_space_mapping=lambda: [len(env.simulation.log), 0.0])
+    env = single_env(calling(*[decide] * 400), decide, driver="thread")
+    env.reset()
+    results, refused, barrier = [], [], threading.Barrier(4)
+
+    def work(number):
+        barrier.wait()
+        for _ in range(100):
+            try:
+                results.append((number, int(env.step(number)[0][0])))
+            except ReentrancyError:
+                refused.append(number)
+                time.sleep(0)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(results) + len(refused) == 400
+    # Each step was answered with what came of it, and with nothing of anybody else's.
+    assert sorted(place for _, place in results) == list(range(1, len(results) + 1))
+    assert [number for number, _ in sorted(results, key=lambda result: result[1])] == env.simulation.log[: len(results)]
+    env.close()
+
+
+def test_an_environment_is_not_used_from_inside_its_own_simulation_or_mappings():
+    raised = []
+
+    def use(*arguments):
+        for method in (lambda: env.step(1), env.reset, env.close):
+            with suppress(ReentrancyError):
+                method()
+                pytest.fail("it was used")
+            raised.append(True)
+        return 0.0
+
+    decide = decision(agent="a_0")
+    other = decision(agent="b_0", reward_mapping=use)
+    env = aec_env(script(lambda simulation: (decide(), use(), decide(), other())), [decide, other], driver="thread")
+    env.reset()
+    env.step(1)
+    env.step(1)
+    assert len(raised) == 6
+    assert env.agent_selection == "b_0"
+    env.close()
+
+
+# -- what is left behind --------------------------------------------------------------------------
+
+
+@VIEWS
+@pytest.mark.parametrize(
+    "how", ["end", "truncated", "close", "collect", "reset", "model error", "mapping error", "none"]
+)
+def test_no_thread_is_left_after_any_end(view, how):
+    def rewarded():
+        if how == "mapping error" and env.failing:
+            raise ZeroDivisionError
+        return 0.0
+
+    def main(simulation):
+        decide()
+        if how == "model error":
+            raise ZeroDivisionError
+        decide()
+        if how == "truncated":
+            decide()
+
+    before = simulation_threads()
+    decide = decision(reward_mapping=rewarded)
+    env = view(script(main), decide, driver="thread", max_steps=2)
+    env.failing = False
+    assert len(simulation_threads()) == len(before) + 1  # in which the simulation was made
+    if how != "none":
+        env.reset()
+        assert len(simulation_threads()) == len(before) + 1
+        env.failing = True
+        if "error" in how:
+            with pytest.raises(ZeroDivisionError):
+                env.step(1)
+        else:
+            env.step(1)
+    if how in ("end", "truncated"):
+        env.step(1)
+    if how == "reset":
+        for _ in range(5):
+            env.reset()
+        assert len(simulation_threads()) == len(before) + 1
+    assert len(simulation_threads()) == len(before) + 1  # the one in which the next episode is going to run
+    if how in ("collect", "none"):
+        del env
+    else:
+        env.close()
+    assert simulation_threads() == before
+
+
+def test_too_many_threads_are_an_error(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise RuntimeError("can't start new thread")
+
+    decide = decision()
+    env = single_env(calling(decide), decide, driver="thread")
+    env.close()
+    before = simulation_threads()
+    monkeypatch.setattr(threading, "_start_joinable_thread", refuse, raising=False)
+    monkeypatch.setattr(threading, "_start_new_thread", refuse, raising=False)
+    with pytest.raises(RuntimeError, match="can't start"):
+        env.reset()
+    with pytest.raises(RuntimeError, match="can't start"):
+        single_env(calling(decide), decide, driver="thread")
+    assert simulation_threads() == before
+    monkeypatch.undo()
+    env.reset()
+    env.step(1)
+    assert env.simulation.log == [1]
+
+
+# -- errors and interruptions ---------------------------------------------------------------------
+
+
+needs_signals = pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="the platform has no pthread_kill")
+
+
+@pytest.fixture
+def interruptible():
+    """Whoever is started in the background of a shell ignores Ctrl-C, and Python leaves it at that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupt():
+    time.sleep(0.02)  # by now it is waited for the simulation
+    signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+
+@needs_signals
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupted_wait_ends_the_episode_and_the_simulation_unwinds_at_its_next_decision():
+    log, interrupted = [], threading.Event()
+
+    def main(simulation):
+        try:
+            log.append(decide())
+            if simulation.episodes == 1:
+                interrupt()
+                assert interrupted.wait(10)
+            log.append(decide())
+        finally:
+            log.append("unwound")
+
+    def stop():
+        interrupted.set()
+
+    decide = decision()
+    env = single_env(script(main), decide, driver="thread")
+    env.reset()
+    env.simulation.stop = stop  # is called as soon as the interruption has surfaced
+    with pytest.raises(KeyboardInterrupt) as caught:
+        env.step(1)
+    assert log == [1, "unwound"]
+    assert "seed" in notes(caught.value)
+    env.reset()
+    env.step(2)
+    assert env.step(3)[2]
+    assert log == [1, "unwound", 2, 3, "unwound"]
+
+
+@needs_signals
+@pytest.mark.usefixtures("interruptible")
+def test_a_simulation_that_never_decides_again_is_given_up_with_a_warning(monkeypatch, older_threads):
+    monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
+    go_on, log, numbers = threading.Event(), [], count(1)
+
+    def main(simulation):
+        number = next(numbers)
+        log.append(decide())
+        if number == 1:
+            interrupt()
+            assert go_on.wait(10)
+        try:
+            log.append(decide())
+        finally:
+            log.append(f"unwound {number}")
+
+    decide = decision()
+    env = single_env(script(main), decide, driver="thread")
+    env.reset()
+    (stuck,) = set(simulation_threads()) - set(older_threads)
+    with pytest.raises(KeyboardInterrupt), pytest.warns(ResourceWarning, match=r"Script.*neither decided"):
+        env.step(1)
+    env.reset()
+    env.step(2)
+    go_on.set()  # it was given up, but it is not to go on for ever
+    stuck.join(10)
+    assert log == [1, 2, "unwound 1"]
+    env.step(3)
+    assert log == [1, 2, "unwound 1", 3, "unwound 2"]
+
+
+@pytest.mark.parametrize("how", ["close", "collect"])
+def test_a_simulation_that_hangs_while_it_unwinds_is_given_up_with_a_warning(monkeypatch, how, older_threads):
+    monkeypatch.setattr(threads, "SECONDS_TO_UNWIND", 0.05)
+    go_on = threading.Event()
+
+    def main(simulation):
+        try:
+            decide()
+        finally:
+            go_on.wait(10)
+
+    decide = decision()
+    env = single_env(script(main), decide, driver="thread")
+    env.reset()
+    (stuck,) = set(simulation_threads()) - set(older_threads)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if how == "close":
+            env.close()
+        del env
+        gc.collect()
+    assert [warning.category for warning in caught] == [ResourceWarning]
+    go_on.set()
+    stuck.join(10)
+
+
+def test_a_model_that_refuses_to_unwind_is_left_suspended(older_threads):
+    stop = [False]
+
+    def main(simulation):
+        while not stop[0]:
+            with suppress(BaseException):
+                decide()
+
+    decide = decision()
+    env = single_env(script(main), decide, driver="thread")
+    env.reset()
+    (left,) = set(simulation_threads()) - set(older_threads)
+    with pytest.warns(ResourceWarning, match="Script refuses to end"):
+        env.close()
+    assert left.is_alive()
+    left.name = "left behind"  # for good: it waits for an answer that nobody gives

@@ -1,0 +1,277 @@
+"""Variants: a model with all that an experiment changes, under one name; and what environments say they are made of."""
+
+import json
+import pickle
+from dataclasses import FrozenInstanceError, replace
+from importlib.metadata import version
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from examples.greenhouse_coop import variants
+from examples.greenhouse_coop.env import GreenhouseSim, parallel_env
+from examples.greenhouse_coop.model import Greenhouse
+
+from simenv_marl import (
+    RULE,
+    ChangedResult,
+    HandlerError,
+    OptionValueError,
+    SimulationError,
+    UnknownOptionError,
+    UnknownPointError,
+    Variant,
+    aec_env,
+    generate_env,
+    joint_env,
+    provenance,
+    register_simulation,
+    simulate,
+    single_env,
+)
+from tests.worlds.models import Script, decision, define, play
+
+
+class Farm(Script):
+    """A farm that asks once for each of its fields."""
+
+    def __init__(self, fields=2, price=1):
+        super().__init__(None)
+        self.fields, self.price = fields, price
+
+    def run(self):
+        for field in range(self.fields):
+            self.log.append((self.sow(field), self.harvest(field)))
+
+    def sow(self, field):
+        return "wheat"
+
+    def harvest(self, field):
+        return self.price
+
+
+SOW, HARVEST = f"{__name__}.Farm.sow", f"{__name__}.Farm.harvest"
+POINTS = {SOW: define(agent="sower_0"), HARVEST: define(agent="reaper_0")}
+
+
+def dearer(farm, field, _result):
+    return ChangedResult(_result * 10)
+
+
+def five(observation):
+    return 5
+
+
+LARGE = Variant("large", Farm, parameters={"fields": 3, "price": 2}, points=POINTS)
+DEAR = replace(LARGE, name="dear", plugins=[(dearer, HARVEST, "after")], policies={HARVEST: RULE})
+
+
+# -- what is made of them -------------------------------------------------------------------------
+
+
+def test_a_variant_serves_wherever_a_simulation_is_asked_for():
+    assert simulate(LARGE).log == [("wheat", 2)] * 3
+    assert simulate(DEAR).log == [("wheat", 20)] * 3
+    assert simulate(DEAR, {"sower_0": five}).log == [(5, 20)] * 3
+    for env in (aec_env(DEAR), generate_env(DEAR, view="aec")()):
+        assert env.possible_agents == ["sower_0"]
+        play(env, 4)
+        assert env.simulation.log == [(4, 20)] * 3
+    env = single_env(DEAR)
+    env.reset()
+    assert env.step(RULE)[2:4] == (False, False)
+    env = joint_env(LARGE)
+    assert set(env.action_space.spaces) == {"sower_0", "reaper_0"}
+    assert Farm().sow(0) == "wheat"  # and the model is what it was
+
+
+def test_what_is_given_beside_it_comes_on_top():
+    assert simulate(DEAR, {HARVEST: five}).log == [("wheat", 50)] * 3
+    twice = [(dearer, HARVEST, "after")]
+    assert simulate(DEAR, plugins=twice).log == [("wheat", 200)] * 3
+    env = aec_env(DEAR, {SOW: define(agent="someone")}, max_steps=1, policies={HARVEST: RULE})
+    assert env.possible_agents == ["someone"]
+    assert [turn.truncated for turn in play(env, 1)] == [False, True]
+    env = aec_env(replace(DEAR, options={"max_steps": 1}))
+    assert len(play(env, 1)) == 2
+    env = aec_env(replace(DEAR, options={"max_steps": 1}), max_steps=2)
+    assert len(play(env, 1)) == 3
+
+
+def test_variants_of_one_model_run_side_by_side():
+    envs = [aec_env(variant, policies={HARVEST: RULE}) for variant in (LARGE, DEAR, replace(LARGE, parameters={}))]
+    for env in envs:
+        env.reset()
+    for step in range(3):
+        for env in envs:
+            if env.agents and not all(env.terminations.values()):
+                env.step(step)
+    assert [env.simulation.log for env in envs] == [
+        [(0, 2), (1, 2), (2, 2)],
+        [(0, 20), (1, 20), (2, 20)],
+        [(0, 1), (1, 1)],
+    ]
+
+
+def test_registered_by_their_name():
+    registries = (gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry)
+    before = [dict(registry) for registry in registries]
+    try:
+        ids = register_simulation(DEAR) + register_simulation(replace(LARGE, options={"max_steps": 1}), name="other")
+        assert ids[:3] == ["dear/Sow-v0", "dear/Joint-v0", "dear/coop_v0"]
+        env = gymnasium.make(ids[0]).unwrapped
+        env.reset()
+        env.step(7)
+        assert env.simulation.log == [(7, 20)]
+        env = pettingzoo.make("aec", "other/coop_v0").unwrapped
+        assert len(play(env, 1)) == 3
+        with pytest.raises(OptionValueError, match="name="):
+            register_simulation(Farm, POINTS)
+    finally:
+        for registry, entries in zip(registries, before, strict=True):
+            registry.clear()
+            registry.update(entries)
+
+
+def test_simulations_and_factories_of_every_kind():
+    assert simulate(Variant("instance", Farm(1), points=POINTS)).log == [("wheat", 1)]
+    assert simulate(Variant("factory", lambda fields: Farm(fields), parameters={"fields": 1})).log == [("wheat", 1)]
+
+
+# -- values ---------------------------------------------------------------------------------------
+
+
+def test_variants_are_frozen():
+    with pytest.raises(FrozenInstanceError):
+        LARGE.name = "larger"
+    with pytest.raises(TypeError):
+        LARGE.parameters["fields"] = 5
+    given = {"fields": 1}
+    variant = Variant("small", Farm, parameters=given)
+    given["fields"] = 7
+    assert simulate(variant).log == [("wheat", 1)]
+
+
+def test_variants_can_be_pickled():
+    variant = Variant("small", Farm, parameters={"fields": 1}, plugins=[(dearer, HARVEST, "after")], points=[SOW])
+    again = pickle.loads(pickle.dumps(variant))
+    assert (again.name, again.simulation, dict(again.parameters), again.plugins, again.points) == (
+        ("small", Farm, {"fields": 1}, ((dearer, HARVEST, "after"),), [SOW])
+    )
+    assert simulate(again, points=POINTS).log == [("wheat", 10)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"name": ""}, OptionValueError, "name"),
+        ({"parameters": {"acres": 3}}, SimulationError, "acres"),
+        ({"parameters": 3}, OptionValueError, "parameters"),
+        ({"simulation": Farm(), "parameters": {"fields": 3}}, SimulationError, "class or a factory"),
+        ({"simulation": DEAR}, SimulationError, "replace"),
+        ({"options": {"plugins": []}}, OptionValueError, "plugins"),
+        ({"options": {"speed": 3}}, UnknownOptionError, "speed"),
+        ({"policies": {"nobody": five}}, UnknownPointError, "nobody"),
+        ({"plugins": [(dearer, HARVEST, "between")]}, HandlerError, "between"),
+    ],
+)
+def test_variants_that_cannot_be(changes, error, message):
+    with pytest.raises(error, match=message):
+        aec_env(replace(LARGE, **changes))
+
+
+# -- what environments are made of ----------------------------------------------------------------
+
+
+def test_an_environment_says_what_it_is_made_of():
+    env = aec_env(DEAR, max_steps=np.int64(9), policies={HARVEST: five})
+    assert env.provenance()["seed"] is None
+    env.reset(seed=3)
+    said = json.loads(json.dumps(env.provenance()))
+    assert said == {
+        "simulation": f"{__name__}.Farm",
+        "packages": {"tests": None},
+        "variant": "dear",
+        "parameters": {"fields": 3, "price": 2},
+        "points": {SOW: "sower_0"},
+        "plugins": [{"handler": f"{__name__}.dearer", "target": HARVEST, "position": "after"}],
+        "policies": {HARVEST: f"{__name__}.five"},
+        "options": {"max_steps": 9},
+        "seed": 3,
+        "python": said["python"],
+        "dependencies": said["dependencies"],
+    }
+    assert said["dependencies"]["numpy"] == np.__version__
+    assert said["dependencies"]["simenv-marl"] == version("simenv-marl")
+    assert provenance(DEAR, seed=3, max_steps=9, policies={HARVEST: five}) == said
+
+
+def test_versions_are_those_of_the_packages_that_the_model_comes_from():
+    said = provenance(
+        Farm, {"mesa.examples.advanced.wolf_sheep.agents.Wolf.move": define(agent=lambda wolf: str(wolf))}
+    )
+    assert said["packages"] == {"mesa": version("mesa"), "tests": None}
+    assert said["points"] == {"mesa.examples.advanced.wolf_sheep.agents.Wolf.move": None}
+    assert said["variant"] is None
+
+
+def test_what_json_does_not_know_is_named():
+    ant = decision(agent="ant_0")
+    variant = Variant(
+        "odd", lambda **parameters: Farm(), parameters={"a": np.arange(2), "b": {1.5}, "c": Farm}, points=ant
+    )
+    said = json.loads(json.dumps(provenance(variant)))
+    assert said["parameters"] == {"a": [0, 1], "b": ["1.5"], "c": f"{__name__}.Farm"}
+    assert "<lambda>" in said["simulation"]
+
+
+# -- the greenhouse -------------------------------------------------------------------------------
+
+
+def test_a_decision_within_a_plugin_is_an_agents_like_any_other():
+    """The ventilator that arrives by a plugin lives through the same days as the one that is named from outside."""
+    rng = np.random.default_rng(4)
+    named, plugged = parallel_env(), generate_env(variants.VENTILATED, view="parallel")()
+    observations = [env.reset(seed=2)[0] for env in (named, plugged)]
+    assert named.possible_agents == sorted(plugged.possible_agents, reverse=True)
+    while named.agents:
+        actions = {agent: rng.random(1).astype(np.float32) * 0.5 for agent in named.agents}
+        results = [env.step(actions) for env in (named, plugged)]
+        observations = [result[0] for result in results]
+        for agent in actions:
+            assert observations[0][agent].tolist() == observations[1][agent].tolist()
+        assert results[0][1] == results[1][1]
+    assert not plugged.agents
+    assert named.simulation.greenhouse.day == plugged.simulation.greenhouse.day
+
+
+def test_the_papers_air_exchange():
+    """Humidity moves towards that outside, the faster the warmer it is; nobody else's does."""
+    env, other = single_env(variants.WARM_EXCHANGE), single_env(variants.BASE)
+    for each in (env, other):
+        each.reset(seed=1)
+    house = env.simulation.greenhouse
+    assert house.humidity != other.simulation.greenhouse.humidity
+    with_handler, without = Greenhouse(1), Greenhouse(1)
+    with_handler.temp = without.temp = 35
+    with_handler.humidity = without.humidity = 0.9
+    variants.new_air_exchange(with_handler)
+    without.update_air_exchange()
+    assert with_handler.humidity == pytest.approx(0.6)
+    assert without.humidity == pytest.approx(0.84)
+
+
+def test_with_rules_throughout_the_second_agent_changes_nothing():
+    plain = GreenhouseSim()
+    plain.reset(seed=5)
+    plain.run()
+    ran = simulate(variants.VENTILATED, seed=5)
+    assert [plant.health for plant in ran.greenhouse.pots] == [plant.health for plant in plain.greenhouse.pots]
+
+
+def test_the_variants_page_prints(capsys):
+    variants.main()
+    out = capsys.readouterr().out
+    assert "warm_exchange" in out
+    assert '"variant": "ventilated"' in out

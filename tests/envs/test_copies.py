@@ -1,0 +1,224 @@
+"""Environments are copied and pickled between episodes."""
+
+import copy
+import pickle
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import cloudpickle
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from simenv_marl import (
+    RULE,
+    CopyError,
+    Variant,
+    aec_env,
+    difference,
+    generate_env,
+    joint_env,
+    parallel_env,
+    single_env,
+)
+from tests.worlds.copied import Walk, WalkEnv, blow, define
+from tests.worlds.many_worlds import beings
+
+ROOT = Path(__file__).parents[2]
+VIEWS = pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
+COPIES = pytest.mark.parametrize(
+    "copied",
+    [
+        copy.deepcopy,
+        copy.copy,
+        lambda env: pickle.loads(pickle.dumps(env)),
+        lambda env: cloudpickle.loads(cloudpickle.dumps(env)),
+    ],
+    ids=["deepcopy", "copy", "pickle", "cloudpickle"],
+)
+
+
+def episode(env, **reset):
+    """What an episode of any view with random actions tells."""
+    told = [env.reset(**reset)]
+    if hasattr(env, "agent_iter"):
+        for agent in env.agent_iter():
+            observation, *rest = env.last()
+            told.append((agent, observation.tolist(), *rest))
+            env.step(None if rest[1] or rest[2] else env.action_space(agent).sample())
+    elif hasattr(env, "agents"):
+        while env.agents:
+            told.append(env.step({agent: env.action_space(agent).sample() for agent in env.agents}))
+    else:
+        ended = False
+        while not ended:
+            told.append(env.step(env.action_space.sample()))
+            ended = told[-1][2] or told[-1][3]
+    return repr(told), list(env.simulation.steps)
+
+
+@VIEWS
+@COPIES
+def test_a_copy_goes_on_as_the_original_would(make, copied):
+    """Before the first episode, after it, and when it was closed; its generators come along."""
+    env = make(Walk, Walk.choose)
+    for number in range(3):
+        twin = copied(env)
+        assert type(twin) is type(env)
+        assert twin.simulation is not env.simulation
+        seed = {} if number else {"seed": 5}
+        assert episode(twin, **seed) == episode(env, **seed)
+        assert episode(copied(env)) == episode(env)
+        if number == 1:
+            env.close()
+    assert twin.provenance()["points"] == env.provenance()["points"]
+
+
+@VIEWS
+@COPIES
+def test_in_mid_episode_it_is_a_clear_error(make, copied):
+    env = make(Walk, Walk.choose)
+    env.reset(seed=1)
+    with pytest.raises(CopyError, match=r"between episodes.*branch"):
+        copied(env)
+    env.step(RULE)
+    env.close()
+    copied(env).reset()
+
+
+def test_agents_that_have_yet_to_take_leave_are_of_the_episode():
+    env = aec_env(Walk(1), Walk.choose)
+    env.reset()
+    env.step(1)
+    with pytest.raises(CopyError, match="afterwards, or see branch"):
+        copy.deepcopy(env)
+    env.step(None)
+    copy.deepcopy(env).reset()
+
+
+@COPIES
+def test_generated_classes(copied):
+    env = WalkEnv(max_steps=2)
+    twin = copied(env)
+    assert type(twin) is WalkEnv
+    assert episode(twin, seed=2) == episode(env, seed=2)
+    lost = generate_env(Walk, Walk.choose, view="aec")(max_steps=2)
+    twin = copied(lost)
+    assert isinstance(twin, type(aec_env(Walk, Walk.choose)))
+    assert episode(twin, seed=2) == episode(lost, seed=2)
+
+
+@COPIES
+def test_environments_in_wrappers(copied):
+    env = TimeLimit(single_env(Walk, Walk.choose), 3)
+    twin = copied(env)
+    assert [twin.reset(seed=1)[0].tolist(), twin.step(1)[0].tolist()] == [
+        env.reset(seed=1)[0].tolist(),
+        env.step(1)[0].tolist(),
+    ]
+    wrapped = OrderEnforcingWrapper(aec_env(Walk, Walk.choose))
+    copied(wrapped).reset()
+
+
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+@COPIES
+def test_what_environments_are_made_of_comes_along(copied, driver):
+    """Points that nobody has decorated, policies, plugins, variants, rosters and all other options."""
+    points = {f"{Walk.__module__}.Walk.drift": define(agent="wind_0"), Walk.choose: None}
+    variant = Variant("long", Walk, parameters={"length": 7}, plugins=[(blow, Walk.drift, "instead")])
+    env = aec_env(variant, points, policies={Walk.choose: RULE}, max_steps=3, driver=driver, global_rng=True)
+    twin = copied(env)
+    assert twin.possible_agents == ["wind_0"]
+    assert twin.provenance() == env.provenance()
+    assert twin.provenance()["variant"] == "long"
+    env.close()
+
+
+def test_entities_and_their_roster():
+    names = [f"being_{number}" for number in range(3)]
+    (point,) = beings()
+    env = parallel_env(Walk, beings(), possible_agents={point: names})
+    for twin in (copy.deepcopy(env), cloudpickle.loads(cloudpickle.dumps(env))):
+        assert twin.possible_agents == names
+    env.close()
+
+
+def test_vectors_of_gymnasium_in_processes_of_their_own():
+    env = single_env(Walk, Walk.choose)
+    vector = gymnasium.vector.AsyncVectorEnv([lambda: copy.deepcopy(env)] * 2)
+    observations, _ = vector.reset(seed=[1, 2])
+    assert observations.tolist() == [[0.0], [0.0]]
+    vector.step(np.array([1, 1]))
+    vector.close()
+
+
+def test_lambdas_need_cloudpickle():
+    env = single_env(Walk, {Walk.choose: define(agent="walker_0", reward_mapping=lambda walk: 1.0)})
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        pickle.dumps(env)
+    twin = cloudpickle.loads(cloudpickle.dumps(env))
+    twin.reset(seed=1)
+    assert twin.step(1)[1] == 1.0
+
+
+def test_in_another_process_with_all_that_only_this_one_knows():
+    """A model in ``__main__``, decorated and not, with differences, lambdas and policies, as in a notebook."""
+    code = """
+    import random, sys, cloudpickle, numpy as np
+    from gymnasium import spaces
+    from simenv_marl import aec_env, difference, make_step, RULE, parallel_env
+
+    def define(agent):
+        return make_step(
+            observation_space=spaces.Box(-99, 99, (1,), np.float32),
+            observation_space_mapping=lambda model: [model.total],
+            action_space=spaces.Discrete(9),
+            action_space_mapping=lambda action: action,
+            reward_mapping=difference(lambda model: model.total),
+            agent=agent,
+        )
+
+    class Model:
+        def reset(self, seed=None):
+            self.total = 0
+        def run(self):
+            for _ in range(3):
+                self.total += self.one() + self.two()
+        @define("one_0")
+        def one(self):
+            return 1
+        def two(self):
+            return 10
+
+    env = aec_env(Model, {Model.one: None, Model.two: define("two_0")}, policies={"two_0": lambda observation: 5})
+    env.reset()
+    env.close()
+    sys.stdout.buffer.write(cloudpickle.dumps(env))
+    """
+    first = [sys.executable, "-c", textwrap.dedent(code)]
+    pickled = subprocess.run(first, capture_output=True, timeout=120, check=True, cwd=ROOT).stdout
+    code = """
+    import sys, pickle
+    env = pickle.loads(sys.stdin.buffer.read())
+    env.reset(seed=1)
+    rewards = []
+    for agent in env.agent_iter():
+        observation, reward, ended, *_ = env.last()
+        rewards.append(reward)
+        env.step(None if ended else 2)
+    print(agent, rewards, env.simulation.total, env.simulation.two())
+    """
+    second = [sys.executable, "-c", textwrap.dedent(code)]
+    ran = subprocess.run(second, input=pickled, capture_output=True, timeout=120, check=False, cwd=ROOT)
+    assert ran.stdout.decode().strip() == "one_0 [0.0, 7.0, 7.0, 7.0] 21 10", ran.stderr.decode()
+
+
+def test_differences_and_spaces_survive():
+    twin = cloudpickle.loads(cloudpickle.dumps(difference(lambda value: value)))
+    assert twin(3) == 0.0
+    assert spaces.Discrete(3) == pickle.loads(pickle.dumps(define())).action_space

@@ -1,0 +1,129 @@
+"""Infos have the same keys from the reset to the end: there are learners that ask for them once and for all."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import RULE, aec_env, joint_env, parallel_env
+from tests.worlds.many_worlds import Being, beings
+from tests.worlds.models import calling, decision, script
+
+MASKED = {"action_mask_mapping": lambda: [0, 1, 1] + [0] * 7}
+SEES_MASKS = {
+    "observation_space": spaces.Dict(
+        {"observations": spaces.Box(0, 9, (1,), np.float32), "action_mask": spaces.MultiBinary(10)}
+    ),
+    "observation_space_mapping": lambda: {"observations": [1.0]},
+}
+
+
+def clocked(*functions, ends=None):
+    """A factory of simulations with a clock, which call those functions one after the other."""
+    make = calling(*functions, ends=ends)
+
+    def factory():
+        simulation = make()
+        simulation.time = lambda: float(len(simulation.log))
+        return simulation
+
+    return factory
+
+
+def keys_of_aec(env):
+    """The keys of each agent's infos, as they are seen after the reset and after each step."""
+    env.reset(seed=1)
+    yield {agent: set(info) for agent, info in env.infos.items()}
+    while env.agents:
+        env.step(None if env.terminations[env.agent_selection] else RULE)
+        yield {agent: set(info) for agent, info in env.infos.items()}
+
+
+def keys_of_rounds(env):
+    _, infos = env.reset(seed=1)
+    yield {agent: set(info) for agent, info in infos.items()}
+    while env.agents:
+        _, _, _, _, infos = env.step(RULE)
+        yield {agent: set(info) for agent, info in infos.items()}
+
+
+@pytest.mark.parametrize(("make", "keys"), [(aec_env, keys_of_aec), (parallel_env, keys_of_rounds)])
+def test_keys_are_there_before_the_first_decision_and_stay(make, keys):
+    ant, bee, elk = decision(agent="ant_0", **MASKED), decision(agent="bee_0", **MASKED), decision(agent="elk_0")
+    env = make(clocked(ant, bee, ant, ant, bee), [ant, bee, elk])
+    more = {"deciding", "acted"} if make is parallel_env else set()
+    expected = {
+        "ant_0": {"action_mask", "time", "elapsed"} | more,
+        "bee_0": {"action_mask", "time", "elapsed"} | more,
+        "elk_0": {"time", "elapsed"} | more,
+    }
+    seen = list(keys(env))
+    assert seen[0] == expected
+    assert all(infos[agent] == expected[agent] for infos in seen for agent in infos)
+    assert len(seen) > 2
+
+
+def test_everything_is_legal_for_whoever_has_not_decided_yet():
+    ant, bee = decision(agent="ant_0", **MASKED), decision(agent="bee_0", **MASKED)
+    env = aec_env(clocked(ant, bee, bee), [ant, bee])
+    env.reset()
+    assert env.infos["ant_0"]["action_mask"].tolist() == [0, 1, 1] + [0] * 7
+    assert env.infos["bee_0"]["action_mask"].tolist() == [1] * 10
+    assert env.infos["bee_0"]["action_mask"].dtype == np.int8
+    assert (env.infos["bee_0"]["time"], env.infos["bee_0"]["elapsed"]) == (0.0, 0.0)
+    env.step(1)
+    assert env.infos["bee_0"]["action_mask"].tolist() == [0, 1, 1] + [0] * 7
+    assert (env.infos["bee_0"]["time"], env.infos["bee_0"]["elapsed"]) == (1.0, 0.0)
+    env.step(2)
+    assert (env.infos["bee_0"]["time"], env.infos["bee_0"]["elapsed"]) == (2.0, 1.0)
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
+def test_a_mask_in_an_observation_without_a_decision_is_open(make):
+    """A mask of zeros would leave a policy nothing to choose from."""
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", **MASKED, **SEES_MASKS)
+    env = make(calling(ant, bee), [ant, bee])
+    if make is aec_env:
+        env.reset()
+        observation = env.observe("bee_0")
+    else:
+        observation = env.reset()[0]["bee_0"]
+    assert observation["action_mask"].tolist() == [1] * 10
+    assert observation["observations"].tolist() == [0.0]
+    space = env.observation_space["bee_0"] if make is joint_env else env.observation_space("bee_0")
+    assert observation in space
+
+
+def test_no_two_have_a_mask_in_common():
+    ant, bee, elk = (decision(agent=agent, **MASKED) for agent in ("ant_0", "bee_0", "elk_0"))
+    env = parallel_env(calling(ant, bee, elk), [ant, bee, elk])
+    _, infos = env.reset()
+    infos["bee_0"]["action_mask"][:] = 0
+    assert infos["elk_0"]["action_mask"].tolist() == [1] * 10
+    _, infos = env.reset()
+    assert infos["bee_0"]["action_mask"].tolist() == [1] * 10
+
+
+def test_whom_the_model_has_let_go_of_keeps_the_keys():
+    """Without a word: there is nothing to observe any more, and nobody is said to have ended."""
+
+    def main(simulation):
+        one, two = Being(0), Being(1)
+        simulation.beings = [one, two]
+        one.act()
+        two.act()
+        simulation.beings.remove(one)
+        del one
+        two.act()
+        two.act()
+
+    points = beings(action_mask_mapping=lambda being: [0, 1] + [0] * 8)
+    env = parallel_env(script(main), points, possible_agents=["being_0", "being_1"])
+    _, infos = env.reset()
+    assert infos["being_0"].keys() == infos["being_1"].keys() == {"action_mask", "deciding", "acted"}
+    _, _, _, _, infos = env.step({"being_0": 1, "being_1": 1})
+    assert infos["being_0"]["action_mask"].tolist() == [1] * 10
+    assert infos["being_1"]["action_mask"].tolist() == [0, 1] + [0] * 8
+    while env.agents:
+        _, _, terminations, _, infos = env.step({"being_1": 1})
+        assert infos["being_0"].keys() == {"action_mask", "deciding", "acted"}
+        assert terminations["being_0"] == (not env.agents)

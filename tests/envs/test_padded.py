@@ -1,0 +1,323 @@
+"""Padded rosters: everybody who may ever be there is there, from the reset to the end of the episode."""
+
+from __future__ import annotations
+
+import random
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pettingzoo.test import api_test, parallel_api_test, seed_test
+
+from simenv_marl import (
+    RULE,
+    AgentError,
+    OptionValueError,
+    UnknownAgentError,
+    aec_env,
+    generate_env,
+    joint_env,
+    parallel_env,
+    single_env,
+)
+from tests.worlds.many_worlds import (
+    ROSTER,
+    Announcing,
+    Answered,
+    Being,
+    Colony,
+    answer,
+    beings,
+    colony_points,
+    designs,
+    seeds,
+)
+from tests.worlds.models import decision, notes, script
+
+EVERYBODY = st.tuples(designs, seeds, st.sampled_from([Colony, Announcing]))
+
+
+def colony(design, kind, view, **options):
+    overseen = bool(design.overseen)
+    return view(lambda: kind(design), colony_points(overseen=overseen), possible_agents=roster(overseen), **options)
+
+
+def roster(overseen):
+    return {f"{Colony.__module__}.Creature.act": ROSTER} if overseen else ROSTER
+
+
+def is_blank(env, agent, observation):
+    return env.observation_space(agent).contains(observation) and not np.any(observation)
+
+
+# -- turns ------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(EVERYBODY)
+def test_turns_are_those_of_the_living_and_all_else_stands_by(world):
+    design, seed, kind = world
+    env = colony(design, kind, aec_env, padded=True)
+    env.reset(seed=seed)
+    everybody = list(env.possible_agents)
+    paid, decided, seen = defaultdict(float), [], defaultdict(float)
+    ended = False
+    for agent in env.agent_iter():
+        _, reward, terminated, truncated, info = env.last()
+        over = terminated or truncated
+        ended = ended or over
+        if not ended:
+            assert sorted(env.agents) == sorted(everybody)
+            assert info["present"] is True
+            for other in everybody:
+                assert not env.terminations[other]
+                assert not env.truncations[other]
+                if not env.infos[other]["present"]:
+                    assert is_blank(env, other, env.observe(other))
+        assert {tuple(info) for info in env.infos.values()} == {("present",)}
+        paid[agent] += reward
+        if over:
+            assert truncated == design.truncates
+            assert terminated != design.truncates
+            env.step(None)
+            continue
+        env.step(answer(seed, agent, decided.count(agent)))
+        decided.append(agent)
+        for other, value in env.rewards.items():
+            seen[other] += value
+    plain = Answered(design, seed)
+    assert decided == plain.decisions
+    assert env.simulation.trace == plain.trace
+    assert {agent: value for agent, value in paid.items() if agent in plain.first} == plain.totals
+    assert all(paid[agent] == 0 for agent in everybody if agent not in plain.first)
+    assert env.agents == []
+
+
+@settings(deadline=None)
+@given(EVERYBODY)
+def test_rewards_are_seen_once_in_the_step_that_brings_them(world):
+    design, seed, kind = world
+    env, bare = (colony(design, kind, aec_env, padded=padded) for padded in (True, False))
+    totals = []
+    for each in (env, bare):
+        each.reset(seed=seed)
+        number, total = defaultdict(int), defaultdict(float)
+        for agent in each.agent_iter():
+            over = each.terminations[agent] or each.truncations[agent]
+            each.step(None if over else answer(seed, agent, number[agent]))
+            number[agent] += not over
+            if not over:
+                for other, value in each.rewards.items():
+                    total[other] += value
+        totals.append({agent: value for agent, value in total.items() if value})
+    assert totals[0] == totals[1]
+
+
+# -- rounds -----------------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(EVERYBODY)
+def test_rounds_have_everybody_and_are_those_of_the_living(world):
+    design, seed, kind = world
+    env, bare = (colony(design, kind, parallel_env, padded=padded) for padded in (True, False))
+    observations, infos = env.reset(seed=seed)
+    expected, _ = bare.reset(seed=seed)
+    everybody = list(env.possible_agents)
+    chance = random.Random(seed)
+    while env.agents:
+        assert env.agents == everybody
+        present = {agent for agent in everybody if infos[agent]["present"]}
+        for agent in everybody:
+            if agent in present:
+                np.testing.assert_array_equal(observations[agent], expected[agent])
+            else:
+                assert is_blank(env, agent, observations[agent])
+                assert not infos[agent]["deciding"]
+        actions = {agent: chance.choice([0, 1, 2, 3, 4, 99 if agent not in present else RULE]) for agent in everybody}
+        observations, rewards, terminations, truncations, infos = env.step(actions)
+        used = {agent: action for agent, action in actions.items() if agent in present}
+        expected, paid, *_ = bare.step(used)
+        assert (
+            set(observations) == set(rewards) == set(terminations) == set(truncations) == set(infos) == set(everybody)
+        )
+        assert {agent: value for agent, value in rewards.items() if value} == {a: v for a, v in paid.items() if v}
+        assert {tuple(sorted(info)) for info in infos.values()} == {("acted", "deciding", "present")}
+        flags = set(zip(terminations.values(), truncations.values(), strict=True))
+        over = not bare.agents
+        assert flags == {(over and not design.truncates, over and design.truncates)}
+        assert all(type(flag) is bool for flag in (*terminations.values(), *truncations.values()))
+    assert env.simulation.trace == bare.simulation.trace
+    env.close()
+    bare.close()
+
+
+# -- what stands by ---------------------------------------------------------------------------------
+
+
+def generations(simulation):
+    first, second = Being(1), Being(2)
+    simulation.log.append(first.act())
+    first.health = 7
+    first.leave()
+    second.health = 1
+    simulation.log.append(second.act())
+    simulation.log.append(second.act())
+
+
+def test_the_removed_are_paid_at_once_and_blank_from_then_on():
+    env = parallel_env(script(generations), beings(), possible_agents=["being_1", "being_2"], padded=True)
+    observations, infos = env.reset(seed=0)
+    assert observations["being_1"].tolist() == [1, 0]
+    assert [infos[agent]["present"] for agent in env.agents] == [True, False]
+    observations, rewards, terminations, _, infos = env.step({"being_1": 3, "being_2": 4})
+    assert env.simulation.log == [3]  # the other one was not there yet when it was given
+    assert rewards == {"being_1": 7.0, "being_2": 0.0}
+    assert terminations == {"being_1": False, "being_2": False}
+    assert observations["being_1"].tolist() == [0, 0]
+    assert infos["being_1"] == {"present": False, "deciding": False, "acted": True}
+    assert infos["being_2"] == {"present": True, "deciding": True, "acted": False}
+    _, rewards, _, _, infos = env.step({"being_1": "not looked at", "being_2": 4})
+    assert rewards == {"being_1": 0.0, "being_2": 1.0}
+    assert infos["being_1"]["acted"] is False
+    with pytest.raises(UnknownAgentError, match="no live agent"):
+        env.step({"being_3": 1})
+    _, rewards, terminations, truncations, _ = env.step({"being_1": 1, "being_2": 5})
+    assert env.simulation.log == [3, 4, 5]
+    assert terminations == {"being_1": True, "being_2": True}
+    assert truncations == {"being_1": False, "being_2": False}
+    assert env.agents == []
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_a_limit_of_time_truncates_all_alike(steps):
+    options = {"possible_agents": ["being_1", "being_2"], "padded": True, "max_steps": steps}
+    env = parallel_env(script(generations), beings(), **options)
+    env.reset(seed=0)
+    for _ in range(steps):
+        _, _, terminations, truncations, _ = env.step({"being_1": 1, "being_2": 1})
+    assert truncations == {"being_1": True, "being_2": True}
+    assert terminations == {"being_1": False, "being_2": False}
+    env = aec_env(script(generations), beings(), **options)
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(1)
+    assert env.truncations == {"being_1": True, "being_2": True}
+    assert env.terminations == {"being_1": False, "being_2": False}
+
+
+def test_masks_are_open_and_clocks_go_on():
+    def main(simulation):
+        simulation.hours = 0.0
+        first, second = Being(1), Being(2)
+        for hour in range(4):
+            simulation.hours = float(hour)
+            (first if hour < 2 else second).act()
+            if hour == 1:
+                first.leave()
+
+    class Timed(type(script(main)())):
+        def time(self):
+            return getattr(self, "hours", 0.0)
+
+    masked = beings(
+        action_mask_mapping=lambda being: [0, 1, 0],
+        action_space=spaces.Discrete(3),
+        observation_space=spaces.Dict(
+            {"health": spaces.Discrete(9), "action_mask": spaces.MultiBinary(3)}
+        ),
+        observation_space_mapping=lambda being: {"health": being.health},
+    )  # fmt: skip
+    names = ["being_1", "being_2", "being_3"]
+    env = parallel_env(lambda: Timed(main), masked, possible_agents=names, padded=True)
+    observations, infos = env.reset(seed=0)
+    hours = [0.0]
+    while True:
+        for agent in names:
+            mask = [0, 1, 0] if infos[agent]["present"] else [1, 1, 1]
+            assert infos[agent]["action_mask"].tolist() == observations[agent]["action_mask"].tolist() == mask
+            assert set(infos[agent]) == {"present", "deciding", "acted", "action_mask", "time", "elapsed"}
+            assert infos[agent]["time"] == hours[-1]
+        if not env.agents:
+            break
+        observations, _, _, _, infos = env.step(dict.fromkeys(names, 1))
+        hours.append(env.simulation.hours)
+    assert hours == [0.0, 1.0, 2.0, 3.0, 3.0]
+
+
+def test_nobody_comes_back():
+    def main(simulation):
+        being = Being(1)
+        being.act()
+        being.leave()
+        being.act()
+
+    env = parallel_env(script(main), beings(), possible_agents=["being_1", "being_2"], padded=True)
+    env.reset(seed=0)
+    with pytest.raises(AgentError, match="after its end"):
+        env.step({"being_1": 1, "being_2": 1})
+
+
+def test_without_a_roster_there_is_nobody_to_pad():
+    for view in (aec_env, parallel_env):
+        with pytest.raises(OptionValueError, match="possible_agents"):
+            view(script(generations), beings(), padded=True)
+    with pytest.raises(OptionValueError, match="padded"):
+        aec_env(script(generations), beings(), possible_agents=["being_1"], padded="yes")
+    made = generate_env(script(generations), beings(), view="parallel", padded=True)
+    assert made(possible_agents=["being_1", "being_2"]).possible_agents == ["being_1", "being_2"]
+
+
+def test_views_of_one_agent_have_nobody_to_pad():
+    function = decision()
+    env = single_env(script(lambda simulation: function()), function, padded=True)
+    assert env.reset(seed=0)[0].tolist() == [1.0, 2.0]
+    env = joint_env(script(generations), beings(), possible_agents=["being_1", "being_2"], padded=True)
+    env.reset(seed=0)
+    assert not env.step({"being_1": 3, "being_2": 3})[2]
+
+
+def test_errors_leave_it_as_errors_do():
+    points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
+    env = aec_env(script(generations), points, possible_agents=["being_1", "being_2"], padded=True)
+    env.reset(seed=0)
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(1)
+    assert "being_2" in notes(caught.value)
+    env.reset(seed=0)
+    assert sorted(env.agents) == ["being_1", "being_2"]
+
+
+# -- what others check ------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings(
+    "ignore:Observation numpy array is all zeros"
+)  # which is what there is to see of the absent
+@settings(deadline=None, max_examples=20)
+@given(EVERYBODY)
+def test_the_tests_of_pettingzoo(world):
+    design, _, kind = world
+    api_test(colony(design, kind, aec_env, padded=True), num_cycles=60)
+    parallel_api_test(colony(design, kind, parallel_env, padded=True), num_cycles=60)
+    seed_test(lambda: colony(design, kind, aec_env, padded=True), num_cycles=30)
+
+
+def test_what_a_round_tells_stands_in_the_order_of_the_roster():
+    def main(simulation):
+        simulation.crowd = [Being(2), Being(0)]
+        for _ in range(3):
+            for being in simulation.crowd:
+                being.act()
+
+    names = ["being_0", "being_1", "being_2"]
+    env = parallel_env(script(main), beings(), possible_agents=names, padded=True)
+    told = env.reset()
+    while env.agents:
+        assert env.agents == names
+        assert [list(part) for part in told] == [names] * len(told)
+        told = env.step({"being_0": 1, "being_1": 1, "being_2": 1})
+    assert [list(part) for part in told] == [names] * 5

@@ -1,0 +1,725 @@
+"""Many simulations at once tell what as many environments of their own tell."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import pickle
+import threading
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector as wrappers
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    ClosedError,
+    CopyError,
+    EpisodeOverError,
+    InvalidActionError,
+    NotResetError,
+    OptionValueError,
+    ReentrancyError,
+    ResetNeededError,
+    UnknownOptionError,
+    ViewError,
+    WrongThreadError,
+    joint_env,
+    make_step,
+    register_simulation,
+    single_env,
+    vector_env,
+)
+from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
+from tests.worlds.many_worlds import Being, beings
+from tests.worlds.models import notes, stacks
+from tests.worlds.worlds import FuseError, designs, seeds
+
+pytestmark = FORKS
+
+
+# -- what is told -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", VARIETY)
+def test_it_tells_what_gymnasium_tells_of_as_many_single_views(kind, mode):
+    model, decision = VARIETY[kind]
+    points = {POINT: decision}
+    ours = vector_env(model, points, num_envs=5, autoreset_mode=mode)
+    theirs = SyncVectorEnv([lambda: single_env(model, points)] * 5, autoreset_mode=mode)
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert ours.single_action_space == theirs.single_action_space
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.metadata == theirs.metadata
+    assert ours.render_mode == theirs.render_mode
+    agree(ours, theirs, 40, np.random.default_rng(1))
+    assert same(ours.np_random_seed, theirs.np_random_seed)
+    assert [g.random() for g in ours.np_random] == [g.random() for g in theirs.np_random]
+    samples = [[space.sample() for space in envs.get_attr("action_space")] for envs in (ours, theirs)]
+    assert same(*samples)
+    ours.close()
+    theirs.close()
+
+
+@given(designs(), seeds, st.sampled_from(MODES), st.integers(1, 4))
+@settings(max_examples=150)
+def test_it_tells_what_gymnasium_tells_of_random_worlds(design, seed, mode, number):
+    ours = made(design, number, mode)
+    if ours is None:
+        return
+    theirs = made(design, number, mode, sync=True)
+    agree(ours, theirs, 15, np.random.default_rng(seed))
+    assert [s.trace for s in ours.get_attr("simulation")] == [s.trace for s in theirs.get_attr("simulation")]
+    ours.close()
+    theirs.close()
+
+
+class Pair:
+    """Two decisions, one of an agent with a name of its own and one of entities that are born and die."""
+
+    def reset(self, seed: int | None = None) -> None:
+        self.random = np.random.default_rng(seed)
+        self.entities = [Entity(number) for number in range(2)]
+        self.level = 0
+
+    def expected_calls(self, point: str) -> list[Any]:
+        return [(entity,) for entity in self.entities] if point.endswith("grow") else [(self,)]
+
+    def run(self) -> None:
+        for _ in range(int(self.random.integers(2, 5))):
+            self.level += self.steer()
+            for entity in self.entities:
+                entity.size += entity.grow()
+
+    @make_step(
+        observation_space=spaces.Box(-99, 99, (1,), np.float64),
+        observation_space_mapping=lambda self: [self.level],
+        action_space=spaces.Box(-1, 1, (1,), np.float64),
+        action_space_mapping=lambda action: float(action[0]),
+        reward_mapping=lambda self: self.level,
+        agent="steerer",
+    )
+    def steer(self) -> float:
+        return 0.0
+
+
+class Entity:
+    def __init__(self, number: int) -> None:
+        self.number, self.size = number, 0.0
+
+    @make_step(
+        observation_space=spaces.Box(-99, 99, (1,), np.float64),
+        observation_space_mapping=lambda self: [self.size],
+        action_space=spaces.Box(-2, 2, (1,), np.float64),
+        action_space_mapping=lambda action: float(action[0]),
+        reward_mapping=lambda self: self.size,
+        agent=lambda self: f"entity_{self.number}",
+    )
+    def grow(self) -> float:
+        return 0.0
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("flatten", [False, True])
+def test_it_tells_what_gymnasium_tells_of_as_many_joint_views(flatten, mode):
+    points = [Pair.steer, Entity.grow]
+    ours = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode)
+    theirs = SyncVectorEnv([lambda: joint_env(Pair, points, flatten=flatten)] * 3, autoreset_mode=mode)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    agree(ours, theirs, 20, np.random.default_rng(0))
+    workers = vector_env(Pair, points, num_envs=3, flatten=flatten, autoreset_mode=mode, workers=2, context=FORK)
+    agree(workers, ours, 20, np.random.default_rng(0))
+    for envs in (ours, theirs, workers):
+        envs.close()
+
+
+def test_the_view_can_be_chosen():
+    envs = vector_env(Counter, Counter.decide, num_envs=2, view="joint")
+    assert isinstance(envs.single_action_space, spaces.Dict)
+    envs.close()
+    with pytest.raises(ViewError, match="needs one active decision point"):
+        vector_env(Pair, [Pair.steer, Entity.grow], num_envs=2, view="single")
+    with pytest.raises(OptionValueError, match="view must be"):
+        vector_env(Counter, Counter.decide, num_envs=2, view="aec")
+
+
+@pytest.mark.parametrize("options", [{"driver": "thread"}, {"max_steps": 2}, {"plugins": "some"}])
+def test_options_mean_what_they_mean_to_one_environment(options):
+    if "plugins" in options:
+        options = {"plugins": [(halve, Counter.decide, "after")]}
+    ours = vector_env(Counter, Counter.decide, num_envs=3, **options)
+    theirs = SyncVectorEnv([lambda: single_env(Counter, Counter.decide, **options)] * 3)
+    agree(ours, theirs, 20, np.random.default_rng(0))
+    ours.close()
+    theirs.close()
+
+
+def halve(model: Any, _result: int) -> Any:
+    from simenv_marl import ChangedResult
+
+    return ChangedResult((_result + 1) // 2)
+
+
+# -- seeds and resets -------------------------------------------------------------------------------
+
+
+def seeds_of(envs: Any) -> list[int | None]:
+    return [simulation.seed for simulation in envs.get_attr("simulation")]
+
+
+def test_seeds_are_one_for_all_or_one_for_each():
+    envs = vector_env(Counter, Counter.decide, num_envs=3)
+    envs.reset(seed=7)
+    assert seeds_of(envs) == [7, 8, 9]
+    assert envs.np_random_seed == (7, 8, 9)
+    envs.reset(seed=np.int64(4))
+    assert seeds_of(envs) == [4, 5, 6]
+    envs.reset(seed=[3, None, 1])
+    assert seeds_of(envs)[::2] == [3, 1]
+    assert seeds_of(envs)[1] != 5
+    envs.reset()
+    drawn = seeds_of(envs)
+    envs.reset(seed=[3, None, 1])
+    envs.reset()
+    assert seeds_of(envs)[::2] == drawn[::2]
+    for wrong in ([1, 2], -1, [1, 2, -3], [1.0, 2, 3]):
+        with pytest.raises(OptionValueError, match="seed"):
+            envs.reset(seed=wrong)
+    with pytest.raises(TypeError):
+        envs.reset(seed=1.5)
+    envs.close()
+
+
+def test_some_can_be_reset_with_options_for_them():
+    envs = vector_env(Counter, Counter.decide, num_envs=3)
+    with pytest.raises(NotResetError, match="no episode yet"):
+        envs.step([1, 1, 1])
+    with pytest.raises(NotResetError, match="no episodes yet"):
+        envs.reset(options={"reset_mask": np.array([True, False, False])})
+    envs.reset(seed=0)
+    envs.step([1, 1, 1])
+    options = {"reset_mask": np.array([False, True, False]), "more": 1}
+    observations, _ = envs.reset(seed=20, options=options)
+    assert observations[:, 0].tolist() == [1, 0, 1]
+    assert seeds_of(envs) == [0, 21, 2]
+    assert envs.envs[1].simulation.options == {"more": 1}
+    assert "reset_mask" in options
+    for wrong in ([True, False, False], np.array([1, 0, 0]), np.array([True]), np.zeros(3, bool)):
+        with pytest.raises(OptionValueError, match="reset_mask"):
+            envs.reset(options={"reset_mask": wrong})
+    envs.close()
+
+
+def test_without_autoreset_an_ended_episode_must_be_reset():
+    envs = vector_env(Counter, Counter.decide, num_envs=3, autoreset_mode="Disabled")
+    envs.reset(seed=0)
+    over = np.zeros(3, bool)
+    while not over.any():
+        *_, terminations, truncations, _ = envs.step([1, 1, 1])
+        over = terminations | truncations
+    counts = [simulation.count for simulation in envs.get_attr("simulation")]
+    with pytest.raises(EpisodeOverError, match="reset_mask"):
+        envs.step([1, 1, 1])
+    assert [simulation.count for simulation in envs.get_attr("simulation")] == counts
+    envs.reset(options={"reset_mask": over})
+    envs.step([1, 1, 1])
+    envs.close()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"num_envs": 0},
+        {"num_envs": "2"},
+        {"num_envs": True},
+        {"num_envs": 2, "workers": -1},
+        {"num_envs": 2, "autoreset_mode": "never"},
+    ],
+)
+def test_numbers_and_modes_that_cannot_be_are_refused(options):
+    with pytest.raises(OptionValueError):
+        vector_env(Counter, Counter.decide, **options)
+    with pytest.raises(UnknownOptionError, match="max_steps"):
+        vector_env(Counter, Counter.decide, num_envs=2, max_step=3)
+
+
+# -- actions ----------------------------------------------------------------------------------------
+
+
+def counts(envs: Any) -> list[int]:
+    return [simulation.count for simulation in envs.get_attr("simulation")]
+
+
+def test_one_illegal_action_moves_nobody():
+    envs = vector_env(Counter, {POINT: VARIETY["masked"][1]}, num_envs=3)
+    envs.reset(seed=0)
+    for actions, number in (
+        ([1, 1, 9], 2),
+        ([1, 0, 1], 1),
+        ([1, 2, 1], 1),
+        ([None, 1, 1], 0),
+        ([RULE, 1, 1], 0),
+        (np.array([1, 1, 2]), 2),
+        (np.array([1.0, 1.0, 1.0]), 0),
+    ):
+        with pytest.raises(InvalidActionError, match=f"^sub-environment {number}: "):
+            envs.step(actions)
+        assert counts(envs) == [0, 0, 0]
+    for actions in ([1, 1], [1, 1, 1, 1], 1, None, RULE, "111", np.ones((3, 2), int)):
+        with pytest.raises(InvalidActionError):
+            envs.step(actions)
+        assert counts(envs) == [0, 0, 0]
+    envs.step([1, 1, 1])
+    assert counts(envs) == [1, 1, 1]
+    envs.close()
+
+
+def test_one_illegal_action_in_a_joint_view_moves_nobody():
+    envs = vector_env(Pair, [Pair.steer, Entity.grow], num_envs=2)
+    observations, _ = envs.reset(seed=0)
+    legal = {agent: np.zeros((2, 1)) for agent in observations}
+    for illegal in (
+        {**legal, "steerer": np.array([[0.0], [3.0]])},
+        {**legal, "entity_1": np.array([[0.0], [np.nan]])},
+        {**legal, "steerer": [np.zeros(1), RULE]},
+        {"steerer": np.zeros((2, 1))},
+        {agent: np.zeros((1, 1)) for agent in observations},
+        RULE,
+    ):
+        with pytest.raises(InvalidActionError):
+            envs.step(illegal)
+    assert [simulation.level for simulation in envs.get_attr("simulation")] == [0, 0]
+    envs.step(legal)
+    envs.close()
+
+
+def test_the_action_of_one_that_is_reset_is_not_looked_at():
+    envs = vector_env(Counter, Counter.decide, num_envs=2, max_steps=2)
+    envs.reset(seed=0)
+    envs.step([1, 1])
+    *_, truncations, _ = envs.step([1, 1])
+    assert truncations.all()
+    observations, rewards, terminations, truncations, _ = envs.step([99, -1])
+    assert observations[:, 0].tolist() == rewards.tolist() == [0, 0]
+    assert not (terminations | truncations).any()
+    with pytest.raises(InvalidActionError, match="is not in its action space"):
+        envs.step([99, -1])
+    envs.close()
+
+
+def test_boxes_take_actions_in_other_dtypes():
+    envs = vector_env(Counter, {POINT: VARIETY["box"][1]}, num_envs=2)
+    envs.reset(seed=0)
+    for batch in (np.ones((2, 2)), np.ones((2, 2), int), [[1.0, 1.0], [1, 1]]):
+        envs.reset(seed=0)
+        envs.step(batch)
+        assert counts(envs) == [3, 3]
+    with pytest.raises(InvalidActionError, match="sub-environment 1"):
+        envs.step(np.array([[0, 0], [0, 3.5]], np.float32))
+    envs.close()
+
+
+@pytest.mark.parametrize("copy", [True, False])
+@pytest.mark.parametrize("kind", ["plain", "nested"])
+def test_observations_are_copies_unless_told_otherwise(kind, copy):
+    model, decision = VARIETY[kind]
+    envs = vector_env(model, {POINT: decision}, num_envs=2, copy=copy)
+    first, _ = envs.reset(seed=0)
+    image = first["image"] if kind == "nested" else first
+    kept = image.copy()
+    second, *others = envs.step([1, 1])
+    assert np.shares_memory(image, second["image"] if kind == "nested" else second) != copy
+    assert np.array_equal(image, kept) == copy
+    assert not any(np.shares_memory(a, b) for a, b in zip(others[:3], envs.step([1, 1])[1:4], strict=True))
+    envs.close()
+
+
+# -- errors -----------------------------------------------------------------------------------------
+
+
+def test_an_error_says_where_it_was_and_all_are_as_ever_after_a_reset():
+    stacks_before = stacks()
+    envs = vector_env(Counter, Counter.decide, num_envs=3)
+    envs.reset(seed=0)
+    envs.envs[1].simulation.failing = True
+    with pytest.raises(FuseError) as caught:
+        envs.step([1, 1, 1])
+    assert "sub-environment 1" in notes(caught.value)
+    assert "seed 1" in notes(caught.value)
+    with pytest.raises(EpisodeOverError, match="an error has ended"):
+        envs.step([1, 1, 1])
+    with pytest.raises(EpisodeOverError, match="without a reset_mask"):
+        envs.reset(options={"reset_mask": np.array([False, True, False])})
+    envs.envs[1].simulation.failing = False
+    fresh = vector_env(Counter, Counter.decide, num_envs=3)
+    agree(envs, fresh, 10, np.random.default_rng(0))
+    envs.close()
+    fresh.close()
+    assert stacks(stacks_before) == stacks_before
+
+
+@pytest.mark.parametrize("mapping", ["observation_space_mapping", "reward_mapping", "action_space_mapping"])
+@pytest.mark.parametrize("culprit", [0, 2])
+def test_an_error_in_a_mapping_says_where_it_was(mapping, culprit):
+    stacks_before = stacks()
+
+    def fail(thing: Any) -> Any:
+        if isinstance(thing, Counter):
+            if thing.seed == culprit and thing.count:
+                raise FuseError
+            return [0, 0] if mapping.startswith("obs") else 0.0
+        if thing == 3:
+            raise FuseError
+        return 1
+
+    envs = vector_env(Counter, {POINT: definition(**{mapping: fail})}, num_envs=3)
+    envs.reset(seed=0)
+    actions = np.where(np.arange(3) == culprit, 3, 1)
+    with pytest.raises(FuseError) as caught:
+        envs.step(actions)
+    assert f"sub-environment {culprit}" in notes(caught.value)
+    if mapping == "action_space_mapping" and culprit == 0:
+        envs.step([1, 1, 1])  # nothing had moved
+        assert counts(envs) == [1, 1, 1]
+    else:
+        with pytest.raises(EpisodeOverError, match="begin the next ones"):
+            envs.step([1, 1, 1])
+    envs.reset(seed=5)
+    envs.step([1, 1, 1])
+    assert counts(envs) == [1, 1, 1]
+    envs.close()
+    assert stacks(stacks_before) == stacks_before
+
+
+def test_an_error_after_another_one_was_reset_has_all_be_reset():
+    def fail_at_three(action: int) -> int:
+        if action == 3:
+            raise FuseError
+        return 1
+
+    envs = vector_env(Counter, {POINT: definition(action_space_mapping=fail_at_three)}, num_envs=2)
+    goals = {seed: int(np.random.default_rng(seed).integers(3, 12)) for seed in range(10)}
+    envs.reset(seed=[max(goals, key=goals.__getitem__), min(goals, key=goals.__getitem__)])
+    while not (told := envs.step([1, 1]))[2].any() and not told[3].any():
+        pass
+    assert (told[2] | told[3]).tolist() == [False, True]
+    with pytest.raises(FuseError) as caught:
+        envs.step([3, 1])
+    assert "sub-environment 0" in notes(caught.value)
+    with pytest.raises(EpisodeOverError, match="begin the next ones"):
+        envs.step([1, 1])
+    envs.reset(seed=0)
+    envs.step([1, 1])
+    envs.close()
+
+
+def test_an_error_in_a_reset_says_where_it_was():
+    class Fragile(Counter):
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+            super().reset(seed, options)
+            if seed == 6:
+                raise FuseError
+
+    envs = vector_env(Fragile, {POINT: definition()}, num_envs=3)
+    with pytest.raises(FuseError) as caught:
+        envs.reset(seed=5)
+    assert "sub-environment 1" in notes(caught.value)
+    with pytest.raises(NotResetError, match="no episode yet"):
+        envs.step([1, 1, 1])
+    envs.reset(seed=0)
+    envs.step([1, 1, 1])
+    envs.close()
+
+
+def test_it_cannot_be_used_from_inside_itself():
+    envs: Any = None
+
+    def meddle(model: Any) -> float:
+        if model.count:
+            envs.step([1, 1])
+        return 0.0
+
+    envs = vector_env(Counter, {POINT: definition(reward_mapping=meddle)}, num_envs=2)
+    envs.reset(seed=0)
+    with pytest.raises(ReentrancyError, match="was used from"):
+        envs.step([1, 1])
+    envs.reset(seed=0)
+    envs.close()
+
+
+def test_inside_another_simulation_it_works_all_the_same():
+    inner = vector_env(Counter, {POINT: definition()}, num_envs=2)
+    told = []
+
+    class Outer(Counter):
+        def run(self) -> Any:
+            inner.reset(seed=0)
+            told.append(inner.step([1, 2])[0][:, 0].tolist())
+            return super().run()
+
+    outer = vector_env(Outer, {POINT: definition()}, num_envs=2)
+    outer.reset(seed=0)
+    assert told == [[1, 2], [1, 2]]
+    outer.close()
+    inner.close()
+
+
+def test_another_thread_is_told_so_and_nothing_has_moved():
+    envs = vector_env(Counter, Counter.decide, num_envs=2)
+    envs.reset(seed=0)
+    errors = []
+
+    def use() -> None:
+        for method in (lambda: envs.step([1, 1]), envs.reset, envs.close):
+            try:
+                method()
+            except WrongThreadError as error:
+                errors.append(error)
+
+    thread = threading.Thread(target=use)
+    thread.start()
+    thread.join()
+    assert len(errors) == 3
+    assert not envs.closed
+    envs.step([1, 1])
+    assert counts(envs) == [1, 1]
+    envs.close()
+
+
+def test_with_the_thread_driver_any_thread_may_use_it():
+    envs = vector_env(Counter, Counter.decide, num_envs=2, driver="thread")
+    envs.reset(seed=0)
+    thread = threading.Thread(target=envs.step, args=([1, 1],))
+    thread.start()
+    thread.join()
+    assert counts(envs) == [1, 1]
+    envs.close()
+
+
+# -- the simulations themselves -----------------------------------------------------------------------
+
+
+def test_sub_environments_can_be_asked_and_told():
+    envs = vector_env(Timed, {POINT: VARIETY["goal"][1]}, num_envs=3, render_mode="ansi")
+    envs.reset(seed=0)
+    envs.step([1, 2, 3])
+    assert envs.render() == ("ansi 1", "ansi 2", "ansi 3")
+    assert envs.call("compute_reward", np.ones(1), np.zeros(1), {}) == (-1.0,) * 3
+    assert [simulation.count for simulation in envs.get_attr("simulation")] == [1, 2, 3]
+    assert [env.simulation for env in envs.envs] == list(envs.get_attr("simulation"))
+    envs.set_attr("tag", "same")
+    assert envs.get_attr("tag") == ("same",) * 3
+    envs.set_attr("tag", [1, 2, 3])
+    assert envs.get_attr("tag") == (1, 2, 3)
+    with pytest.raises(OptionValueError):
+        envs.set_attr("tag", [1, 2])
+    spaces_of = envs.get_attr("action_space")
+    assert len({id(space) for space in spaces_of}) == 3
+    assert spaces_of[0] == envs.single_action_space
+    with pytest.raises(AttributeError):
+        envs.get_attr("nothing")
+    assert envs.unwrapped is envs
+    envs.close()
+
+
+def test_a_sub_environment_that_somebody_else_resets_is_stepped_where_it_then_stands():
+    envs = vector_env(Counter, POINT, num_envs=2)
+    envs.reset(seed=[5, 6])
+    for _ in range(2):
+        envs.step([1, 1])
+    other = envs.envs[1]
+    observation, _ = other.reset(seed=6)
+    assert observation[0] == 0
+    assert envs.step([1, 1])[0][:, 0].tolist() == [3, 1]
+    other.close()
+    with pytest.raises(ResetNeededError, match="call reset"):
+        envs.step([1, 1])
+    envs.reset(seed=[5, 6])
+    assert envs.step([1, 1])[0][:, 0].tolist() == [1, 1]
+    envs.close()
+
+
+def test_it_cannot_be_copied_or_pickled():
+    envs = vector_env(Counter, Counter.decide, num_envs=2)
+    for use in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(CopyError, match="cannot be copied or pickled"):
+            use(envs)
+    envs.close()
+
+
+def test_close_unwinds_all_and_only_once():
+    stacks_before = stacks()
+    for prepare in (
+        lambda envs: None,
+        lambda envs: envs.reset(),
+        lambda envs: envs.reset() and envs.step([1, 1]),
+    ):
+        envs = vector_env(Counter, Counter.decide, num_envs=2)
+        prepare(envs)
+        simulations = envs.get_attr("simulation")
+        envs.close()
+        envs.close()
+        assert envs.closed
+        assert all(simulation.unwound for simulation in simulations if hasattr(simulation, "count"))
+        for use in (envs.reset, lambda envs=envs: envs.step([1, 1]), lambda envs=envs: envs.call("simulation")):
+            with pytest.raises(ClosedError, match="the environment is closed"):
+                use()
+    assert stacks(stacks_before) == stacks_before
+
+
+def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
+    stacks_before = stacks()
+
+    class Stubborn(Counter):
+        def run(self) -> Any:
+            try:
+                super().run()
+            except BaseException:
+                if self.seed:
+                    raise LookupError("it would not go") from None
+                raise
+
+    envs = vector_env(Stubborn, {POINT: definition()}, num_envs=3)
+    envs.reset(seed=0)
+    simulations = envs.get_attr("simulation")
+    with pytest.raises(LookupError) as caught:
+        envs.close()
+    assert "sub-environment 1" in notes(caught.value)
+    assert "sub-environment 2: LookupError" in notes(caught.value)
+    assert all(simulation.unwound for simulation in simulations)
+    assert envs.closed
+    assert stacks(stacks_before) == stacks_before
+
+
+def test_one_that_is_dropped_unwinds_all():
+    stacks_before = stacks()
+    envs = vector_env(Counter, Counter.decide, num_envs=2)
+    envs.reset(seed=0)
+    simulations = envs.get_attr("simulation")
+    del envs
+    gc.collect()
+    assert all(simulation.unwound for simulation in simulations)
+    assert stacks(stacks_before) == stacks_before
+
+
+# -- beside Gymnasium ---------------------------------------------------------------------------------
+
+
+def test_the_wrappers_of_gymnasium_do_what_they_do_to_its_own():
+    make = {
+        "statistics": wrappers.RecordEpisodeStatistics,
+        "normal": lambda envs: wrappers.NormalizeReward(wrappers.NormalizeObservation(envs)),
+        "list": wrappers.DictInfoToList,
+        "changed": lambda envs: wrappers.ClipReward(envs, 0.0, 0.5),
+        "flat": lambda envs: wrappers.TransformReward(wrappers.FlattenObservation(envs), np.negative),
+    }
+    for wrap in make.values():
+        ours = wrap(vector_env(Timed, {POINT: definition()}, num_envs=3))
+        theirs = wrap(SyncVectorEnv([lambda: single_env(Timed, {POINT: definition()})] * 3))
+        told = ours.reset(seed=0), theirs.reset(seed=0)
+        for _ in range(20):
+            for one, other in zip(*told, strict=True):
+                assert alike(one, other)
+            told = ours.step(np.array([1, 2, 3])), theirs.step(np.array([1, 2, 3]))
+        ours.close()
+        theirs.close()
+
+
+def alike(one: Any, other: Any) -> bool:
+    """The same, but for how long it has taken."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(alike(one[key], other[key]) for key in one if key != "t")
+    return same(one, other)
+
+
+def test_gymnasium_makes_it_of_registered_ids():
+    ids = register_simulation(Pair, [Pair.steer, Entity.grow], name="vectors")
+    try:
+        for identity in ids[:2]:
+            ours = gymnasium.make_vec(identity, num_envs=3, vectorization_mode="vector_entry_point", max_steps=3)
+            assert type(ours).__name__ == "SimulationVectorEnv"
+            assert ours.spec.id == identity
+            ours.spec.to_json()
+            theirs = gymnasium.make_vec(identity, num_envs=3, vectorization_mode="sync", max_steps=3)
+            agree(ours, theirs, 12, np.random.default_rng(0))
+            ours.close()
+            theirs.close()
+        envs = gymnasium.make_vec(ids[0], num_envs=2, autoreset_mode="SameStep", workers=1, context=FORK)
+        assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        envs.reset(seed=0)
+        envs.close()
+    finally:
+        for identity in ids[:2]:
+            gymnasium.registry.pop(identity)
+
+
+@pytest.mark.parametrize("view", ["single", "joint"])
+@pytest.mark.parametrize("mode", MODES)
+def test_an_agent_that_is_removed_terminates_and_is_not_truncated(view, mode):
+    class Brief:
+        def reset(self, seed: int | None = None) -> None:
+            self.being = Being(0)
+
+        def expected_calls(self, point: str) -> list[Any]:
+            return [(self.being,)]
+
+        def run(self) -> Any:
+            self.being.act()
+            self.being.leave()
+            return TRUNCATED
+
+    envs = vector_env(Brief, beings(agent="being_0"), num_envs=2, view=view, autoreset_mode=mode)
+    alone = (single_env if view == "single" else joint_env)(Brief, beings(agent="being_0"))
+    alone.reset(seed=0)
+    expected = alone.step(1 if view == "single" else {"being_0": 1})[2:4]
+    envs.reset(seed=0)
+    *_, terminated, truncated, _ = envs.step(np.ones(2, np.int64) if view == "single" else {"being_0": np.ones(2, int)})
+    assert list(zip(terminated.tolist(), truncated.tolist(), strict=True)) == [expected] * 2
+    if view == "single":
+        assert expected == (True, False)
+    envs.close()
+
+
+@pytest.mark.parametrize("culprit", [0, 1])
+def test_wherever_an_error_was_all_are_to_be_reset(culprit):
+    envs = vector_env(Counter, Counter.decide, num_envs=2)
+    envs.reset(seed=0)
+    envs.envs[culprit].simulation.failing = True
+    with pytest.raises(FuseError) as caught:
+        envs.step([1, 1])
+    assert f"sub-environment {culprit}" in notes(caught.value)
+    for _ in range(2):
+        with pytest.raises(EpisodeOverError, match="an error has ended"):
+            envs.step([1, 1])
+    envs.close()
+
+
+def test_what_is_reset_to_ask_for_the_agents_is_unwound():
+    """Where no roster is declared, a simulation is reset when the environment is made."""
+
+    ended = []
+
+    class Announcing(Counter):
+        def run(self):
+            try:
+                super().run()
+            finally:
+                ended.append(self)
+
+        def expected_calls(self, point):
+            return [(self,)]
+
+    point = definition(agent=lambda self: "counter_0")
+    envs = vector_env(Announcing, {f"{__name__}.Counter.decide": point}, num_envs=2)
+    assert len(ended) == 1
+    envs.close()

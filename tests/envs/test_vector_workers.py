@@ -1,0 +1,542 @@
+"""Simulations spread over processes tell what they tell in one, and nothing hangs or stays behind."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simenv_marl import (
+    ClosedError,
+    EpisodeOverError,
+    InvalidActionError,
+    OptionValueError,
+    RewardError,
+    WorkerError,
+    make_step,
+    vector_env,
+)
+from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
+from tests.worlds.models import notes
+from tests.worlds.worlds import designs, seeds
+
+ROOT = Path(__file__).parents[2]
+
+pytestmark = FORKS
+
+
+def workers(model: Any = Counter, decision: Any = None, **options: Any) -> Any:
+    """A vector environment of four counters in two workers."""
+    options = {"num_envs": 4, "workers": 2, "context": FORK, **options}
+    return vector_env(model, {POINT: decision or definition()}, **options)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left():
+    before = set(multiprocessing.active_children())  # joblib keeps its own for the next time
+    yield
+    gc.collect()
+    assert set(multiprocessing.active_children()) <= before
+
+
+class Odd(Exception):
+    """An error that is not made of its arguments."""
+
+    def __init__(self, *, count: int) -> None:
+        super().__init__("it is odd")
+        self.count = count
+
+
+class Failing(Counter):
+    """Does something terrible at a count that its options tell."""
+
+    def __init__(self) -> None:
+        self.process = os.getpid()
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        super().reset(seed, options)
+        self.goal = 100
+        self.how = (options or {}).get(seed)
+
+    def run(self) -> Any:
+        while True:
+            self.count += self.decide()
+            if self.how == "odd":
+                raise Odd(count=self.count)
+            if self.how == "local":
+                raise type("Local", (ValueError,), {})("made here")
+            if self.how == "unpicklable":
+                error = ValueError("with something in it")
+                error.thing = (part for part in ())
+                raise error
+            if self.how == "kill":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "exit":
+                os._exit(7)
+            if self.how == "system exit":
+                raise SystemExit(3)
+
+
+ONES = np.ones(4, np.int64)
+
+
+# -- the same -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("context", multiprocessing.get_all_start_methods())
+def test_workers_tell_what_one_process_tells_however_they_are_started(context):
+    points = {POINT: definition(action_mask_mapping=lambda self: [1, self.count % 2, 1])}
+    with_workers = vector_env(Counter, points, num_envs=5, workers=2, context=context)
+    without = vector_env(Counter, points, num_envs=5)
+    agree(with_workers, without, 30, np.random.default_rng(1))
+    with_workers.close()
+    without.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", VARIETY)
+def test_workers_tell_the_same_of_all_kinds_of_spaces(kind, mode):
+    model, decision = VARIETY[kind]
+    with_workers = workers(model, decision, num_envs=5, autoreset_mode=mode)
+    without = vector_env(model, {POINT: decision}, num_envs=5, autoreset_mode=mode)
+    assert with_workers.metadata == without.metadata
+    agree(with_workers, without, 25, np.random.default_rng(1))
+    assert same(with_workers.np_random_seed, without.np_random_seed)
+    with_workers.close()
+    without.close()
+
+
+@given(designs(), seeds, st.sampled_from(MODES), st.integers(1, 4), st.integers(1, 5))
+@settings(max_examples=15)
+def test_workers_tell_the_same_of_random_worlds(design, seed, mode, number, processes):
+    joint_or_single = made(design, number, mode)
+    if joint_or_single is None:
+        return
+    with_workers = made(design, number, mode, workers=processes, context=FORK)
+    agree(with_workers, joint_or_single, 12, np.random.default_rng(seed))
+    with_workers.close()
+    joint_or_single.close()
+
+
+def test_simulations_are_spread_evenly_and_there_are_no_more_workers_than_simulations():
+    envs = workers(Failing, num_envs=5, workers=3)
+    assert sorted(map(processes_of(envs).count, set(processes_of(envs)))) == [1, 2, 2]
+    envs.close()
+    envs = workers(Failing, num_envs=2, workers=5)
+    assert len(set(processes_of(envs))) == 2
+    assert os.getpid() not in processes_of(envs)
+    envs.close()
+
+
+def processes_of(envs: Any) -> list[int]:
+    """In which process each simulation is."""
+    return [simulation.process for simulation in envs.get_attr("simulation")]
+
+
+def test_models_and_mappings_that_no_module_holds_are_sent_along():
+    class Local:
+        def reset(self, seed: int | None = None) -> None:
+            self.count = seed or 0
+
+        def run(self) -> None:
+            while True:
+                self.count += self.decide()
+
+        @make_step(
+            observation_space=spaces.Box(0, 1000, (1,), np.int64),
+            observation_space_mapping=lambda self: [self.count],
+            action_space=spaces.Discrete(5),
+            action_space_mapping=int,
+            reward_mapping=lambda self: float(self.count),
+        )
+        def decide(self) -> int:
+            return 0
+
+    envs = vector_env(Local, Local.decide, num_envs=3, workers=2, context="spawn")
+    assert envs.reset(seed=4)[0].tolist() == [[4], [5], [6]]
+    observations, rewards, *_ = envs.step([1, 2, 3])
+    assert observations.tolist() == [[5], [7], [9]]
+    assert rewards.tolist() == [5.0, 7.0, 9.0]
+    envs.close()
+
+
+def test_functions_may_be_named_while_another_environment_decides_them():
+    points = {Plain.decide: definition()}
+    first = vector_env(Plain, points, num_envs=2)
+    second = vector_env(Plain, points, num_envs=2, workers=1)
+    third = vector_env(Plain, {Plain.decide: definition()}, num_envs=2, workers=1)
+    agree(first, second, 10, np.random.default_rng(0))
+    agree(first, third, 10, np.random.default_rng(0))
+    for envs in (first, second, third):
+        envs.close()
+
+
+class Plain(Counter):
+    """Decides by a function that nobody has decorated."""
+
+    def decide(self) -> int:
+        return 1
+
+
+def test_what_cannot_be_sent_is_refused():
+    lock = threading.Lock()
+    with pytest.raises(OptionValueError, match="cannot be sent to another process"):
+        vector_env(lambda: (lock, Counter())[1], {POINT: definition()}, num_envs=2, workers=1)
+
+
+def test_calls_and_attributes_go_to_the_workers_and_back():
+    envs = workers(render_mode="ansi")
+    envs.reset(seed=3)
+    assert envs.render() == ("ansi 0",) * 4
+    envs.set_attr("tag", [1, 2, 3, 4])
+    assert envs.get_attr("tag") == (1, 2, 3, 4)
+    assert [simulation.seed for simulation in envs.get_attr("simulation")] == [3, 4, 5, 6]
+    with pytest.raises(AttributeError, match="nothing_of_that_name"):
+        envs.call("nothing_of_that_name")
+    with pytest.raises(AttributeError, match="other processes"):
+        envs.envs  # noqa: B018
+    with pytest.raises(OptionValueError):
+        envs.set_attr("tag", [1])
+    envs.step(ONES)
+    envs.close()
+
+
+@pytest.mark.parametrize("copy", [True, False])
+def test_observations_are_copies_unless_told_otherwise(copy):
+    envs = workers(copy=copy)
+    first, _ = envs.reset(seed=0)
+    kept = first.copy()
+    second, *_ = envs.step(ONES)
+    assert (second is first) != copy
+    assert np.array_equal(first, kept) == copy
+    envs.close()
+    assert first.shape == (4, 2)  # it can be read still
+
+
+# -- errors ---------------------------------------------------------------------------------------------
+
+
+def test_an_illegal_action_anywhere_moves_nothing():
+    envs = workers(Counter, VARIETY["masked"][1])
+    before, _ = envs.reset(seed=0)
+    for illegal in ([1, 1, 1, 9], [1, 1, 2, 1], [1, 1, 1], "none", None):
+        with pytest.raises(InvalidActionError) as caught:
+            envs.step(np.array(illegal) if isinstance(illegal, list) else illegal)
+        if isinstance(illegal, list) and len(illegal) == 4:
+            assert f"sub-environment {np.argmax(np.array(illegal) != 1)}" in str(caught.value)
+    after, *_ = envs.step(ONES)
+    assert (after[:, 0] - before[:, 0]).tolist() == [1, 1, 1, 1]
+    envs.close()
+
+
+def test_errors_come_back_as_themselves_and_the_next_reset_works():
+    envs = workers(Failing)
+    for how, kind, message in (
+        ("odd", Odd, "it is odd"),
+        ("local", ValueError, "made here"),
+        ("unpicklable", WorkerError, "ValueError: with something in it"),
+        ("system exit", SystemExit, "3"),
+    ):
+        envs.reset(seed=0, options={2: how})
+        with pytest.raises(kind, match=message) as caught:
+            envs.step(ONES)
+        assert "sub-environment 2" in notes(caught.value)
+        assert "seed 2" in notes(caught.value)
+        assert "in run" in str(caught.value.__cause__)
+        if how == "odd":
+            assert caught.value.count == 1
+        with pytest.raises(EpisodeOverError, match="begin the next ones"):
+            envs.step(ONES)
+        with pytest.raises(EpisodeOverError, match="without a reset_mask"):
+            envs.reset(options={"reset_mask": np.array([0, 0, 1, 0], bool)})
+        envs.reset(seed=0)
+        observations, *_ = envs.step(ONES)
+        assert observations[:, 0].tolist() == [1, 1, 1, 1]
+    envs.close()
+
+
+def test_errors_of_the_tree_stay_themselves():
+    envs = workers(Counter, definition(reward_mapping=lambda self: float("nan") if self.count else 0.0))
+    envs.reset(seed=0)
+    with pytest.raises(RewardError, match="not finite") as caught:
+        envs.step(ONES)
+    assert "sub-environment 0" in notes(caught.value)
+    envs.close()
+
+
+def test_errors_in_a_factory_surface_where_the_environment_is_made():
+    with pytest.raises(ZeroDivisionError) as caught:
+        workers(Breaking(os.getpid()), num_envs=3)
+    assert "worker 0" in notes(caught.value)
+
+
+class Breaking:
+    """A factory that works in one process alone."""
+
+    def __init__(self, process: int) -> None:
+        self.process = process
+
+    def __call__(self) -> Any:
+        return Counter() if os.getpid() == self.process else 1 / 0
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+@pytest.mark.parametrize(("how", "code"), [("kill", -signal.SIGKILL), ("exit", 7)])
+def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, code):
+    envs = workers(Failing)
+    envs.reset(seed=0, options={3: how})
+    with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* exit code {code}"):
+        envs.step(ONES)
+    with pytest.raises(EpisodeOverError, match="begin the next ones"):
+        envs.step(ONES)
+    with pytest.raises(WorkerError, match="is dead"):
+        envs.call("simulation")
+    envs.reset(seed=0)
+    observations, *_ = envs.step(ONES)
+    assert observations[:, 0].tolist() == [1, 1, 1, 1]
+    envs.close()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+def test_workers_that_are_killed_between_steps_are_noticed():
+    for use in (lambda envs: envs.step(ONES), lambda envs: envs.call("simulation"), None):
+        envs = workers(Failing)
+        envs.reset(seed=0)
+        for process in set(processes_of(envs)):
+            os.kill(process, signal.SIGKILL)
+        if use is not None:
+            with pytest.raises(WorkerError, match="exit code -9"):
+                use(envs)
+        envs.close()
+        assert envs.closed
+
+
+def test_errors_survive_pickling():
+    envs = workers(Failing)
+    envs.reset(seed=0, options={1: "exit"})
+    with pytest.raises(WorkerError, match="died with exit code") as caught:
+        envs.step(ONES)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    envs.close()
+
+
+# -- the end --------------------------------------------------------------------------------------------
+
+
+def gone(process: int) -> bool:
+    """Whether a process ends, within some seconds."""
+    for _ in range(200):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_close_ends_the_workers_in_every_state_and_only_once():
+    for prepare in (
+        lambda envs: None,
+        lambda envs: envs.reset(),
+        lambda envs: envs.reset() and envs.step(ONES),
+    ):
+        envs = workers(Failing)
+        prepare(envs)
+        there = set(processes_of(envs))
+        envs.close()
+        envs.close()
+        assert envs.closed
+        assert all(map(gone, there))
+        for use in (envs.reset, lambda envs=envs: envs.step(ONES), lambda envs=envs: envs.call("simulation")):
+            with pytest.raises(ClosedError, match="the environment is closed"):
+                use()
+
+
+class Stubborn(Counter):
+    """Raises while it is unwound."""
+
+    def run(self) -> Any:
+        try:
+            super().run()
+        except BaseException:
+            raise LookupError("it would not go") from None
+
+
+def test_errors_while_closing_surface_and_the_workers_end():
+    envs = workers(Stubborn)
+    envs.reset(seed=0)
+    with pytest.raises(LookupError, match="it would not go"):
+        envs.close()
+    assert envs.closed
+
+
+def test_an_environment_that_is_dropped_ends_its_workers():
+    envs = workers(Failing)
+    envs.reset(seed=0)
+    there = set(processes_of(envs))
+    del envs
+    gc.collect()
+    assert all(map(gone, there))
+
+
+def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
+    monkeypatch.setattr("simenv_marl.envs.workers.SECONDS_TO_CLOSE", 0.5)
+    envs = workers(Hanging)
+    envs.reset(seed=0)
+    with pytest.warns(ResourceWarning, match="did not close"):
+        envs.close()
+    assert envs.closed
+
+
+class Hanging(Counter):
+    """Does not come to an end when it is unwound."""
+
+    def run(self) -> Any:
+        try:
+            super().run()
+        finally:
+            time.sleep(60)
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there is no setitimer")
+def test_an_interrupted_step_leaves_the_environment_in_step():
+    envs = workers(Slow)
+    envs.reset(seed=0)
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(KeyboardInterrupt):
+            envs.step(ONES)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    with pytest.raises(EpisodeOverError, match="begin the next ones"):
+        envs.step(ONES)
+    observations, _ = envs.reset(seed=7)
+    assert observations[:, 0].tolist() == [0, 0, 0, 0]
+    assert [simulation.seed for simulation in envs.get_attr("simulation")] == [7, 8, 9, 10]
+    envs.close()
+
+
+class Slow(Counter):
+    """Takes its time."""
+
+    def run(self) -> Any:
+        while True:
+            self.count += self.decide()
+            if self.seed == 0:
+                time.sleep(0.4)
+
+
+SCRIPT = """
+import os
+import numpy as np
+from gymnasium import spaces
+from simenv_marl import make_step, vector_env
+
+class Model:
+    def reset(self): self.count = 0
+    def run(self):
+        try:
+            while True: self.count += self.decide()
+        finally:
+            print("unwound", flush=True)
+
+    @make_step(
+        observation_space=spaces.Box(0, 9, (1,), np.int64), observation_space_mapping=lambda self: [self.count],
+        action_space=spaces.Discrete(2), action_space_mapping=int, reward_mapping=lambda self: 1.0,
+    )
+    def decide(self): return 0
+
+if __name__ == "__main__":
+    envs = vector_env(Model, Model.decide, num_envs=2, workers=2, context={context!r})
+    envs.reset(seed=0)
+    print(envs.step([1, 0])[0].tolist(), flush=True)
+    {end}
+"""
+
+
+@pytest.mark.parametrize("context", ["spawn", FORK])
+@pytest.mark.parametrize("end", ["", "raise KeyboardInterrupt", "os.kill(os.getpid(), 9)"])
+def test_nothing_stays_behind_when_the_interpreter_ends(context, end, tmp_path):
+    path = tmp_path / "script.py"
+    path.write_text(SCRIPT.format(context=context, end=end), encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-W", "ignore:This process:DeprecationWarning", "-X", "dev", str(path)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,  # the output ends when the last worker does
+        check=False,
+    )
+    lines = done.stdout.splitlines()
+    assert lines[0] == "[[1], [0]]"
+    assert done.stdout.count("unwound") == 2
+    if not end:
+        assert done.stderr == ""
+        assert done.returncode == 0
+    assert "leaked" not in done.stderr
+
+
+@pytest.mark.skipif(FORK != "fork", reason="there is no fork")
+def test_a_fork_leaves_the_workers_to_the_process_that_has_started_them():
+    envs = workers()
+    envs.reset(seed=0)
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            envs.step(ONES)
+        except WorkerError:
+            code = 0
+        finally:
+            del envs
+            gc.collect()
+            os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
+    observations, *_ = envs.step(ONES)
+    assert observations[:, 0].tolist() == [1, 1, 1, 1]
+    envs.close()
+
+
+def test_contexts_that_do_not_exist_are_refused():
+    with pytest.raises(OptionValueError, match="context must be"):
+        workers(context="magic")
+    with pytest.raises(OptionValueError, match="context must be"):
+        workers(context=3)
+    envs = workers(context=multiprocessing.get_context(FORK))
+    envs.close()
+
+
+def test_modes_are_kept_by_the_workers():
+    envs = workers(autoreset_mode=AutoresetMode.DISABLED)
+    envs.reset(seed=0)
+    while True:
+        *_, terminations, truncations, _ = envs.step(ONES)
+        if (terminations | truncations).any():
+            break
+    with pytest.raises(EpisodeOverError, match="reset_mask"):
+        envs.step(ONES)
+    envs.reset(options={"reset_mask": terminations | truncations})
+    envs.step(ONES)
+    envs.close()

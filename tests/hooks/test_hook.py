@@ -1,0 +1,232 @@
+"""Stand-ins, and who takes part in their calls."""
+
+import gc
+import inspect
+import pickle
+import threading
+import weakref
+
+import cloudpickle
+import pytest
+from greenlet import getcurrent, greenlet
+
+from simenv_marl.core.children import ChildThreads
+from simenv_marl.hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
+from simenv_marl.hooks.stacks import EVALUATING, OUTSIDE, STACKS, outside_simulation, stack_of
+
+
+def rule(first, second=2, *, third=3):
+    """Say what it was called with."""
+    return first, second, third
+
+
+class Model:
+    def decide(self):
+        return "rule"
+
+    def items(self, number):
+        yield from range(number)
+        return "rule"
+
+    async def wait(self, seconds):
+        return seconds
+
+
+class Stack:
+    """A simulation's stack that decides everything, or what it is told."""
+
+    def __init__(self, plugins=None):
+        self.plugins, self.asked, self.hidden = plugins, [], 0
+        self.children = ChildThreads()  # where other tests have left environments, threads are watched
+
+    def taker(self, hook, here):
+        self.asked.append(here)
+        return lambda args, kwargs: ("elsewhere", args)
+
+    def refusal_of(self, hook, where):
+        return lambda args, kwargs: f"refused in {where}"
+
+    def hide(self):
+        self.hidden += 1
+
+    def show(self):
+        self.hidden -= 1
+
+
+@pytest.fixture
+def stack():
+    made = Stack()
+    here = getcurrent()
+    STACKS[here] = made
+    yield made
+    del STACKS[here]
+
+
+def in_a_greenlet(function):
+    return greenlet(function).switch()
+
+
+# -- stand-ins --------------------------------------------------------------------------------------
+
+
+def test_a_stand_in_looks_like_its_function_and_runs_it():
+    made = Hook(rule, "somewhere.rule").stand_in()
+    assert (made.__name__, made.__doc__, inspect.signature(made)) == ("rule", rule.__doc__, inspect.signature(rule))
+    assert made(1) == made(first=1) == (1, 2, 3)
+    assert made(1, third=4) == (1, 2, 4)
+    assert hook_of(made).function is beneath(made) is rule
+    assert (hook_of(rule), beneath(rule)) == (None, rule)
+    with pytest.raises(TypeError):
+        made()
+
+
+@pytest.mark.parametrize(("args", "kwargs"), [((1,), {}), ((1, 5), {}), ((1,), {"third": 7}), ((), {"first": 1})])
+def test_a_taker_gets_the_arguments_as_they_were_passed(args, kwargs):
+    hook = Hook(rule, "somewhere.rule")
+    hook.enter(getcurrent(), lambda *taken: taken, None)
+    made = hook.stand_in()
+    assert made(*args, **kwargs) == (args, kwargs)
+    with pytest.raises(TypeError, match="missing"):
+        made()
+    hook.leave(getcurrent())
+    assert hook.takers == {}
+
+
+def test_every_kind_of_function_has_takers_of_its_kind():
+    items, wait = Hook(Model.items, f"{__name__}.Model.items"), Hook(Model.wait, f"{__name__}.Model.wait")
+    assert (items.kind, wait.kind) == ("generator", "coroutine")
+
+    def generate(args, kwargs):
+        yield "taken"
+
+    async def taken(args, kwargs):
+        return "taken"
+
+    items.enter(getcurrent(), generate, None)
+    wait.enter(getcurrent(), taken, None)
+    assert list(items.stand_in()(Model(), 2)) == ["taken"]
+    with pytest.raises(StopIteration, match="taken"):
+        wait.stand_in()(Model(), 1).send(None)
+
+
+def test_takers_are_found_by_greenlet():
+    hook = Hook(Model.decide, f"{__name__}.Model.decide")
+    made = hook.stand_in()
+    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
+    assert made(Model()) == "taken"
+    assert in_a_greenlet(lambda: made(Model())) == "rule"  # no simulation's stack is among its parents
+    said = []
+    thread = threading.Thread(target=lambda: said.append(made(Model())))
+    thread.start()
+    thread.join()
+    assert said == ["rule"]
+
+
+def test_a_greenlet_belongs_to_the_nearest_stack_among_its_parents(stack):
+    hook = Hook(Model.decide, f"{__name__}.Model.decide")
+    made = hook.stand_in()
+    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
+    model = Model()
+    assert in_a_greenlet(lambda: made(model)) == ("elsewhere", (model,))
+    assert in_a_greenlet(lambda: in_a_greenlet(lambda: made(model))) == ("elsewhere", (model,))
+    assert len(stack.asked) == 2
+
+
+def test_what_a_stack_has_spawned_on_a_hub_of_others_is_refused(stack):
+    hook = Hook(Model.decide, f"{__name__}.Model.decide")
+    made = hook.stand_in()
+    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
+    here, said = getcurrent(), []
+
+    class Spawned(greenlet):
+        spawning_greenlet = staticmethod(weakref.ref(here))
+
+    def hub():
+        spawned = Spawned(lambda: made(Model()))
+        return spawned.switch()
+
+    thread = threading.Thread(target=lambda: said.append(hub()))  # where no parent is the stack
+    thread.start()
+    thread.join()
+    assert "refused in a greenlet that the simulation has spawned" in said[0]
+
+
+def test_outside_a_simulation_its_takers_are_masked(stack):
+    here = getcurrent()
+    with outside_simulation():
+        assert stack.hidden == 1
+        assert STACKS[here] is OUTSIDE
+        assert stack_of(here) is None
+        assert in_a_greenlet(lambda: stack_of(getcurrent())) is None
+        with outside_simulation():
+            assert stack.hidden == 1
+        assert STACKS[here] is OUTSIDE
+    assert stack.hidden == 0
+    assert stack_of(here) is stack
+    assert EVALUATING == {}
+
+
+def test_in_a_greenlet_of_the_model_only_that_is_masked(stack):
+    def work():
+        with outside_simulation():
+            assert stack.hidden == 0
+            assert stack_of(getcurrent()) is None
+        return stack_of(getcurrent())
+
+    assert in_a_greenlet(work) is stack
+    assert list(STACKS.values()).count(OUTSIDE) == 0
+
+
+# -- rules and what is made of them -----------------------------------------------------------------
+
+
+def test_what_runs_in_the_functions_place_does_so_everywhere_but_in_what_has_begun():
+    hook = Hook(Model.decide, f"{__name__}.Model.decide")
+    made = hook.stand_in()
+    hook.replace_rule(lambda model: "other")
+    assert made(Model()) == in_a_greenlet(lambda: made(Model())) == "other"
+    hook.replace_rule()
+    assert made(Model()) == "rule"
+    assert hook.takers == {}
+
+
+def test_what_a_stand_in_was_made_with_stays_with_it():
+    hook = Hook(rule, "somewhere.rule")
+    one, two = hook.stand_in("one"), hook.stand_in("two")
+    assert (made_with(one), made_with(two)) == ("one", "two")
+    assert hook_of(one) is hook_of(two) is hook
+    assert set(hook.stand_ins) == {one, two}
+
+
+def test_a_hook_goes_with_its_stand_ins():
+    def function():
+        return 1
+
+    made = Hook(function, "somewhere.function").stand_in()
+    reference = weakref.ref(hook_of(made))
+    assert list(MADE_OF[function]) == [reference()]
+    del made
+    gc.collect()
+    assert reference() is None
+    assert not MADE_OF[function]
+
+
+def test_a_stand_in_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
+    scope = {"__name__": "__main__"}
+    exec("def function(number): return number", scope)
+    made = Hook(scope["function"], "__main__.function").stand_in("made with")
+    again = pickle.loads(cloudpickle.dumps(made))
+    hook = hook_of(again)
+    assert again(3) == 3
+    assert made_with(again) == "made with"
+    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
+    assert again(3) == "taken"
+    hook.leave(getcurrent())
+
+
+def test_async_generators_have_neither_value_nor_items():
+    async def function():
+        yield 1
+
+    with pytest.raises(Exception, match="async generator"):
+        Hook(function, "somewhere.function")

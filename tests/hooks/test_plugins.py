@@ -1,0 +1,1260 @@
+"""Section 8: handlers before, after and instead of a model's functions, for the whole process."""
+
+import asyncio
+import collections.abc
+import copy
+import gc
+import inspect
+import pickle
+import sys
+import types
+import weakref
+
+import pytest
+
+import simenv_marl
+from simenv_marl import (
+    ChangedArgs,
+    ChangedResult,
+    HandlerError,
+    PatchError,
+    SimEnvError,
+    UnknownTargetError,
+    aec_env,
+    attach_handler,
+    attached_handlers,
+    decision_points,
+    expose_to_plugins,
+    exposed_functions,
+    handlers,
+    remove_handler,
+    trace,
+)
+from tests.foreign import market, shop
+from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
+from tests.worlds.models import calling, define, notes, play
+
+MARKET = "tests.foreign.market"
+HERE = __name__
+
+
+@pytest.fixture(autouse=True)
+def _nothing_stays_attached():
+    places = [market, shop, Trader, Broker, Junior, Dealer, Cautious, Greenhouse, Heated]
+    before = [held(place) for place in places]
+    yield
+    assert attached_handlers() == []
+    for place, then in zip(places, before, strict=True):
+        now = held(place)
+        assert now.keys() == then.keys()
+        assert all(now[name] is then[name] for name in now)
+
+
+def held(place):
+    return {name: value for name, value in vars(place).items() if not name.startswith("__") or name == "__init__"}
+
+
+class Greenhouse:
+    def __init__(self, humidity=50):
+        self.humidity = humidity
+
+    def __repr__(self):
+        return f"Greenhouse({self.humidity})"
+
+    def update_air_exchange(self):
+        self.humidity += 1
+
+    def water(self, amount, *, twice=False):
+        """Water the plants."""
+        return amount * (2 if twice else 1)
+
+    def days(self, number):
+        yield from range(number)
+        return "over"
+
+    async def wire(self, amount):
+        return amount
+
+    @staticmethod
+    def rounded(amount):
+        return int(amount)
+
+    @classmethod
+    def kind(cls, suffix=""):
+        return cls.__name__ + suffix
+
+
+class Heated(Greenhouse):
+    def water(self, amount, *, twice=False):
+        return super().water(amount, twice=twice) + 100
+
+
+HOUSE = f"{HERE}.Greenhouse"
+
+
+def plus_one(value):
+    return value + 1
+
+
+def local():
+    """A function of its own, exposed, with a log of its handlers."""
+
+    @expose_to_plugins
+    def function(value, more=0):
+        """Add."""
+        return value + more
+
+    return function
+
+
+# -- the paper ------------------------------------------------------------------------------------
+
+
+def test_the_papers_first_listing(capsys):
+    import simenv_marl as se
+
+    def my_func(input):  # noqa: A002
+        return input + 1
+
+    print(my_func(2))
+    my_func = se.expose_to_plugins(my_func)
+
+    def before_func(input):  # noqa: A002
+        print(f"got {input}")
+
+    se.attach_handler(before_func, my_func, "before")
+    print(my_func(2))
+    se.remove_handler(my_func, "before")
+
+    def manipulate(input):  # noqa: A002
+        return se.ChangedArgs(input * 2)
+
+    se.attach_handler(manipulate, my_func, "before")
+    print(my_func(2))
+    assert capsys.readouterr().out.split("\n") == ["3", "got 2", "3", "5", ""]
+    se.remove_handler(my_func, "before")
+
+
+def test_the_papers_second_listing():
+    def new_air_exchange(self):
+        self.humidity -= 10
+
+    before = vars(Greenhouse)["update_air_exchange"]
+    Greenhouse.update_air_exchange = expose_to_plugins(Greenhouse.update_air_exchange)
+    try:
+        attach_handler(new_air_exchange, f"{HOUSE}.update_air_exchange", "instead")
+        house = Greenhouse()
+        house.update_air_exchange()
+        assert house.humidity == 40
+        remove_handler(Greenhouse.update_air_exchange, "instead")
+        house.update_air_exchange()
+        assert house.humidity == 41
+    finally:
+        Greenhouse.update_air_exchange = before
+
+
+# -- positions ------------------------------------------------------------------------------------
+
+
+def test_handlers_of_a_position_run_in_the_order_in_which_they_were_attached():
+    function, log = local(), []
+    with handlers(
+        *[
+            (lambda *args, name=name, position=position, **kwargs: log.append((position, name)), function, position)
+            for name in "ab"
+            for position in ("after", "before")
+        ]
+    ):
+        assert function(1) == 1
+    assert log == [("before", "a"), ("before", "b"), ("after", "a"), ("after", "b")]
+
+
+def test_changed_arguments_and_results_chain():
+    function, seen = local(), []
+
+    def see(*args, **kwargs):
+        seen.append((args, kwargs))
+
+    with handlers(
+        (lambda value, more=0: ChangedArgs(value * 2, more=5), function, "before"),
+        (see, function, "before"),
+        (lambda value, more=0: ChangedArgs(value + 1, more=more), function, "before"),
+        (see, function, "after"),
+        (lambda value, more=0, *, _result: ChangedResult(_result * 10), function, "after"),
+        (lambda *args, _result, **kwargs: ChangedResult(_result + 1), function, "after"),
+    ):
+        assert function(3) == (7 + 5) * 10 + 1
+    assert seen == [((6,), {"more": 5}), ((7,), {"more": 5, "_result": 12})]
+
+
+@pytest.mark.parametrize("nothing", [None, 0, False, "text", (1, 2)])
+def test_whatever_else_handlers_return_changes_nothing(nothing):
+    function = local()
+    with handlers((lambda *args: nothing, function, "before"), (lambda *args, _result: nothing, function, "after")):
+        assert function(1, 2) == 3
+
+
+def test_arguments_arrive_as_they_were_passed():
+    function, seen = local(), []
+
+    def see(*args, **kwargs):
+        seen.append((args, kwargs))
+
+    with handlers((see, function, "before")):
+        function(1)
+        function(1, 2)
+        function(1, more=2)
+        function(value=1)
+        function(more=3, value=1)
+    assert seen == [
+        ((1,), {}),
+        ((1, 2), {}),
+        ((1,), {"more": 2}),
+        ((), {"value": 1}),
+        ((), {"more": 3, "value": 1}),
+    ]
+
+
+def test_a_handlers_parameters_may_have_other_names():
+    function, seen = local(), []
+    with handlers((lambda a, b=9: seen.append((a, b)), function, "before")):
+        function(1)
+        function(value=1)
+        function(1, more=2)
+        function(more=2, value=1)
+    assert seen == [(1, 9), (1, 9), (1, 2), (1, 2)]
+
+
+def test_a_wrong_call_is_the_functions_own_error_and_no_handler_runs():
+    function, log = local(), []
+    with handlers((lambda *args, **kwargs: log.append(1), function, "before")):
+        for wrong in (lambda: function(), lambda: function(1, 2, 3), lambda: function(1, other=3)):
+            with pytest.raises(TypeError):
+                wrong()
+    assert log == []
+
+
+def test_of_several_instead_the_latest_alone_runs():
+    function, log = local(), []
+    with handlers(
+        (lambda *args: log.append("before"), function, "before"),
+        (lambda *args: "first", function, "instead"),
+        (lambda *args: "latest", function, "instead"),
+        (lambda *args: log.append("after"), function, "after"),
+    ):
+        assert function(1) == "latest"
+        assert log == []
+        remove_handler(function, "instead", attached_handlers()[2][0])
+        assert function(1) == "first"
+    assert function(1) == 1
+
+
+def test_instead_may_call_what_it_replaces():
+    function = local()
+    with handlers(
+        (lambda value, more=0: function.__wrapped__(value, more) * 10, function, "instead"),
+        (lambda self, amount, *, twice=False: Greenhouse.water.__wrapped__(self, 1) + 0.5, f"{HOUSE}.water", "instead"),
+    ):
+        assert function(2) == 20
+        assert Greenhouse().water(7) == 1.5
+
+
+def test_handlers_that_call_the_function_again_are_called_again():
+    function, depths = local(), []
+
+    def before(value, more=0):
+        depths.append(value)
+        if value:
+            function(value - 1)
+
+    with handlers((before, function, "before")):
+        function(2)
+    assert depths == [2, 1, 0]
+
+
+def test_after_gets_the_result_only_where_it_asks_for_it():
+    function, seen = local(), []
+    with handlers(
+        (lambda value, more=0: seen.append("plain"), function, "after"),
+        (lambda value, more=0, _result=None: seen.append(_result), function, "after"),
+        (lambda *args, **kwargs: seen.append(kwargs), function, "after"),
+    ):
+        function(1, 2)
+    assert seen == ["plain", 3, {"_result": 3}]
+
+
+def test_the_same_handler_twice_runs_twice_and_is_removed_one_by_one():
+    function, log = local(), []
+
+    def count(value, more=0):
+        log.append(value)
+
+    attach_handler(count, function, "before")
+    attach_handler(count, function, "before")
+    function(1)
+    remove_handler(function, "before", count)
+    function(2)
+    remove_handler(function, "before", count)
+    function(3)
+    assert log == [1, 1, 2]
+    with pytest.raises(HandlerError, match="not attached"):
+        remove_handler(function, "before", count)
+
+
+def test_handlers_that_come_while_the_function_runs_are_for_the_next_call():
+    log = []
+
+    @expose_to_plugins
+    def function():
+        if not attached_handlers():
+            attach_handler(after, function, "after")
+
+    def after():
+        log.append("after")
+
+    function()
+    assert log == []
+    function()
+    assert log == ["after"]
+    remove_handler(function, "after")
+
+
+def test_a_handler_may_remove_itself_and_others():
+    function, log = local(), []
+
+    def once(value, more=0):
+        log.append("once")
+        remove_handler(function, "before")
+
+    attach_handler(once, function, "before")
+    attach_handler(lambda *args: log.append("second"), function, "before")
+    function(1)
+    function(1)
+    assert log == ["once", "second"]
+
+
+# -- what can be extended -------------------------------------------------------------------------
+
+
+FORMS = {
+    "method": (f"{HOUSE}.water", lambda: Greenhouse().water(3), 3),
+    "inherited": (f"{HERE}.Heated.update_air_exchange", lambda: Heated().update_air_exchange(), None),
+    "overridden": (f"{HOUSE}.water", lambda: Heated().water(3) - 100, 3),
+    "staticmethod": (f"{HOUSE}.rounded", lambda: Greenhouse.rounded(2.5), 2),
+    "staticmethod of an object": (f"{HOUSE}.rounded", lambda: Heated().rounded(2.5), 2),
+    "inherited staticmethod": (f"{HERE}.Heated.rounded", lambda: Heated.rounded(2.5), 2),
+    "classmethod": (f"{HOUSE}.kind", lambda: Heated.kind(suffix="!"), "Heated!"),
+    "inherited classmethod": (f"{HERE}.Heated.kind", lambda: Heated.kind(suffix="!"), "Heated!"),
+    "function": (f"{MARKET}.price", lambda: market.price("tea", rebate=2), 8),
+    "imported by name": (f"{MARKET}.price", lambda: shop.total("tea"), 10),
+    "imported under another name": (f"{MARKET}.price", lambda: shop.total_cost("tea"), 9),
+    "private": (f"{MARKET}.Trader.__hidden", lambda: Trader().look(), 7),
+    "standard library": ("statistics.mean", lambda: __import__("statistics").mean([1, 2, 3]), 2),
+    "generator function": (f"{HOUSE}.days", lambda: list(Greenhouse().days(3)), [0, 1, 2]),
+    "coroutine function": (f"{HOUSE}.wire", lambda: asyncio.run(Greenhouse().wire(3)), 3),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_whatever_is_importable_can_be_extended_by_its_name(form):
+    name, call, result = FORMS[form]
+    log = []
+    with handlers(
+        (lambda *args, **kwargs: log.append("before"), name, "before"),
+        (lambda *args, **kwargs: log.append("after"), name, "after"),
+    ):
+        assert call() == result
+        assert log == ["before", "after"]
+    assert call() == result
+    assert log == ["before", "after"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_same_as_itself(form):
+    name, call, result = FORMS[form]
+    if name.endswith("__hidden"):
+        name = f"{MARKET}.Trader._Trader__hidden"
+    owner, _, attribute = name.rpartition(".")
+    module, _, class_name = owner.rpartition(".")
+    holder = sys.modules[owner] if owner in sys.modules else getattr(sys.modules[module], class_name)
+    log = []
+    attach_handler(lambda *args, **kwargs: log.append(1), getattr(holder, attribute), "before")
+    assert call() == result
+    assert log == [1]
+    remove_handler(getattr(holder, attribute), "before")
+    assert call() == result
+    assert log == [1]
+
+
+def test_an_inherited_method_is_extended_for_its_class_and_subclasses_alone():
+    log = []
+    with handlers((lambda self, *args, **kwargs: log.append(type(self).__name__), f"{MARKET}.Broker.bid", "before")):
+        assert [kind().bid("tea") for kind in (Trader, Broker, Junior, Dealer, Cautious)] == [5, 5, 5, 5, 4]
+    assert log == ["Broker", "Junior"]
+
+
+def test_base_and_subclass_may_both_be_extended_in_any_order():
+    log = []
+    sub = (lambda self, *args, **kwargs: log.append("sub"), f"{MARKET}.Broker.bid", "before")
+    base = (lambda self, *args, **kwargs: log.append("base"), f"{MARKET}.Trader.bid", "before")
+    for first, second in ((sub, base), (base, sub)):
+        attach_handler(*first)
+        attach_handler(*second)
+        Broker().bid("tea")
+        assert log == ["sub", "base"]
+        remove_handler(first[1], "before")
+        Broker().bid("tea")
+        assert log == ["sub", "base", "base" if first is sub else "sub"]
+        remove_handler(second[1], "before")
+        log.clear()
+
+
+def test_calls_of_super_are_calls():
+    log = []
+    with handlers((lambda self, *args, **kwargs: log.append(args), f"{HOUSE}.water", "before")):
+        assert Heated().water(3, twice=True) == 106
+    assert log == [(3,)]
+
+
+def test_construction_can_be_extended():
+    log = []
+    with handlers(
+        (lambda self, humidity=50: ChangedArgs(self, humidity + 1), f"{HOUSE}.__init__", "before"),
+        (lambda self, humidity=50: log.append(self.humidity), Greenhouse.__init__, "after"),
+    ):
+        assert Heated(humidity=3).humidity == 4
+    assert log == [4]
+    assert Heated().humidity == 50
+
+
+def test_every_kind_of_function_can_be_exposed_inside_the_model():
+    class Model:
+        @expose_to_plugins
+        def method(self, value=1):
+            return value
+
+        @staticmethod
+        @expose_to_plugins
+        def under(value):
+            return value
+
+        @expose_to_plugins
+        @staticmethod
+        def over(value):
+            return value
+
+        @classmethod
+        @expose_to_plugins
+        def class_under(cls):
+            return cls
+
+        @expose_to_plugins
+        @classmethod
+        def class_over(cls):
+            return cls
+
+    class Sub(Model):
+        pass
+
+    calls = {
+        "method": (lambda: Sub().method(), 1),
+        "under": (lambda: Model.under(value=2), 2),
+        "over": (lambda: Sub().over(2), 2),
+        "class_under": (lambda: Sub.class_under(), Sub),
+        "class_over": (lambda: Sub().class_over(), Sub),
+    }
+    for name, (call, result) in calls.items():
+        assert call() == result
+        log = []
+        with handlers((lambda *args, log=log, **kwargs: log.append(1), getattr(Model, name), "before")):
+            assert call() == result
+        assert log == [1]
+
+
+def test_exposing_again_gives_the_same():
+    function = local()
+    assert expose_to_plugins(function) is function
+    items = expose_to_plugins([1])
+    assert expose_to_plugins(items) is items
+    held = expose_to_plugins(vars(Greenhouse)["rounded"])
+    assert isinstance(held, staticmethod)
+    assert expose_to_plugins(held) is held
+    again = expose_to_plugins(expose_to_plugins(Greenhouse.kind))
+    assert isinstance(again, classmethod)
+    module = types.ModuleType("exposed_model")
+    sys.modules["exposed_model"] = module
+    try:
+        exec("def function(): return 1", vars(module))
+        plain = module.function
+        module.function = expose_to_plugins(plain)
+        assert expose_to_plugins(plain) is module.function
+    finally:
+        del sys.modules["exposed_model"]
+
+
+def test_an_exposed_function_keeps_its_looks():
+    for function in (
+        Greenhouse.water,
+        Greenhouse.days,
+        Greenhouse.wire,
+        market.price,
+    ):
+        exposed = expose_to_plugins(function)
+        assert exposed is not function
+        assert inspect.signature(exposed) == inspect.signature(function)
+        for name in ("__name__", "__qualname__", "__doc__", "__module__"):
+            assert getattr(exposed, name) == getattr(function, name)
+        for kind in (inspect.isgeneratorfunction, inspect.iscoroutinefunction, inspect.isfunction):
+            assert kind(exposed) == kind(function)
+        assert exposed.__wrapped__ is function
+
+
+def test_siblings_may_each_expose_what_they_have_inherited():
+    class Animal:
+        def move(self):
+            return "moved"
+
+    class Wolf(Animal):
+        pass
+
+    class Sheep(Animal):
+        pass
+
+    Wolf.move = expose_to_plugins(Wolf.move)
+    Sheep.move = expose_to_plugins(Sheep.move)
+    with handlers((lambda self: "wolf", Wolf.move, "instead")):
+        assert [kind().move() for kind in (Animal, Wolf, Sheep)] == ["moved", "wolf", "moved"]
+
+
+def test_an_exposed_function_of_a_module_is_extended_where_others_had_imported_it_before():
+    before = market.price
+    market.price = expose_to_plugins(market.price)
+    exposed = market.price
+    try:
+        for target in (f"{MARKET}.price", exposed):
+            with handlers((lambda good, *, rebate=0: 1, target, "instead")):
+                assert (market.price("tea"), shop.total("tea"), shop.total_cost("tea")) == (1, 1, 1)
+            assert (shop.price, shop.cost, market.price) == (before, before, exposed)
+    finally:
+        market.price = before
+
+
+def test_an_exposed_function_outlives_its_place():
+    before = market.price
+    market.price = exposed = expose_to_plugins(market.price)
+    try:
+        with handlers((lambda good, *, rebate=0: 1, exposed, "instead")):
+            assert shop.total("tea") == 1
+    finally:
+        market.price = before
+    with handlers((lambda good, *, rebate=0: 1, exposed, "instead")):
+        assert (exposed("tea"), shop.total("tea")) == (1, 10)
+    with handlers((lambda good, *, rebate=0: 1, f"{MARKET}.price", "instead")):
+        assert (exposed("tea"), shop.total("tea")) == (10, 1)
+
+
+@pytest.mark.parametrize("parameter", ["found", "rule", "args", "self", "SLOT"])
+def test_parameters_may_have_any_name(parameter):
+    scope = {"expose_to_plugins": expose_to_plugins}
+    exec(
+        f"class Model:\n    @staticmethod\n    @expose_to_plugins\n    def function({parameter}): return {parameter}",
+        scope,
+    )
+    function, log = scope["Model"].function, []
+    for attached in ([], [(lambda *args, **kwargs: log.append(1), function, "before")]):
+        with handlers(*attached):
+            assert function(3) == function(**{parameter: 4}) - 1 == 3
+    assert log == [1, 1]
+
+
+def test_modules_that_are_imported_meanwhile_are_restored_too():
+    before = market.price
+    late = types.ModuleType("late_shop")
+    sys.modules["late_shop"] = late
+    try:
+        with handlers((lambda *args, **kwargs: 1, f"{MARKET}.price", "instead")):
+            exec("from tests.foreign.market import price as asked", vars(late))
+            assert late.asked("tea") == 1
+        assert late.asked is before
+    finally:
+        del sys.modules["late_shop"]
+
+
+def test_what_was_exposed_inside_a_function_has_its_name_all_the_same():
+    first, function = local(), local()
+    with handlers((lambda value, more=0: 9, f"{HERE}.local.<locals>.function", "instead")):
+        assert (first(1), function(1)) == (1, 9)
+
+
+def test_builtins_can_be_exposed_as_themselves():
+    length = expose_to_plugins(len)
+    with handlers((lambda thing, **kwargs: ChangedResult(kwargs["_result"] + 1), length, "after")):
+        assert length([1, 2]) == 3
+    assert length([1, 2]) == 2
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+
+def two(a, b):
+    return a, b
+
+
+@pytest.mark.parametrize(
+    ("handler", "target", "position", "error"),
+    [
+        (print, "nowhere.to.be.found", "before", UnknownTargetError),
+        (print, "nowhere", "before", UnknownTargetError),
+        (print, "", "before", UnknownTargetError),
+        (print, f"{MARKET}.Trader.missing", "before", UnknownTargetError),
+        (print, f"{MARKET}.Missing.bid", "before", UnknownTargetError),
+        (print, f"{MARKET}.Trader.quote", "before", PatchError),
+        (print, f"{MARKET}.OPEN", "before", PatchError),
+        (print, "math.sqrt", "before", PatchError),
+        (print, "datetime.datetime.now", "before", PatchError),
+        (print, len, "before", PatchError),
+        (print, 3, "before", PatchError),
+        (print, [1, 2], "before_next", PatchError),
+        (print, Trader().bid, "before", PatchError),
+        (print, Trader, "before_next", PatchError),
+        (print, f"{MARKET}.Trader", "before", PatchError),
+        (print, two, "during", HandlerError),
+        (print, two, None, HandlerError),
+        (print, two, "before_next", HandlerError),
+        (None, two, "before", HandlerError),
+        (lambda: None, two, "before", HandlerError),
+        (lambda a: None, two, "before", HandlerError),
+        (lambda a, b, c: None, two, "before", HandlerError),
+        (lambda a, *, b: None, two, "before", HandlerError),
+        (lambda a, b, _result: None, two, "before", HandlerError),
+        (lambda a, b, _result: None, two, "instead", HandlerError),
+        (lambda **kwargs: None, two, "before", HandlerError),
+        (lambda good: None, f"{MARKET}.price", "before", HandlerError),
+        (lambda good, *, discount=0: None, f"{MARKET}.price", "before", HandlerError),
+        (lambda self, good: None, f"{MARKET}.Trader.bid", "before", HandlerError),
+        (lambda good, limit: None, f"{MARKET}.Trader.bid", "after", HandlerError),
+    ],
+)
+def test_what_cannot_work_is_refused_when_it_is_attached(handler, target, position, error):
+    with pytest.raises(error) as caught:
+        attach_handler(handler, target, position)
+    assert isinstance(caught.value, SimEnvError)
+    with pytest.raises(error), handlers((handler, target, position)):
+        raise AssertionError
+
+
+@pytest.mark.parametrize(
+    "handler",
+    [
+        lambda a, b: None,
+        lambda x, y: None,
+        lambda *args, **kwargs: None,
+        lambda *args: None,
+        lambda a, *rest: None,
+        lambda a, b, c=0: None,
+        lambda a, b, /: None,
+        Trader().bid,
+        print,
+    ],
+)
+def test_whatever_can_be_called_with_the_arguments_is_accepted(handler):
+    with handlers((handler, two, "before")):
+        assert two(1, b=2) == (1, 2)
+        assert two(a=1, b=2) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("target", "position", "handler"),
+    [
+        (two, "before", None),
+        (two, "before", print),
+        (two, "during", None),
+        (f"{MARKET}.Trader.bid", "after", None),
+    ],
+)
+def test_removing_what_is_not_attached_is_refused(target, position, handler):
+    with handlers((two, two, "after")), pytest.raises(HandlerError, match="handlers are attached"):
+        remove_handler(target, position, handler)
+
+
+def test_a_slip_of_the_pen_gets_a_hint():
+    exposed = local()
+    name = f"{HERE}.plus_ome"
+    with pytest.raises(UnknownTargetError, match=r"did you mean .*counting"):
+        attach_handler(print, name.replace("plus_ome", "countin"), "before")
+    assert exposed(1) == 1
+
+
+def test_errors_survive_pickling():
+    for error in (HandlerError("a"), UnknownTargetError("b")):
+        copied = pickle.loads(pickle.dumps(error))
+        assert (type(copied), copied.args) == (type(error), error.args)
+
+
+# -- for a while ----------------------------------------------------------------------------------
+
+
+def test_handlers_are_there_for_as_long_as_the_block_runs():
+    with handlers((lambda *args, **kwargs: 1, f"{MARKET}.Trader.bid", "instead")):
+        assert Trader().bid("tea") == 1
+        assert attached_handlers()[0][1:] == (f"{MARKET}.Trader.bid", "instead")
+    assert Trader().bid("tea") == 5
+    with pytest.raises(ZeroDivisionError), handlers((lambda *args, **kwargs: 1, f"{MARKET}.Trader.bid", "instead")):
+        raise ZeroDivisionError
+    assert Trader().bid("tea") == 5
+
+
+def test_half_of_the_handlers_are_none():
+    with (
+        pytest.raises(HandlerError, match="cannot be called with all arguments"),
+        handlers(
+            (lambda *args, **kwargs: 1, f"{MARKET}.Trader.bid", "instead"),
+            (lambda: 1, f"{MARKET}.price", "instead"),
+        ),
+    ):
+        raise AssertionError
+    with pytest.raises(HandlerError, match="handlers are given as"), handlers(print):
+        raise AssertionError
+
+
+def test_blocks_may_overlap_and_remove_nothing_but_their_own():
+    function, log = local(), []
+
+    def see(value, more=0):
+        log.append(value)
+
+    attach_handler(see, function, "before")
+    one, two = handlers((see, function, "before")), handlers((see, function, "before"))
+    one.__enter__()
+    two.__enter__()
+    one.__exit__(None, None, None)
+    function(1)
+    assert log == [1, 1]
+    remove_handler(function, "before")  # all of them
+    two.__exit__(None, None, None)
+    function(1)
+    assert log == [1, 1]
+
+
+def test_somebody_elses_patch_meanwhile_is_left_alone():
+    before = vars(Trader)["bid"]
+    attach_handler(lambda *args, **kwargs: 1, f"{MARKET}.Trader.bid", "instead")
+
+    def replacement(self, good, limit=5):
+        return 0
+
+    with pytest.raises(HandlerError, match="no handler attached"):
+        remove_handler(f"{MARKET}.price", "instead")
+    exposed = Trader.bid
+    Trader.bid = replacement
+    try:
+        remove_handler(exposed, "instead")
+        assert Trader.bid is replacement
+    finally:
+        Trader.bid = before
+
+
+# -- errors ---------------------------------------------------------------------------------------
+
+
+def failing(*args, **kwargs):
+    raise ZeroDivisionError("of the handler")
+
+
+@pytest.mark.parametrize("position", ["before", "after", "instead"])
+def test_a_handlers_error_is_its_own_and_says_where_it_was_attached(position):
+    log = []
+    with handlers((failing, f"{MARKET}.Trader.bid", position)):
+        with pytest.raises(ZeroDivisionError, match="of the handler") as caught:
+            Trader().bid("tea")
+        assert notes(caught.value) == (f"simenv_marl: in the handler failing, attached {position} {MARKET}.Trader.bid")
+        remove_handler(Trader.bid, position)
+        with handlers((lambda *args, **kwargs: log.append(1), Trader.bid, "before")):
+            assert Trader().bid("tea") == 5
+    assert log == [1]
+
+
+def test_a_functions_error_passes_by_what_comes_after():
+    log = []
+
+    @expose_to_plugins
+    def function():
+        raise KeyError("of the model")
+
+    with handlers((lambda: log.append(1), function, "after")), pytest.raises(KeyError) as caught:
+        function()
+    assert log == []
+    assert notes(caught.value) == ""
+
+
+# -- generator functions --------------------------------------------------------------------------
+
+
+@expose_to_plugins
+def counting(number, step=1):
+    """Counts; what is sent is added, and what is thrown is counted as zero."""
+    total = 0
+    try:
+        for value in range(number):
+            try:
+                sent = yield value * step
+                total += sent or 0
+            except KeyError:
+                total = 0
+    finally:
+        CLOSED.append(number)
+    return total
+
+
+CLOSED = []
+
+
+def test_handlers_of_a_generator_function_see_its_arguments_and_what_it_returns():
+    log = []
+    with handlers(
+        (lambda number, step=1: ChangedArgs(number + 1, 10), counting, "before"),
+        (lambda number, step=1, *, _result: log.append((number, step, _result)), counting, "after"),
+    ):
+        generator = counting(2)
+        assert log == []
+        assert list(generator) == [0, 10, 20]
+    assert log == [(3, 10, 0)]
+    assert inspect.isgeneratorfunction(counting)
+
+
+@pytest.mark.parametrize("position", [None, "before", "after_next"])
+def test_what_is_sent_and_thrown_reaches_the_generator(position):
+    attached = [] if position is None else [(lambda *args, **kwargs: None, counting, position)]
+    with handlers(*attached):
+        generator = counting(4)
+        assert next(generator) == 0
+        assert generator.send(5) == 1
+        assert generator.throw(KeyError()) == 2
+        assert generator.send(7) == 3
+        with pytest.raises(StopIteration) as stop:
+            generator.send(1)
+        assert stop.value.value == 8
+        CLOSED.clear()
+        generator = counting(5)
+        next(generator)
+        generator.close()
+        assert CLOSED == [5]
+        generator = counting(6)
+        next(generator)
+        with pytest.raises(ZeroDivisionError):
+            generator.throw(ZeroDivisionError())
+        assert CLOSED == [5, 6]
+
+
+def test_items_of_a_generator_have_handlers():
+    log = []
+    with handlers(
+        (lambda number, step=1: log.append(number), counting, "before_next"),
+        (lambda number, step=1, *, _result: ChangedResult(_result + 100), counting, "after_next"),
+        (lambda number, step=1, *, _result: ChangedResult(_result * 2), counting, "after_next"),
+    ):
+        assert list(counting(3)) == [200, 202, 204]
+        assert log == [3] * 4
+
+
+def test_items_may_be_handed_out_instead():
+    left = [1, 2, 3]
+
+    def instead(number, step=1):
+        if not left:
+            raise StopIteration("over")
+        return left.pop()
+
+    with handlers((instead, counting, "instead_next")):
+        generator = counting(100)
+        assert [next(generator), generator.send(7), next(generator)] == [3, 2, 1]
+        with pytest.raises(StopIteration) as stop:
+            next(generator)
+        assert stop.value.value == "over"
+
+
+def test_a_generator_may_be_replaced():
+    def instead(number, step=1):
+        yield from "ab"
+        return "c"
+
+    with handlers((instead, counting, "instead")):
+        assert list(counting(3)) == ["a", "b"]
+    with handlers((lambda number, step=1: [7, 8], counting, "instead")):
+        assert list(counting(3)) == [7, 8]
+    with handlers((lambda number, step=1: None, counting, "instead")):
+        assert list(counting(3)) == []
+    with handlers((lambda number, step=1: failing(), counting, "before_next")):
+        with pytest.raises(ZeroDivisionError) as caught:
+            next(counting(3))
+        assert "before_next" in notes(caught.value)
+
+
+# -- coroutine functions --------------------------------------------------------------------------
+
+
+def test_coroutine_functions_stay_ones_and_after_gets_what_was_awaited():
+    log = []
+
+    async def before(self, amount):
+        await asyncio.sleep(0)
+        log.append("before")
+        return ChangedArgs(self, amount + 1)
+
+    with handlers(
+        (before, f"{HOUSE}.wire", "before"),
+        (lambda self, amount, _result: ChangedResult((amount, _result)), f"{HOUSE}.wire", "after"),
+    ):
+        assert inspect.iscoroutinefunction(Greenhouse.wire)
+        coroutine = Greenhouse().wire(1)
+        assert log == []
+        assert asyncio.run(coroutine) == (2, 2)
+
+    async def instead(self, amount):
+        return "instead"
+
+    with handlers((instead, f"{HOUSE}.wire", "instead")):
+        assert asyncio.run(Greenhouse().wire(1)) == "instead"
+
+    async def fails(self, amount):
+        failing()
+
+    with handlers((fails, f"{HOUSE}.wire", "before")):
+        with pytest.raises(ZeroDivisionError) as caught:
+            asyncio.run(Greenhouse().wire(1))
+        assert "fails, attached before" in notes(caught.value)
+
+
+def test_async_generator_functions_are_refused():
+    async def items():
+        yield 1
+
+    with pytest.raises(PatchError, match="is an async generator function"):
+        expose_to_plugins(items)
+
+
+# -- iterables ------------------------------------------------------------------------------------
+
+
+def test_an_exposed_list_is_one_in_all_respects():
+    items = expose_to_plugins([3, 1, 2])
+    assert isinstance(items, list)
+    assert isinstance(items, collections.abc.Iterable)
+    assert not isinstance(items, collections.abc.Iterator)
+    items.append(4)
+    assert (len(items), items[0], items[1:3], 4 in items, items == [3, 1, 2, 4]) == (4, 3, [1, 2], True, True)
+    assert [*items] == sorted(items, key=[3, 1, 2, 4].index) == [3, 1, 2, 4]
+    assert list(reversed(items)) == [4, 2, 1, 3]
+    seen = []
+    with handlers(
+        (lambda thing: seen.append(thing is items), items, "before_next"),
+        (lambda thing, _result: ChangedResult(_result * 10), items, "after_next"),
+    ):
+        assert [*items] == [30, 10, 20, 40]
+        assert [item for item in items] == [30, 10, 20, 40]  # noqa: C416
+    assert seen == [True] * 10
+    assert [*items] == [3, 1, 2, 4]
+
+
+def test_iterators_stay_iterators():
+    items = expose_to_plugins(iter([1, 2, 3]))
+    assert isinstance(items, collections.abc.Iterator)
+    assert iter(items) is items
+    with handlers((lambda thing, _result: ChangedResult(-_result), items, "after_next")):
+        assert next(items) == -1
+    assert list(items) == [2, 3]
+    assert list(items) == []
+
+
+def test_exposed_generators_can_be_sent_to():
+    generator = expose_to_plugins((lambda: (yield (yield 1)))())
+    assert next(generator) == 1
+    assert generator.send(5) == 5
+    generator.close()
+
+
+def test_items_of_an_iterable_may_be_handed_out_instead():
+    numbers = iter([7, 8])
+    items = expose_to_plugins({"a": 1})
+    with handlers((lambda thing: next(numbers), items, "instead_next")):
+        assert list(items) == [7, 8]
+    assert list(items) == ["a"]
+    assert items["a"] == 1
+
+
+def test_iterables_have_no_other_positions():
+    items = expose_to_plugins([1])
+    for position in ("before", "after", "instead"):
+        with pytest.raises(HandlerError, match="_next"):
+            attach_handler(print, items, position)
+
+
+def test_copies_of_an_exposed_iterable_have_its_handlers():
+    items = expose_to_plugins([[1], [2]])
+    with handlers((lambda thing, _result: ChangedResult(_result * 2), items, "after_next")):
+        copied = copy.deepcopy(items)
+        copied[0].append(5)
+        assert list(copied) == [[1, 5, 1, 5], [2, 2]]
+        assert list(copy.copy(items)) == list(items) == [[1, 1], [2, 2]]
+        restored = pickle.loads(pickle.dumps(items))
+        assert list(restored) == [[1], [2]]
+    assert type(restored) is type(items)
+
+
+POOL = [1, 2]
+
+
+def test_an_iterable_of_a_module_is_extended_by_its_name():
+    before = POOL
+    with handlers((lambda thing, _result: ChangedResult(_result + 1), f"{HERE}.POOL", "after_next")):
+        assert list(POOL) == [2, 3]
+    assert POOL is before
+
+
+class Pool:
+    def __init__(self, *items):
+        self.items = items
+
+    def __iter__(self):
+        yield from self.items
+
+
+class Deck:
+    def __init__(self):
+        self.left = 3
+
+    def __iter__(self):
+        return self
+
+    def __next__(self):
+        if not self.left:
+            raise StopIteration
+        self.left -= 1
+        return self.left
+
+
+class Bag(list):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("kind", "make", "items"),
+    [(Pool, lambda: Pool(1, 2), [1, 2]), (Deck, Deck, [2, 1, 0]), (Bag, lambda: Bag([1, 2]), [1, 2])],
+)
+@pytest.mark.parametrize("how", ["class", "name", "exposed"])
+def test_classes_whose_instances_iterate(kind, make, items, how):
+    before = dict(vars(kind))
+    target = kind if how == "class" else f"{HERE}.{kind.__name__}"
+    if how == "exposed":
+        kind = target = expose_to_plugins(type(kind.__name__, (kind,), {"__module__": HERE}))
+        made = {"Pool": (1, 2), "Deck": (), "Bag": ([1, 2],)}[kind.__name__]
+        make = lambda: kind(*made)  # noqa: E731
+    subjects = []
+    subject = make()
+    with handlers(
+        (lambda thing: subjects.append(thing), target, "before_next"),
+        (lambda thing, _result: ChangedResult(_result + 10), target, "after_next"),
+    ):
+        assert list(subject) == [item + 10 for item in items]
+        assert isinstance(subject, kind)
+        with pytest.raises(HandlerError, match="__init__"):
+            attach_handler(print, target, "before")
+    assert all(thing is subject for thing in subjects)
+    assert len(subjects) == len(items) + 1
+    assert list(make()) == items
+    if how != "exposed":
+        assert dict(vars(kind)) == before
+
+
+# -- decision points ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["exposed first", "decided first"])
+def test_handlers_lie_outside_whichever_decorator_came_first(order):
+    def choose(value):
+        return value
+
+    decide = define()
+    decided = decide(expose_to_plugins(choose)) if order == "exposed first" else expose_to_plugins(decide(choose))
+    with handlers((lambda value: ChangedArgs(value + 1), decided, "before")):
+        assert decided(1) == 2
+    assert decided(1) == 1
+    assert inspect.unwrap(decided) is choose
+
+
+def test_a_function_that_is_decorated_while_it_has_handlers_keeps_them_outside():
+    original = vars(Trader)["bid"]
+    log = []
+    try:
+        with handlers((lambda *args, **kwargs: log.append(1), f"{MARKET}.Trader.bid", "before")):
+            Trader.bid = define()(Trader.bid)
+            assert Trader().bid("tea") == 5
+        with handlers(
+            (lambda *args, **kwargs: log.append(2), f"{MARKET}.Trader.bid", "before"),
+            (lambda *args, **kwargs: log.append(3), Trader.bid, "before"),
+        ):
+            env = aec_env(calling(lambda: Trader().bid("tea")), Trader.bid)
+            play(env, 4)
+            assert env.unwrapped.simulation.log == [4]
+            env.close()
+        assert log == [1, 2, 3]
+    finally:
+        Trader.bid = original
+
+
+# -- copies ---------------------------------------------------------------------------------------
+
+
+def test_models_of_a_patched_class_are_copied_and_pickled():
+    house = Greenhouse(7)
+    with handlers((lambda self, amount, *, twice=False: 1, f"{HOUSE}.water", "instead")):
+        for copied in (copy.deepcopy(house), pickle.loads(pickle.dumps(house))):
+            assert (copied.humidity, copied.water(5)) == (7, 1)
+        assert pickle.loads(pickle.dumps(Greenhouse.water)) is Greenhouse.water
+    assert copied.water(5) == 5
+
+
+def test_exposed_classes_are_collected():
+    class Model:
+        @expose_to_plugins
+        def method(self):
+            return 1
+
+    with handlers((lambda self: 2, Model.method, "instead")):
+        assert Model().method() == 2
+    gone = weakref.ref(Model)
+    del Model
+    gc.collect()
+    assert gone() is None
+
+
+# -- seeing what happens --------------------------------------------------------------------------
+
+
+def test_what_is_exposed_and_attached_is_listed():
+    gc.collect()  # other tests have exposed functions, too
+    function = local()
+    name = f"{HERE}.local.<locals>.function"
+    assert name in exposed_functions()
+    assert f"{MARKET}.Trader.bid" not in exposed_functions()
+    with handlers((print, function, "before"), (failing, f"{MARKET}.Trader.bid", "instead")):
+        assert f"{MARKET}.Trader.bid" in exposed_functions()
+        assert attached_handlers() == [
+            (failing, f"{MARKET}.Trader.bid", "instead"),
+            (print, name, "before"),
+        ]
+
+    @define()
+    def choose():
+        return 0
+
+    assert f"{HERE}.test_what_is_exposed_and_attached_is_listed.<locals>.choose" in decision_points()
+    assert choose() == 0
+
+
+def test_calls_are_traced_in_the_order_in_which_they_begin():
+    function = local()
+    with (
+        handlers((lambda value, more=0: Trader().bid("tea", limit=value) and None, function, "before")),
+        trace(function, f"{MARKET}.Trader.bid", counting, f"{HOUSE}.wire") as calls,
+    ):
+        function(3, more=4)
+        list(counting(2))
+        asyncio.run(Greenhouse().wire(8))
+        with pytest.raises(TypeError):
+            function("x")
+        assert calls[0].target == f"{HERE}.local.<locals>.function"
+    shown = [(call.target.rpartition(".")[2], call.arguments.partition(" object at")[0], call.result) for call in calls]
+    assert shown[:4] == [
+        ("function", "3, more=4", "7"),
+        ("bid", f"<{MARKET}.Trader", "3"),
+        ("counting", "2", "0"),
+        ("wire", "Greenhouse(50), 8", "8"),
+    ]
+    assert shown[4][:2] == ("function", "'x'")
+    assert shown[4][2].startswith("raised TypeError")
+    length = len(calls)
+    function(1)
+    assert len(calls) == length
+
+
+def test_without_targets_everything_is_traced():
+    function = local()
+    with trace() as calls:
+        function(1)
+        Trader().bid("tea")
+    assert [call.target for call in calls] == [f"{HERE}.local.<locals>.function"]
+
+
+def test_all_of_it_is_public():
+    for name in ("expose_to_plugins", "attach_handler", "remove_handler", "ChangedArgs", "ChangedResult", "handlers"):
+        assert name in simenv_marl.__all__
+    assert repr(ChangedArgs(1, b=2)) == "ChangedArgs(1, b=2)"
+    assert repr(ChangedResult("x")) == "ChangedResult('x')"
+
+
+# -- what is nearly an item, an end or a name -------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ["ab", b"ab"])
+def test_strings_in_place_of_a_generator_are_its_value_and_no_items(value):
+    with handlers((lambda number, step=1: value, counting, "instead")):
+        generator = counting(3)
+        with pytest.raises(StopIteration) as stop:
+            next(generator)
+        assert stop.value.value == value
+
+
+@pytest.mark.parametrize("position", ["before", "instead"])
+def test_handlers_of_a_generator_function_end_no_items(position):
+    def stopping(*args, **kwargs):
+        raise StopIteration("a slip")
+
+    with handlers((stopping, counting, position)):
+        with pytest.raises(RuntimeError, match="StopIteration") as caught:
+            list(counting(3))
+        assert f"stopping, attached {position}" in notes(caught.value.__cause__)
+
+
+def test_the_end_of_items_has_no_notes():
+    def over(number, step=1):
+        raise StopIteration(7)
+
+    with handlers((over, counting, "instead_next")), pytest.raises(StopIteration) as stop:
+        next(counting(3))
+    assert stop.value.value == 7
+    assert notes(stop.value) == ""
+
+
+class Secretive:
+    def __hide(self, value):
+        return value
+
+    def hide(self, value):
+        return self.__hide(value)
+
+
+class _Shy:
+    def __hide(self, value):
+        return value
+
+    def hide(self, value):
+        return self.__hide(value)
+
+
+@pytest.mark.parametrize("kind", [Secretive, _Shy])
+@pytest.mark.parametrize("written", ["__hide", "mangled"])
+def test_private_names_are_found_as_they_are_written(kind, written):
+    name = written if written == "__hide" else f"_{kind.__name__.lstrip('_')}__hide"
+    with handlers((lambda self, value, _result: ChangedResult(_result + 1), f"{HERE}.{kind.__name__}.{name}", "after")):
+        assert kind().hide(3) == 4
+    assert kind().hide(3) == 3
+
+
+def test_what_a_module_cannot_import_is_its_own_error(tmp_path, monkeypatch):
+    (tmp_path / "lame_model.py").write_text("import no_such_module_at_all\n", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="no_such_module_at_all"):
+        attach_handler(print, "lame_model.Walk.go", "before")
+    with pytest.raises(UnknownTargetError, match="lame_modell"):
+        attach_handler(print, "lame_modell.Walk.go", "before")

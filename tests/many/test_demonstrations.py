@@ -1,0 +1,346 @@
+"""Demonstrations by the rule and by others: mixtures and comparisons. Of data sets: ``clients/test_minari.py``."""
+
+import sys
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    DefinitionError,
+    InvalidActionError,
+    MissingExtraError,
+    Mixture,
+    OptionValueError,
+    collect_episodes,
+    compare_with_rule,
+    record_dataset,
+    save_dataset,
+    simulate_many,
+)
+from tests.worlds.many_worlds import Being, beings
+from tests.worlds.models import calling, decision, plainly, script
+
+
+def ones(observations):
+    return np.ones(len(observations), np.int64)
+
+
+def twos(observations):
+    return [2] * len(observations)
+
+
+# -- mixtures -------------------------------------------------------------------------------------
+
+
+def test_mixtures_leave_each_decision_to_one_of_their_policies():
+    ant = decision(agent="ant_0")
+    mixture = Mixture({ones: 3, twos: 1, RULE: 4})
+    found = collect_episodes(calling(*[ant] * 20), {ant: mixture}, seeds=range(100))[ant]
+    shares = [float((found.extras["component"] == number).mean()) for number in range(3)]
+    assert shares == pytest.approx([0.375, 0.125, 0.5], abs=0.04)
+    assert (found.actions[found.extras["component"] == 0] == 1).all()
+    assert (found.actions[found.extras["component"] == 1] == 2).all()
+    assert found.by_rule.tolist() == (found.extras["component"] == 2).tolist()
+
+
+def test_mixtures_draw_by_seed_and_decision_alone():
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    mixture = Mixture([(ones, 0.5), (twos, 0.5)])
+
+    def actions(seeds, **options):
+        policies = {ant: mixture, bee: mixture}
+        found = collect_episodes(calling(*[ant, bee] * 10), policies, points=[ant, bee], seeds=seeds, **options)
+        of_seeds = {}
+        for own in found.values():
+            for seed, turn, action in zip(np.take(own.seeds, own.episodes), own.turns, own.actions, strict=True):
+                of_seeds[int(seed), int(turn)] = int(action)
+        return of_seeds
+
+    together = actions([5, 6, 2**70])
+    assert together == actions([2**70, 5, 6], batch_size=1) == actions([5, 6], batch_size=2) | actions([2**70])
+    assert len({tuple(together[seed, turn] for turn in range(20)) for seed in (5, 6, 2**70)}) == 3
+
+
+def test_mixtures_give_policies_what_is_theirs():
+    seen = []
+
+    def informed(observations, infos, identities):
+        assert len(observations) == len(infos) == len(identities)
+        seen.extend(
+            (int(observation[0]), info["action_mask"].tolist(), identity)
+            for observation, info, identity in zip(observations, infos, identities, strict=True)
+        )
+        return [1] * len(observations), {"dropped": np.zeros(len(observations))}
+
+    points = beings(action_mask_mapping=lambda being: [0, 1, 1] + [0] * 7)
+
+    def main(simulation):
+        simulation.crowd = [Being(number) for number in range(6)]
+        for being in simulation.crowd:
+            being.act()
+
+    found = collect_episodes(script(main), {Being.act: Mixture({informed: 1, twos: 1})}, points=points, seeds=range(9))
+    own = found[Being.act]
+    expected = [
+        (int(o[0]), [0, 1, 1] + [0] * 7, (own.seeds[e], int(t)))
+        for o, e, t, c in zip(own.observations, own.episodes, own.turns, own.extras["component"], strict=True)
+        if c == 0
+    ]
+    assert sorted(seen, key=repr) == sorted(expected, key=repr)
+    assert own.extras.keys() == {"component"}
+
+
+def test_mixtures_work_with_composite_spaces():
+    space = spaces.Dict(how=spaces.Box(0, 9, (2,), np.float32), what=spaces.Discrete(3))
+    ant = decision(
+        agent="ant_0",
+        observation_space=space,
+        action_space=space,
+        observation_space_mapping=lambda: {"how": [1, 2], "what": 1},
+    )
+
+    def stacked(observations):
+        return {"how": observations["how"] * 2, "what": observations["what"] + 1}
+
+    found = collect_episodes(calling(*[ant] * 9), {ant: Mixture({stacked: 1, RULE: 1})}, seeds=[1, 2])[ant]
+    chosen = ~found.by_rule
+    assert 0 < chosen.sum() < 18
+    assert np.array_equal(found.actions["how"][chosen], np.tile([2, 4], (chosen.sum(), 1)))
+    assert (found.actions["what"][chosen] == 2).all()
+
+
+def test_mixtures_decide_where_nothing_is_collected():
+    ant = decision(agent="ant_0")
+
+    def main(simulation):
+        simulation.log += [ant() for _ in range(6)]
+
+    logs = [
+        simulation.log for simulation in simulate_many(script(main), {ant: Mixture({RULE: 1, ones: 1})}, seeds=range(8))
+    ]
+    assert {answer for log in logs for answer in log} == {"rule", 1}
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {},
+        [],
+        [ones],
+        {ones: -1},
+        {ones: 0},
+        {ones: float("nan")},
+        {ones: "1"},
+        {"ones": 1},
+        [(ones, 1, 2)],
+        {ones: True},
+    ],
+)
+def test_mixtures_that_cannot_be(parts):
+    with pytest.raises(OptionValueError, match=r"mixture|weight"):
+        Mixture(parts)
+
+
+def test_policies_of_mixtures_answer_each_decision():
+    ant = decision(agent="ant_0")
+    with pytest.raises(InvalidActionError, match="1 decisions"):
+        collect_episodes(calling(ant), {ant: Mixture({(lambda observations: [1, 2]): 1})}, seeds=[1])
+    with pytest.raises(InvalidActionError, match="None"):
+        collect_episodes(calling(ant), {ant: Mixture({(lambda observations: None): 1})}, seeds=[1])
+
+
+# -- data sets, as far as nobody writes them ------------------------------------------------------
+
+
+def test_without_minari_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "minari.dataset.minari_dataset", None)
+    monkeypatch.setitem(sys.modules, "minari", None)
+    ant = decision(agent="ant_0")
+    with pytest.raises(MissingExtraError, match=r"simenv-marl\[minari\]"):
+        record_dataset("ants-v0", calling(ant), {ant: ones}, seeds=[1])
+    with pytest.raises(MissingExtraError, match=r"simenv-marl\[minari\]"):
+        save_dataset("ants-v0", collect_episodes(calling(ant), {ant: ones}, seeds=[1])[ant])
+
+
+@pytest.mark.parametrize(
+    ("dataset_id", "match"),
+    [
+        ("both-v0", "2 policies"),
+        ({"ant_0": "same-v0", "bee_0": "same-v0"}, "own"),
+        ({"cat_0": "cats-v0"}, "cat_0"),
+        ({}, "dataset_id"),
+        (None, "dataset_id"),
+        ({"ant_0": 3}, "dataset_id"),
+    ],
+    ids=str,
+)
+def test_each_policy_needs_a_data_set_of_its_own(dataset_id, match):
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    with pytest.raises(OptionValueError, match=match):
+        record_dataset(dataset_id, calling(ant, bee), {"ant_0": ones, "bee_0": ones}, points=[ant, bee], seeds=[1])
+
+
+def test_what_cannot_be_saved():
+    ant = decision(agent="ant_0")
+    with pytest.raises(OptionValueError, match="under one key"):
+        save_dataset("ants-v0", collect_episodes(calling(ant), {ant: ones}, seeds=[1]))
+    with pytest.raises(OptionValueError, match="policies"):
+        record_dataset("ants-v0", calling(ant), ones, seeds=[1])
+
+
+def test_what_the_rule_decides_must_be_known_before_anything_runs(monkeypatch):
+    monkeypatch.setattr("simenv_marl.many.demonstrations._check_free", lambda names: [])
+
+    def never(simulation):
+        raise AssertionError
+
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0", rule_action_mapping=lambda decided: 3)
+    for policy in (RULE, Mixture({ones: 1, RULE: 1}), Mixture({Mixture({RULE: 1}): 1})):
+        with pytest.raises(DefinitionError, match=r"choose.*rule_action_mapping"):
+            record_dataset("ants-v0", script(never), {ant: policy}, points=[ant, bee], seeds=[1])
+        with pytest.raises(AssertionError):
+            record_dataset("bees-v0", script(never), {bee: policy}, points=[ant, bee], seeds=[1])
+    with pytest.raises(AssertionError):
+        record_dataset("ants-v0", script(never), {ant: Mixture({ones: 1, RULE: 0})}, points=[ant], seeds=[1])
+    with pytest.raises(DefinitionError, match="rule_action_mapping"):
+        compare_with_rule(script(never), {ant: ones}, points=[ant], seeds=[1])
+
+
+# -- comparisons ----------------------------------------------------------------------------------
+
+
+def told(**changes):
+    return beings(rule_action_mapping=lambda decided, being: being.health, **changes)
+
+
+def crowd(simulation):
+    """Beings whose rule corresponds to 0, 1, 2, one after the other."""
+    simulation.crowd = [Being(number) for number in range(3)]
+    simulation.log = []
+    for step in range(3):
+        for being in simulation.crowd:
+            being.health = step
+            simulation.log.append(being.act())
+
+
+def test_policies_are_asked_while_the_rule_decides():
+    logs = []
+
+    def main(simulation):
+        crowd(simulation)
+        logs.append(simulation.log)
+
+    found = compare_with_rule(script(main), {Being.act: ones}, points=told(), seeds=[1, 2])[Being.act]
+    assert logs == [["rule"] * 9] * 2
+    assert found.trajectories.by_rule.all()
+    assert found.trajectories.actions.tolist() == [0, 1, 2] * 6
+    assert found.policy_actions.tolist() == [1] * 18
+    assert found.agreements.tolist() == [False, True, False] * 6
+    assert found.agreement == pytest.approx(1 / 3)
+    assert found.trajectories.extras == {}
+    assert "0.333" in repr(found)
+
+
+def test_the_rule_is_what_it_was_collected_as():
+    compared = compare_with_rule(script(crowd), {Being.act: ones}, points=told(), seeds=[1, 2], batch_size=1)
+    alone = collect_episodes(script(crowd), {Being.act: RULE}, points=told(), seeds=[1, 2])
+    one, other = compared[Being.act].trajectories, alone[Being.act]
+    for name in ("observations", "actions", "rewards", "terminations", "starts", "episodes", "by_rule", "turns"):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_who_would_leave_it_to_the_rule_agrees_with_it():
+    policy = Mixture({RULE: 1, (lambda seen: [7] * len(seen)): 1})
+    found = compare_with_rule(script(crowd), {Being.act: policy}, points=told(), seeds=range(4))[Being.act]
+    assert set(np.unique(found.policy_actions)) == {0, 1, 2, 7}
+    assert found.agreements.tolist() == (found.policy_actions != 7).tolist()
+
+
+def test_numbers_may_differ_by_a_tolerance():
+    space = spaces.Dict(how=spaces.Box(-9, 9, (2,), np.float32), what=spaces.Discrete(3))
+    ant = decision(
+        agent="ant_0",
+        action_space=space,
+        rule_action_mapping=lambda decided: {"how": np.array([1, 2], np.float32), "what": 1},
+    )
+    answers = [([1, 2], 1), ([1.5, 2], 1), ([1, 2.75], 1), ([1, 2], 2)]
+
+    def agreements(tolerance):
+        simulation = calling(ant, ant, ant, ant)
+        queue = iter(answers)
+
+        def policy(seen):
+            how, what = next(queue)
+            return [{"how": np.array(how, np.float32), "what": what}]
+
+        return compare_with_rule(simulation, {ant: policy}, seeds=[1], tolerance=tolerance)[ant].agreements.tolist()
+
+    assert agreements(0.0) == [True, False, False, False]
+    assert agreements(0.5) == [True, True, False, False]
+    assert agreements(1) == [True, True, True, False]
+
+
+def test_actions_of_all_kinds_are_compared():
+    space = spaces.Tuple([spaces.MultiDiscrete([3, 3]), spaces.Text(5), spaces.Dict(a=spaces.MultiBinary(2))])
+
+    def action(numbers=(1, 2), word="hello", bits=(0, 1)):
+        return np.array(numbers), word, {"a": np.array(bits, np.int8)}
+
+    ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: action())
+    answers = iter([action(), action(numbers=(1, 1)), action(word="hell"), action(bits=(1, 1)), RULE])
+    found = compare_with_rule(calling(*[ant] * 5), {ant: lambda seen: [next(answers)]}, seeds=[1])[ant]
+    assert found.agreements.tolist() == [True, False, False, False, True]
+    assert found.policy_actions[1].tolist() == ["hello", "hello", "hell", "hello", "hello"]
+
+
+def test_comparisons_of_several_policies_and_of_nobody():
+    ant, bee = (decision(agent=name, rule_action_mapping=lambda decided: 1) for name in ("ant_0", "bee_0"))
+    found = compare_with_rule(calling(ant, ant), {"ant_0": ones, bee: ones}, points=[ant, bee], seeds=[1])
+    assert list(found) == ["ant_0", bee]
+    assert found["ant_0"].agreement == 1.0
+    assert np.isnan(found[bee].agreement)
+
+
+def test_others_may_decide_beside_the_rule():
+    ant, bee = decision(agent="ant_0", rule_action_mapping=lambda decided: 1), decision(agent="bee_0")
+    logs = []
+
+    def main(simulation):
+        logs.append([ant(), bee()])
+
+    found = compare_with_rule(script(main), {ant: twos}, others={bee: twos}, points=[ant, bee], seeds=[1])
+    assert logs == [["rule", 2]]
+    assert list(found) == [ant]
+    assert found[ant].policy_actions.tolist() == [2]
+
+
+def test_decisions_that_correspond_to_no_action():
+    points = beings(rule_action_mapping=lambda decided, being: None if being.number == 2 else 1)
+    with pytest.raises(DefinitionError, match=r"in 3 of 9 decisions .*'being_2' at turn 2 of the episode of seed 8"):
+        compare_with_rule(script(crowd), {Being.act: ones}, points=points, seeds=[8])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"policies": ones},
+        {"policies": {"ant_0": RULE}},
+        {"tolerance": -1},
+        {"others": 3},
+        {"tolerance": "1"},
+    ],
+    ids=plainly,
+)
+def test_comparisons_that_cannot_be(wrong):
+    ant = decision(agent="ant_0", rule_action_mapping=lambda decided: 1)
+    given = {"policies": {ant: ones}, "seeds": [1], **wrong}
+    with pytest.raises(OptionValueError, match=r"policies|tolerance|others"):
+        compare_with_rule(calling(ant), given.pop("policies"), **given)
+
+
+@pytest.mark.parametrize("weight", [float("inf"), -float("inf"), float("nan"), -1e-9, None, 1j])
+def test_weights_of_mixtures_are_finite(weight):
+    with pytest.raises(OptionValueError, match="weight"):
+        Mixture({ones: 1, twos: weight})

@@ -1,0 +1,308 @@
+"""Many simulations, spread over processes by joblib."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import joblib
+import numpy as np
+import pytest
+
+from simenv_marl import (
+    RULE,
+    InvalidActionError,
+    Variant,
+    WorkerError,
+    collect_episodes,
+    difference,
+    expose_to_plugins,
+    make_step,
+    simulate_many,
+)
+from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
+from tests.worlds.models import PAIR, decision, define, notes, script
+
+# Where work is given up, joblib empties its queue of work while a thread of its own may be about to take from it, and
+# ends that thread in any case.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Exception in thread ExecutorManagerThread:pytest.PytestUnhandledThreadExceptionWarning"
+)
+
+DESIGN = Design(initial=4, most=12, ticks=4, overseen="before", truncates=True)
+POINTS = colony_points(overseen=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _workers_end():
+    yield
+    joblib.externals.loky.get_reusable_executor().shutdown(wait=True)
+
+
+def policy(observations):
+    return [RULE if number == 5 else number for number in (observations.sum(axis=1) % 6).astype(int).tolist()]
+
+
+def ones(observations):
+    return np.ones(len(observations), np.int64)
+
+
+def traces(**arguments):
+    policies = {Creature.act: policy, "overseer_0": policy}
+    return simulate_many(lambda: Colony(DESIGN), policies, points=POINTS, collect=lambda s: s.trace, **arguments)
+
+
+@pytest.mark.parametrize("arguments", [{"seeds": range(9)}, {"seeds": [5, 3], "batch_size": 1}, {"seeds": []}], ids=str)
+def test_workers_find_the_same_in_the_same_order(arguments):
+    assert traces(workers=2, **arguments) == traces(**arguments)
+
+
+def test_collected_episodes_are_the_same():
+    policies = {Creature.act: lambda observations: (policy(observations), {"sums": observations.sum(axis=1)})}
+    policies["overseer_0"] = policies[Creature.act]
+    policies["creature_99"] = ones  # who is never born
+    alone, shared = (
+        collect_episodes(
+            lambda: Colony(DESIGN),
+            policies,
+            points=POINTS,
+            seeds=range(9),
+            collect=lambda simulation: simulation.trace,
+            batch_size=2,
+            workers=workers,
+        )
+        for workers in (0, 2)
+    )
+    assert alone["creature_99"].collected == tuple(traces(seeds=range(9)))
+    assert list(alone) == list(shared) == list(policies)
+    for key, found in alone.items():
+        for field in dataclasses.fields(found):
+            one, other = getattr(found, field.name), getattr(shared[key], field.name)
+            if isinstance(one, np.ndarray):
+                assert one.dtype == other.dtype, field.name
+                assert np.array_equal(one, other), field.name
+            elif field.name == "extras":
+                assert one.keys() == other.keys()
+                assert all(np.array_equal(one[name], other[name]) for name in one)
+            else:
+                assert one == other, field.name
+
+
+def test_the_work_is_shared():
+    ant = decision(agent="ant_0")
+    found = simulate_many(
+        script(lambda simulation: simulation.log.append(ant())),
+        {ant: ones},
+        seeds=range(4),
+        workers=2,
+        collect=lambda simulation: (os.getpid(), simulation.log),
+    )
+    assert os.getpid() not in {process for process, _ in found}
+    assert [log for _, log in found] == [[1]] * 4
+
+
+def test_what_is_defined_anywhere_crosses():
+    """Decision functions that nobody can import ask there as here: those of local classes, differences, handlers."""
+
+    class Model:
+        @expose_to_plugins
+        @make_step(
+            observation_space=PAIR,
+            observation_space_mapping=lambda model: [model.level, level_changed(model)],
+            action_space=define().action_space,
+            action_space_mapping=lambda action: action,
+            reward_mapping=difference(lambda model: model.level),
+            agent="model_0",
+        )
+        def decide(self):
+            return 0
+
+        @classmethod
+        @define(agent="class_0")
+        def of_class(cls):
+            return "rule"
+
+        def reset(self, seed):
+            self.level, self.log = seed, []
+
+        def run(self):
+            for _ in range(3):
+                action = self.decide()
+                self.level += action
+                self.log.append((action, Model.of_class()))
+
+    level_changed = difference(lambda model: model.level)
+
+    def two(observations):
+        return 1 + observations[:, 1].astype(int) % 2
+
+    def handler(model):
+        model.level += 3
+
+    policies = {Model.decide: two, Model.of_class: ones}
+    points, plugins = [Model.decide, Model.of_class], [(handler, Model.decide, "before")]
+    arguments = {"points": points, "plugins": plugins, "seeds": range(3)}
+    alone = simulate_many(Model, policies, **arguments)
+    shared = simulate_many(Model, policies, workers=2, **arguments)
+    assert [s.log for s in shared] == [s.log for s in alone] == [[(1, 1), (1, 1), (1, 1)]] * 3
+    assert all(type(simulation) is Model for simulation in shared)  # what comes back is what it was
+    one, two_ = (collect_episodes(Model, policies, workers=workers, **arguments) for workers in (0, 2))
+    assert one[Model.decide].rewards.tolist() == two_[Model.decide].rewards.tolist() == [4.0, 4.0, 1.0] * 3
+
+
+def test_undecorated_models_variants_and_closures_cross():
+    number, before = 7, vars(Creature)["act"]
+    points = {Creature.act: colony_points(overseen=False)[Creature.act]}
+    variant = Variant(
+        "mine", Colony, parameters={"design": DESIGN}, points=points, policies={"creature_0": lambda o: 3}
+    )
+
+    def of_many(observations):
+        return [number % 5] * len(observations)
+
+    arguments = {"seeds": range(4), "collect": lambda simulation: simulation.trace}
+    alone = simulate_many(variant, {Creature.act: of_many}, **arguments)
+    assert simulate_many(variant, {Creature.act: of_many}, workers=2, **arguments) == alone
+    assert vars(Creature)["act"] is before
+
+
+def failing(error, match=None, **arguments):
+    ant = decision(agent="ant_0")
+
+    def main(simulation):
+        simulation.log.append(ant())
+        if simulation.seed == 13:
+            raise arguments["raised"]()
+
+    policies = {ant: arguments.get("policy", ones)}
+    with pytest.raises(error, match=match) as caught:
+        simulate_many(script(main), policies, seeds=range(20), workers=2, collect=lambda simulation: None)
+    return caught.value
+
+
+def test_errors_of_models_surface_as_themselves():
+    error = failing(ZeroDivisionError, raised=lambda: ZeroDivisionError("here"))
+    assert error.args == ("here",)
+    assert "seed 13" in notes(error)
+    assert "in main" in str(error.__cause__)  # where it was raised there
+
+
+def test_errors_of_policies_surface_as_themselves():
+    class LocalError(Exception):
+        pass
+
+    def raising(observations):
+        raise LocalError("a")
+
+    assert "seed" in notes(failing(LocalError, policy=raising, raised=None))
+    failing(InvalidActionError, policy=lambda observations: [1], raised=None)
+
+
+def test_an_error_that_cannot_be_pickled_is_told_of():
+    class PickyError(Exception):
+        def __init__(self, one, two):
+            super().__init__(one)
+            self.held = (number for number in ())
+
+    failing(WorkerError, match="PickyError", raised=lambda: PickyError("once", "upon"))
+
+
+def test_what_nobody_wants_any_more_is_cancelled(monkeypatch):
+    """An interrupt while results arrive: the rest is given up, and nothing is in the way of the next call."""
+    with monkeypatch.context() as patch:
+        patch.setattr("simenv_marl.many.spread.unpack", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            traces(seeds=range(40), workers=2, batch_size=1)
+    assert len(traces(seeds=range(2), workers=2)) == 2
+
+
+def interrupted(parcel):
+    raise KeyboardInterrupt
+
+
+SCRIPT = """
+    import sys, time
+    import numpy as np
+    from gymnasium import spaces
+    from simenv_marl import make_step, simulate_many
+
+    class Model:
+        @make_step(
+            observation_space=spaces.Discrete(100),
+            observation_space_mapping=lambda model: model.level,
+            action_space=spaces.Discrete(100),
+            action_space_mapping=lambda action: action,
+            reward_mapping=lambda model: 0.0,
+        )
+        def decide(self):
+            return 0
+
+        def reset(self, seed):
+            self.level = seed
+
+        def run(self):
+            for _ in range(3):
+                self.level += self.decide()
+                if len(sys.argv) > 1:
+                    open(sys.argv[1], "w").close()
+                    time.sleep(60)
+
+    if __name__ == "__main__":
+        for workers in (2, 0):
+            try:
+                print(simulate_many(Model, {Model.decide: lambda levels: levels + 1}, seeds=range(3), workers=workers,
+                                    collect=lambda model: model.level))
+            except KeyboardInterrupt:
+                print("interrupted")
+                break
+"""
+
+
+def test_scripts_need_no_module(tmp_path):
+    """What a script defines has no name under which workers could import it."""
+    path = tmp_path / "script.py"
+    path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.splitlines() == ["[7, 15, 23]"] * 2, done.stderr
+
+
+def test_an_interrupt_ends_all_processes(tmp_path):
+    path, begun = tmp_path / "script.py", tmp_path / "begun"
+    path.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
+    command = [sys.executable, path, begun]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True) as process:
+        for _ in range(600):
+            if begun.exists():
+                break
+            time.sleep(0.1)
+        os.killpg(process.pid, signal.SIGINT)
+        try:
+            printed, _ = process.communicate(timeout=30)  # and not after the minute for which they sleep
+        finally:
+            process.kill()  # which else is waited for, for ever
+    assert printed.split() == [b"interrupted"]
+
+
+def test_progress_is_shown(capsys):
+    traces(seeds=range(5), workers=2, progress=True)
+    assert "5/5" in capsys.readouterr().err
+
+
+def test_what_is_collected_of_lots_in_which_nobody_decides():
+    ant = decision(agent="ant_0")
+
+    def main(simulation):
+        if simulation.seed == 5:
+            ant()
+
+    for seeds in (range(4), range(8)):
+        for workers in (0, 2):
+            found = collect_episodes(
+                script(main), {ant: ones}, seeds=seeds, batch_size=2, workers=workers, collect=lambda s: s.seed * 10
+            )[ant]
+            assert found.seeds == tuple(seeds)
+            assert found.collected == tuple(10 * seed for seed in seeds)
+            assert found.episodes.tolist() == ([5] if 5 in seeds else [])

@@ -1,0 +1,1 @@
+"""Models, definitions and players that the tests share."""

@@ -1,0 +1,253 @@
+"""Models for vector environments, and what it means that two of these tell the same."""
+
+from __future__ import annotations
+
+import multiprocessing
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from simenv_marl import RULE, TRUNCATED, joint_env, make_step, single_env, vector_env
+from tests.worlds.worlds import FuseError, World, advised, agent_of, points_of
+
+MODES = list(AutoresetMode)
+
+FORK = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+"""The quickest way to start a worker; which one it is makes no difference once it runs."""
+
+FORKS = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+"""That numpy has threads does not matter here: they have nothing to do when a worker is forked."""
+
+
+class Counter:
+    """Counts to a number that its seed gives; every decision says by how much."""
+
+    render_modes = ("ansi",)
+    failing = False
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        self.seed, self.options = seed, options
+        self.random = np.random.default_rng(seed)
+        self.count, self.goal = 0, int(self.random.integers(3, 12))
+
+    def run(self) -> Any:
+        try:
+            while self.count < self.goal:
+                self.count += self.decide()
+                if self.failing:
+                    raise FuseError
+        finally:
+            self.unwound = True
+        return TRUNCATED if self.goal % 2 else None
+
+    def render(self, mode: str) -> str:
+        return f"{mode} {self.count}"
+
+    @make_step(
+        observation_space=spaces.Box(-100, 100, (2,), np.float32),
+        observation_space_mapping=lambda self: [self.count, self.goal],
+        action_space=spaces.Discrete(3, start=1),
+        action_space_mapping=int,
+        reward_mapping=lambda self: self.count / 4,
+    )
+    def decide(self) -> int:
+        return 1
+
+
+POINT = f"{__name__}.Counter.decide"
+
+
+class Timed(Counter):
+    """The same with a clock."""
+
+    def time(self) -> float:
+        return 1.5 * self.count
+
+
+def definition(**changes: Any) -> Any:
+    """A definition for ``Counter.decide``."""
+    return make_step(
+        **{
+            "observation_space": spaces.Box(-100, 100, (2,), np.float32),
+            "observation_space_mapping": lambda self: [self.count, self.goal],
+            "action_space": spaces.Discrete(3, start=1),
+            "action_space_mapping": int,
+            "reward_mapping": lambda self: self.count / 4,
+            **changes,
+        }
+    )
+
+
+NESTED = spaces.Dict(
+    {
+        "count": spaces.Discrete(1000),
+        "both": spaces.Tuple([spaces.Box(-1, 1, (), np.float64), spaces.MultiDiscrete([100, 100])]),
+        "word": spaces.Text(5, charset="abc"),
+        "image": spaces.Box(0, 255, (2, 3, 1), np.uint8),
+    }
+)
+
+VARIETY: dict[str, tuple[Any, Any]] = {
+    "plain": (Counter, definition()),
+    "timed": (Timed, definition()),
+    "masked": (Timed, definition(action_mask_mapping=lambda self: [1, self.count % 2, 1])),
+    "choices": (
+        Counter,
+        definition(
+            action_space=spaces.Discrete(4),
+            action_space_mapping=None,
+            choices=lambda self: list(range(1, 2 + self.count % 4)),
+        ),
+    ),
+    "rows": (
+        Counter,
+        definition(
+            observation_space=spaces.Box(-100, 100, (2, 3), np.float64),
+            # Laid out column by column, and of nobody else.
+            observation_space_mapping=lambda self: np.full((2, 3), [self.count, self.goal, 7.0], order="F"),
+        ),
+    ),
+    "flags": (
+        Counter,
+        definition(
+            observation_space=spaces.Box(0, 1, (2,), np.bool_),
+            observation_space_mapping=lambda self: np.array([self.count > 3, True]),
+        ),
+    ),
+    "large": (
+        Counter,
+        definition(
+            observation_space=spaces.Box(-100, 100, (400,), np.float32),
+            observation_space_mapping=lambda self: np.arange(400) % 7 + self.count,
+        ),
+    ),
+    "box": (
+        Counter,
+        definition(action_space=spaces.Box(0, 3, (2,), np.float32), action_space_mapping=lambda a: 1 + int(a.sum())),
+    ),
+    "one of a box": (
+        Counter,
+        definition(action_space=spaces.Box(0, 3, (1,), np.float32), action_space_mapping=lambda a: 1 + int(a[0])),
+    ),
+    "dict action": (
+        Counter,
+        definition(
+            action_space=spaces.Dict({"a": spaces.Discrete(3), "b": spaces.Box(0, 1, (2,), np.float64)}),
+            action_space_mapping=lambda action: 1 + int(action["a"]),
+        ),
+    ),
+    "multi": (
+        Counter,
+        definition(action_space=spaces.MultiDiscrete([2, 3]), action_space_mapping=lambda a: 1 + int(a.sum())),
+    ),
+    "nested": (
+        Counter,
+        definition(
+            observation_space=NESTED,
+            observation_space_mapping=lambda self: {
+                "count": self.count,
+                "both": (self.count / 100, [self.count, self.goal]),
+                "word": "abc"[: 1 + self.count % 3],
+                "image": np.full((2, 3, 1), self.count),
+            },
+        ),
+    ),
+    "number": (
+        Counter,
+        definition(observation_space=spaces.Discrete(100), observation_space_mapping=lambda self: self.count),
+    ),
+    "image": (
+        Counter,
+        definition(
+            observation_space=spaces.Box(0, 255, (4, 2), np.uint8),
+            observation_space_mapping=lambda self: np.full((4, 2), self.count),
+        ),
+    ),
+    "goal": (
+        Counter,
+        definition(
+            goal_space=spaces.Box(0, 100, (1,), np.float64),
+            achieved_goal_mapping=lambda self: [self.count],
+            desired_goal_mapping=lambda self: [self.goal],
+            compute_reward=lambda achieved, desired, info: -np.abs(achieved - desired).sum(-1),
+        ),
+    ),
+}  # fmt: skip
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two results are equal to the dtype."""
+    if isinstance(one, dict):
+        return isinstance(other, dict) and one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, (tuple, list)):
+        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray):
+        if not isinstance(other, np.ndarray) or one.dtype != other.dtype or one.shape != other.shape:
+            return False
+        if one.dtype == object:
+            return all(map(same, one.tolist(), other.tolist()))
+        return np.array_equal(one, other)
+    return type(one) is type(other) and one == other
+
+
+def legal_actions(envs: Any, infos: dict[str, Any], rng: np.random.Generator) -> Any:
+    """A batch of actions out of the action space that the masks allow."""
+    envs.action_space.seed(int(rng.integers(1000)))
+    actions = envs.action_space.sample()
+    masks = infos.get("action_mask")
+    if isinstance(masks, np.ndarray):
+        start = envs.single_action_space.start
+        actions = np.array([start + rng.choice(np.flatnonzero(m)) if m.any() else start for m in masks])
+    return actions
+
+
+def agree(ours: Any, theirs: Any, steps: int, rng: np.random.Generator) -> None:
+    """Two vector environments tell the same, whatever happens."""
+    disabled = ours.metadata["autoreset_mode"] == AutoresetMode.DISABLED
+    told = ours.reset(seed=5), theirs.reset(seed=5)
+    assert same(*told)
+    for _ in range(steps):
+        actions = legal_actions(ours, told[0][-1], rng)
+        told = ours.step(actions), theirs.step(actions)
+        assert same(*told)
+        assert told[0][1].dtype == np.float64
+        over = told[0][2] | told[0][3]
+        if disabled and over.any():
+            told = tuple(envs.reset(options={"reset_mask": over.copy()}) for envs in (ours, theirs))
+            assert same(*told)
+            infos = told[0][-1]
+            if "action_mask" in infos:  # of those that were not reset it is not told again
+                told = ours.reset(seed=3), theirs.reset(seed=3)
+                assert same(*told)
+
+
+def made(design: Any, number: int, mode: AutoresetMode, *, sync: bool = False, **options: Any) -> Any:
+    """A vector environment of worlds of a design, ours or Gymnasium's; None where there is no such."""
+    points = points_of(design)
+    policies = {points[point]: advised for point in design.policies} | {points[point]: RULE for point in design.rules}
+    entities = [point for point in design.active if agent_of(design.kinds[point], point, 0) != f"point_{point}"]
+    options |= {"policies": policies or None, "max_steps": design.max_steps}
+    if entities:
+        names = {p: [agent_of(design.kinds[p], p, entity) for entity in range(3)] for p in entities}
+        options["possible_agents"] = {points[p]: list(filter(None, names[p])) for p in entities}
+    single = len(design.active) == 1 and not entities
+    if not single and any(design.kinds[point] == "choices" for point in design.active):
+        return None  # what is legal for one may be illegal by its turn
+    source = Source(design, points)
+    if not sync:
+        return vector_env(source, points, num_envs=number, autoreset_mode=mode, **options)
+    make = single_env if single else joint_env
+    return SyncVectorEnv([lambda: make(source, points, **options)] * number, autoreset_mode=mode)
+
+
+class Source:
+    """Makes worlds of a design."""
+
+    def __init__(self, design: Any, points: Any) -> None:
+        self.design, self.points = design, points
+
+    def __call__(self) -> World:
+        return World(self.design, self.points)

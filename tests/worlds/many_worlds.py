@@ -1,0 +1,363 @@
+"""Entities that are born, decide and die, for the tests of many agents.
+
+``Being`` is an entity of no model in particular. ``Colony`` is a whole simulation, in which what is decided makes
+creatures be born and die, decide twice, or never; ``Answered`` is the same without the library, and notes what must
+come of it.
+"""
+
+from __future__ import annotations
+
+import random
+import weakref
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from hypothesis import strategies as st
+
+from simenv_marl import RULE, TRUNCATED, difference
+from tests.worlds.models import define
+
+HERE = __name__
+
+
+# -- entities -------------------------------------------------------------------------------------
+
+
+class Being:
+    """An entity that decides by ``act`` and goes by ``leave``."""
+
+    def __init__(self, number: int) -> None:
+        self.number, self.health, self.whole = number, 0, True
+        self.hunt: Any = None
+
+    def act(self) -> Any:
+        return "rule"
+
+    def leave(self) -> None:
+        self.whole = False
+
+
+class Other:
+    """An entity of another kind."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def act(self) -> Any:
+        return "other rule"
+
+    def leave(self) -> None:
+        pass
+
+
+def banish(place: Any, being: Any) -> None:
+    """Ends a being that is not what it is called on."""
+    being.whole = False
+
+
+def being_of(being: Being) -> str:
+    """The agent of a being."""
+    return f"being_{being.number}"
+
+
+def other_of(other: Other) -> str:
+    """The agent of another."""
+    return f"other_{other.number}"
+
+
+def watch(being: Being) -> list[float]:
+    """A being's health; that of one that is not whole any more is not to be seen."""
+    assert being.whole, "observed after its end"
+    return [being.number, being.health]
+
+
+def pay(being: Being) -> float:
+    """A being's reward is its health."""
+    assert being.whole, "rewarded after its end"
+    return being.health
+
+
+def beings(**changes: Any) -> dict[Any, Any]:
+    """The point of beings, which ``leave`` ends, but for what is changed."""
+    given = {"agent": being_of, "observation_space_mapping": watch, "reward_mapping": pay}
+    return {Being.act: define(**given | {"removed_by": f"{HERE}.Being.leave"} | changes)}
+
+
+def others(**changes: Any) -> dict[Any, Any]:
+    """The point of the others."""
+    return {Other.act: define(**{"agent": other_of, "removed_by": f"{HERE}.Other.leave"} | changes)}
+
+
+class Hunt:
+    """Each being picks one of the living; whoever is let go of before its turn picks no more."""
+
+    def reset(self, seed: int | None = None) -> None:
+        self.beings = {number: Being(number) for number in range(4)}
+        self.weakly, self.log = weakref.WeakSet(self.beings.values()), list[Any]()
+        for being in self.beings.values():
+            being.hunt = weakref.proxy(self)
+
+    def run(self) -> None:
+        for tick in range(2):
+            for number in range(4):
+                for being in [being for being in self.weakly if being.number == number]:
+                    picked = being.act()
+                    self.log.append((tick, number, getattr(picked, "number", picked)))
+                    del being, picked
+                if (tick, number) == (0, 1):
+                    del self.beings[2]
+
+
+class AnnouncedHunt(Hunt):
+    def expected_calls(self, point: str) -> list[tuple[Any]]:
+        return [(being,) for being in self.beings.values()]
+
+
+def hunters() -> dict[Any, Any]:
+    """The point of the beings of a hunt."""
+    return beings(
+        choices=lambda being: list(being.hunt.beings.values()), action_space=spaces.Discrete(4), removed_by=()
+    )
+
+
+# -- a colony -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a colony is like.
+
+    Attributes:
+        initial, most: How many creatures there are first, and may be in all.
+        ticks: How long it runs.
+        overseen: Whether the colony itself decides in each tick, and when: before or after the creatures.
+        truncates: Whether the end is a limit of time.
+    """
+
+    initial: int
+    most: int
+    ticks: int
+    overseen: str = ""
+    truncates: bool = False
+
+
+MOST = 10
+ROSTER = [f"creature_{number}" for number in range(MOST)]
+
+designs = st.builds(
+    Design,
+    initial=st.integers(1, 5),
+    most=st.integers(5, MOST),
+    ticks=st.integers(1, 6),
+    overseen=st.sampled_from(["", "before", "after"]),
+    truncates=st.booleans(),
+)
+
+seeds = st.integers(0, 2**31 - 1)
+
+
+def answer(seed: int, agent: str, number: int) -> Any:
+    """What an agent answers at its decision of that number, whoever asks."""
+    return random.Random(f"{seed} {agent} {number}").choice([0, 1, 2, 3, 4, 4, RULE])
+
+
+class Creature:
+    """Decides a number, on which depends who is born and who dies."""
+
+    def __init__(self, colony: Colony, number: int) -> None:
+        self.colony, self.number, self.decided = colony, number, 0
+
+    @property
+    def name(self) -> str:
+        return f"creature_{self.number}"
+
+    def act(self) -> int:
+        return self.colony.random.randrange(5)
+
+    def die(self) -> None:
+        self.colony.creatures.remove(self)
+        self.colony.trace.append((self.name, "died"))
+
+
+class Colony:
+    """A simulation of creatures."""
+
+    creature: Any = Creature
+
+    def __init__(self, design: Design) -> None:
+        self.design = design
+
+    def reset(self, seed: int | None = None) -> None:
+        self.seed = seed
+        self.random = random.Random(seed)
+        self.trace: list[Any] = []
+        self.fortune = self.born = self.overseen = 0
+        self.creatures: list[Any] = []
+        self.queue: list[Any] = []
+        for _ in range(self.design.initial):
+            self.bear()
+
+    def bear(self) -> None:
+        if self.born < self.design.most:
+            self.creatures.append(self.creature(self, self.born))
+            self.born += 1
+
+    def run(self) -> Any:
+        for _ in range(self.design.ticks):
+            self.queue = self.random.sample(self.creatures, len(self.creatures))
+            if self.design.overseen == "before":
+                self.decide_itself()
+            while self.queue:
+                creature = self.queue.pop(0)
+                if creature in self.creatures:
+                    self.decide(creature)
+                del creature  # whoever has died is to be held by nobody
+            if self.design.overseen == "after":
+                self.decide_itself()
+            self.trace.append("tick")
+        return TRUNCATED if self.design.truncates else None
+
+    def oversee(self) -> int:
+        return self.random.randrange(5)
+
+    def decide_itself(self) -> None:
+        value = self.oversee()
+        self.overseen += 1
+        self.note("overseer_0", value)
+
+    def note(self, agent: str, value: int) -> None:
+        self.fortune = (self.fortune * 3 + value + self.random.randrange(4)) % 997
+        self.trace.append((agent, value, self.fortune))
+
+    def decide(self, creature: Any, *, again: bool = True) -> None:
+        value = creature.act()
+        creature.decided += 1
+        self.note(creature.name, value)
+        event = (value + self.random.randrange(4)) % 9
+        if event in (1, 4):
+            self.bear()
+        if event in (2, 4):
+            creature.die()
+        elif event == 3 and again:
+            self.decide(creature, again=False)
+        elif event == 5:
+            for victim in self.random.sample(self.creatures, min(2, len(self.creatures))):
+                victim.die()
+
+
+class Announcing(Colony):
+    """A colony that knows who is going to decide."""
+
+    def expected_calls(self, point: str) -> list[tuple[Any]]:
+        return [(creature,) for creature in self.creatures] if point.endswith("Creature.act") else [(self,)]
+
+
+class Answered(Colony):
+    """A colony without an environment, in which everybody answers as ``answer`` says.
+
+    Attributes:
+        decisions: Who has decided, in their order.
+        first, last: By agent, the fortune at its first decision and at its end.
+    """
+
+    def __init__(self, design: Design, seed: int | None = None, answers: Any = answer) -> None:
+        super().__init__(design)
+        reference = self
+
+        class AnsweredCreature(Creature):
+            def act(self) -> int:
+                return reference.asked(self.name, super().act)
+
+            def die(self) -> None:
+                reference.ends(self.name)
+                super().die()
+
+        self.creature = AnsweredCreature
+        self.answers = answers
+        self.decisions: list[str] = []
+        self.first: dict[str, int] = {}
+        self.last: dict[str, int] = {}
+        self.reset(seed)
+        self.ended = self.run()
+        for agent in self.first:
+            self.ends(agent)
+
+    def oversee(self) -> int:
+        return self.asked("overseer_0", super().oversee)
+
+    def asked(self, agent: str, rule: Any) -> int:
+        self.first.setdefault(agent, self.fortune)
+        value = self.answers(self.seed, agent, self.decisions.count(agent))
+        self.decisions.append(agent)
+        return rule() if value is RULE else value
+
+    def ends(self, agent: str) -> None:
+        self.last.setdefault(agent, self.fortune)
+
+    @property
+    def totals(self) -> dict[str, float]:
+        """What everybody who has decided was paid, where the change of the fortune is paid."""
+        return {agent: float(self.last[agent] - self.first[agent]) for agent in self.first}
+
+
+def colony_points(*, overseen: bool) -> dict[Any, Any]:
+    """The points of a colony, at which the change of its fortune is paid."""
+    space = {"observation_space": spaces.Box(-1, 1e4, (3,), np.float64)}
+    points = {
+        Creature.act: define(
+            agent=lambda creature: creature.name,
+            observation_space_mapping=lambda c: [c.number, c.decided, c.colony.fortune],
+            reward_mapping=difference(lambda creature: creature.colony.fortune),
+            removed_by=f"{HERE}.Creature.die",
+            **space,
+        )
+    }
+    if overseen:
+        points[Colony.oversee] = define(
+            agent="overseer_0",
+            observation_space_mapping=lambda colony: [-1, colony.overseen, colony.fortune],
+            reward_mapping=difference(lambda colony: colony.fortune),
+            **space,
+        )
+    return points
+
+
+_made: dict[Any, Any] = {}
+
+
+def colony(make: Any, design: Design, simulation: type[Colony] = Colony, *, roster: bool = False) -> Any:
+    """An environment of a colony: one that may have been used before, for another design.
+
+    Args:
+        make: What makes it.
+        design: The design of its episodes from now on.
+        simulation: Of which colony.
+        roster: Whether all that may be born are declared.
+    """
+    key = make, bool(design.overseen), simulation, roster
+    if key not in _made:
+        names = {f"{HERE}.Creature.act": ROSTER} if roster else None
+        points = colony_points(overseen=bool(design.overseen))
+        _made[key] = make(lambda: simulation(design), points, possible_agents=names)
+    _made[key].unwrapped.simulation.design = design
+    return _made[key]
+
+
+def advised(observation: Any, seed: int) -> Any:
+    """The answer of whoever makes that observation."""
+    number, decided = int(observation[0]), int(observation[1])
+    return answer(seed, f"creature_{number}" if number >= 0 else "overseer_0", decided)
+
+
+@dataclass
+class Played:
+    """What came of playing an environment of a colony."""
+
+    simulation: Any
+    decisions: list[str] = field(default_factory=list)
+    totals: Counter[str] = field(default_factory=Counter)
+    ends: dict[str, tuple[bool, bool]] = field(default_factory=dict)
+    joined: dict[str, int] = field(default_factory=dict)

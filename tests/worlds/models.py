@@ -1,0 +1,173 @@
+"""What the tests share: definitions, simulations and players."""
+
+from __future__ import annotations
+
+import gc
+import re
+from collections.abc import Callable, Mapping
+from time import sleep
+from typing import Any, NamedTuple
+
+import greenlet
+import numpy as np
+from gymnasium import spaces
+
+from simenv_marl import RULE, Definition, make_step
+
+
+def plainly(value: Any) -> str:
+    """What a test with that value is called: the same in every process, whatever lies where in memory."""
+    return re.sub(r" at 0x[0-9a-f]+", "", repr(value))
+
+
+PAIR = spaces.Box(-1e6, 1e6, (2,), np.float64)
+
+
+def define(**changes: Any) -> Definition:
+    """A definition that returns the action itself, observes (1, 2) and rewards nothing, but for what is changed."""
+    given: dict[str, Any] = {
+        "observation_space": PAIR,
+        "observation_space_mapping": lambda *args, **kwargs: [1.0, 2.0],
+        "action_space": spaces.Discrete(10),
+        "action_space_mapping": lambda action: action,
+        "reward_mapping": lambda *args, **kwargs: 0.0,
+    }
+    if changes.keys() & {"apply", "choices"}:
+        del given["action_space_mapping"]
+    return make_step(**given | changes)
+
+
+def decision(rule: Callable[..., Any] | None = None, /, **changes: Any) -> Any:
+    """A decision function of its own, whose rule says "rule"."""
+
+    def choose() -> Any:
+        return "rule"
+
+    return define(**changes)(rule or choose)
+
+
+class Script:
+    """A simulation without a base class, whose main loop is a function of it."""
+
+    def __init__(self, main: Callable[[Any], Any]) -> None:
+        self.main = main
+        self.episodes = 0
+
+    def reset(self, seed: int | None = None, options: Any = None) -> None:
+        self.seed, self.options = seed, options
+        self.log: list[Any] = []
+        self.episodes += 1
+
+    def run(self) -> Any:
+        return self.main(self)
+
+
+def script(main: Callable[[Any], Any]) -> Callable[[], Script]:
+    """A factory of simulations with that main loop, which may write to ``simulation.log``."""
+    return lambda: Script(main)
+
+
+def calling(*functions: Callable[[], Any], ends: Any = None) -> Callable[[], Script]:
+    """A factory of simulations that call functions one after the other and log what they return."""
+
+    def main(simulation: Any) -> Any:
+        for function in functions:
+            simulation.log.append(function())
+        return ends
+
+    return script(main)
+
+
+class Turn(NamedTuple):
+    """What one pass of ``agent_iter`` has seen and done."""
+
+    agent: str
+    observation: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+    action: Any
+
+
+def play(env: Any, actions: Any = RULE, *, seed: int | None = None, reset: bool = True) -> list[Turn]:
+    """Play an AEC environment to its end.
+
+    Args:
+        env: The environment.
+        actions: One action for all decisions, an iterator of them, a dict from agents to either, or a
+            callable of the agent and the environment.
+        seed: What it is reset with.
+        reset: Whether it is reset before.
+    """
+    if reset:
+        env.reset(seed=seed)
+    turns = []
+    for agent in env.agent_iter():
+        observation, reward, terminated, truncated, info = env.last()
+        action = None
+        if not (terminated or truncated):
+            action = actions[agent] if isinstance(actions, Mapping) else actions
+            if callable(action):
+                action = action(agent, env)
+            elif hasattr(action, "__next__"):
+                action = next(action)
+        turns.append(Turn(agent, observation, reward, terminated, truncated, info, action))
+        env.step(action)
+    return turns
+
+
+def decisions(turns: list[Turn]) -> list[str]:
+    """The agents in the order in which they decided."""
+    return [turn.agent for turn in turns if not (turn.terminated or turn.truncated)]
+
+
+def rewards_of(turns: list[Turn], agent: str) -> list[float]:
+    """An agent's rewards for its actions, in their order (what it had before its first one left out)."""
+    return [turn.reward for turn in turns if turn.agent == agent][1:]
+
+
+def notes(error: BaseException) -> str:
+    """All notes of an error."""
+    return "\n".join(getattr(error, "__notes__", ()))
+
+
+def culprits(error: BaseException) -> list[str]:
+    """The names of the functions that an error's traceback leads through, the culprit last."""
+    names, trace = [], error.__traceback__
+    while trace is not None:
+        names.append(trace.tb_frame.f_code.co_name)
+        trace = trace.tb_next
+    return names
+
+
+def alive(kind: type) -> int:
+    """How many objects of a type there are since the file of tests began, once the collector has run."""
+    gc.collect()
+    return sum(type(thing) is kind for thing in gc.get_objects())
+
+
+def stacks(expected: int | None = None) -> int:
+    """How many greenlets there are since the file of tests began, that of the thread itself included.
+
+    Of environments that hold others one goes at a time, and where a thread has used some, the last one goes a moment
+    after the thread: what is expected is waited for, and else until nothing more goes.
+    """
+    main, number = greenlet.getcurrent(), -1
+    for _ in range(20):
+        before = number
+        gc.collect()
+        number = 1 + sum(type(thing) is greenlet.greenlet and thing is not main for thing in gc.get_objects())
+        if number == (before if expected is None else expected):
+            break
+        if expected is not None:
+            sleep(0.01)
+    return number
+
+
+_unattended = decision()
+
+
+def nobody_is_asked() -> bool:
+    """Whether no simulation is taken to run in this thread: then decision functions are their rules."""
+    return bool(_unattended() == "rule")

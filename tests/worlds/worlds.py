@@ -1,0 +1,337 @@
+"""Random simulations, and what must come of them, computed without the library.
+
+A world has a level, which every decision changes, and a program: the calls of its decision points in their
+order. ``Reference`` goes through the same program by itself, and tells who decides when, what it observes, what
+it is paid and what the model comes to. It knows of no environment, stack or greenlet.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from gymnasium import spaces
+from hypothesis import strategies as st
+
+from simenv_marl import RULE, TRUNCATED, difference
+from tests.worlds.models import define
+
+KINDS = ("method", "function", "keyword", "entity", "sometimes", "nested", "generator", "choices", "apply")
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a world is like.
+
+    Attributes:
+        kinds: Of what kind each decision point is.
+        program: The calls: of which point, for which of three entities.
+        policies: The points that a policy answers.
+        rules: The points that nobody but their rule answers.
+        differences: The points that are paid by how much the level has changed.
+        truncates: Whether the end is a limit of time.
+        max_steps: The environment's limit.
+    """
+
+    kinds: tuple[str, ...]
+    program: tuple[tuple[int, int], ...]
+    policies: frozenset[int] = frozenset()
+    rules: frozenset[int] = frozenset()
+    differences: frozenset[int] = frozenset()
+    truncates: bool = False
+    max_steps: int | None = None
+
+    @property
+    def active(self) -> list[int]:
+        """The points that the environment's user answers."""
+        return [point for point in range(len(self.kinds)) if point not in self.policies | self.rules]
+
+
+@st.composite
+def designs(draw: Any) -> Design:
+    """Any design in which at least one decision is the user's."""
+    number = draw(st.integers(1, 4))
+    kinds = tuple(draw(st.sampled_from(KINDS)) for _ in range(number))
+    calls = st.tuples(st.integers(0, number - 1), st.integers(0, 2))
+    first = draw(st.integers(0, number - 1))
+    others = [point for point in range(number) if point != first]
+    answered = draw(st.sets(st.sampled_from(others), max_size=2)) if others else set()
+    policies = {point for point in answered if draw(st.booleans())}
+    return Design(
+        kinds=kinds,
+        program=((first, 1), *draw(st.lists(calls, max_size=14))),
+        policies=frozenset(policies),
+        rules=frozenset(answered - policies),
+        differences=frozenset(draw(st.sets(st.integers(0, number - 1)))),
+        truncates=draw(st.booleans()),
+        max_steps=draw(st.none() | st.integers(1, 12)),
+    )
+
+
+seeds = st.integers(0, 2**31 - 1)
+
+answers = seeds.map(lambda seed: random.Random(seed).choices([*range(10), RULE], [1] * 10 + [3], k=80))
+"""Answers in the order of the decisions; an integer becomes legal by its remainder. There are enough of them."""
+
+
+# -- what holds for both --------------------------------------------------------------------------
+
+
+def agent_of(kind: str, point: int, entity: int) -> str | None:
+    """Who decides a call."""
+    if kind == "sometimes" and entity == 0:
+        return None
+    return f"point_{point}_{entity}" if kind in ("entity", "sometimes") else f"point_{point}"
+
+
+def watched(level: int, calls: int) -> list[int]:
+    """What everybody observes."""
+    return [level, calls]
+
+
+def paid(level: int, point: int) -> float:
+    """What whoever decides at a point is paid."""
+    return (level * (point + 2) % 23 - 9) / 8
+
+
+def offered(level: int) -> list[int]:
+    """The choices at a level."""
+    return [level % 5 + number for number in range(1 + level % 3)]
+
+
+def advised(observation: Any, info: Any) -> int:
+    """What a policy answers: the level that it observes, made legal."""
+    return legal(int(observation[0]), info)
+
+
+def legal(answer: Any, info: Any) -> Any:
+    """An answer among those that a mask allows: the first ones, or any of ten."""
+    return answer if answer is RULE else answer % (int(info["action_mask"].sum()) if info else 10)
+
+
+# -- the model ------------------------------------------------------------------------------------
+
+
+class Entity:
+    """What some of the points are decided for."""
+
+    def __init__(self, world: World, number: int) -> None:
+        self.world, self.number = world, number
+
+
+class FuseError(Exception):
+    """What a world raises when its fuse has burnt down."""
+
+
+class World:
+    """A simulation of a design.
+
+    Attributes:
+        fuse: At how many more calls of its rules and mappings it fails; None: never.
+    """
+
+    fuse: int | None = None
+
+    def burn(self) -> None:
+        """Count a call of a rule or of a mapping."""
+        if self.fuse is not None:
+            self.fuse -= 1
+            if self.fuse == 0:
+                raise FuseError
+
+    def __init__(self, design: Design, points: list[Callable[..., Any]]) -> None:
+        self.design, self.points = design, points
+
+    def reset(self, seed: int | None = None) -> None:
+        self.random = random.Random(seed)
+        self.level, self.calls, self.trace = self.random.randrange(50), 0, list[Any]()
+        self.entities = [Entity(self, number) for number in range(3)]
+
+    def run(self) -> Any:
+        try:
+            for point, entity in self.design.program:
+                value = self.call(point, entity)
+                self.calls += 1
+                self.level = (self.level * 3 + value + self.random.randrange(4)) % 101
+                self.trace.append((point, value, self.level))
+        finally:
+            self.trace.append("over")
+        return TRUNCATED if self.design.truncates else None
+
+    def call(self, point: int, entity: int) -> int:
+        kind, function = self.design.kinds[point], self.points[point]
+        if kind == "keyword":
+            return function(self, number=entity)
+        if kind in ("entity", "sometimes"):
+            return function(self.entities[entity])
+        if kind == "generator":
+            return next(iter_value(function(self)))
+        return function(self)
+
+    def rule(self, point: int) -> int:
+        self.burn()
+        value = self.random.randrange(7)
+        if self.design.kinds[point] == "nested" and point > 0:
+            value += self.call(point - 1, value % 3)
+        return value
+
+
+def iter_value(generator: Any) -> Iterable[int]:
+    """The one value of a generator, as an iterator."""
+    value = yield from generator
+    yield value
+
+
+def points_of(design: Design) -> list[Callable[..., Any]]:
+    """Decision functions of a design, whose rules are those of the world."""
+    return [_point(kind, number, number in design.differences) for number, kind in enumerate(design.kinds)]
+
+
+def _point(kind: str, point: int, by_difference: bool) -> Callable[..., Any]:
+    def world_of(thing: Any) -> World:
+        world = thing.world if isinstance(thing, Entity) else thing
+        world.burn()
+        return world
+
+    changes: dict[str, Any] = {
+        "agent": f"point_{point}",
+        "observation_space_mapping": lambda thing, **_: watched(world_of(thing).level, world_of(thing).calls),
+        "reward_mapping": lambda thing, **_: paid(world_of(thing).level, point),
+    }
+    if by_difference:
+        changes["reward_mapping"] = difference(lambda thing, **_: world_of(thing).level / 4)
+
+    class Rules:
+        def of_world(self: Any) -> Any:
+            return self.rule(point)
+
+        def keyword(self: Any, *, number: int) -> Any:
+            return self.rule(point)
+
+        def generator(self: Any) -> Any:
+            if point < 0:
+                yield
+            return self.rule(point)
+
+        def of_entity(self: Any) -> Any:
+            return self.world.rule(point)
+
+    def function(world: World) -> Any:
+        return world.rule(point)
+
+    rule: Any = Rules.of_world
+    if kind == "function":
+        rule = function
+    elif kind in ("entity", "sometimes"):
+        rule = Rules.of_entity
+        changes["agent"] = lambda entity: agent_of(kind, point, entity.number)
+    elif kind in ("keyword", "generator"):
+        rule = vars(Rules)[kind]
+    if kind == "choices":
+        changes |= {"choices": lambda world: offered(world_of(world).level), "action_space": spaces.Discrete(4)}
+    if kind == "apply":
+        changes["apply"] = lambda action, world: action + world.random.randrange(3)
+    return define(**changes)(rule)
+
+
+# -- the reference --------------------------------------------------------------------------------
+
+
+@dataclass
+class Told:
+    """What an agent is told when it decides or ends."""
+
+    agent: str
+    observation: list[int]
+    reward: float
+
+
+class _PendingError(Exception):
+    pass
+
+
+@dataclass
+class Reference:
+    """What must come of a design, a seed and the answers that were given so far.
+
+    Attributes:
+        turns: The decisions that have arisen, in their order; the last one waits unless the episode is over.
+        ends: What the agents are told at the end; None where the episode is not over.
+        truncated: Whether it was truncated.
+        trace: What the model has noted.
+    """
+
+    design: Design
+    seed: int
+    answers: list[Any]
+    turns: list[Told] = field(default_factory=list)
+    ends: dict[str, Told] | None = None
+    truncated: bool = False
+
+    def __post_init__(self) -> None:
+        self.random = random.Random(self.seed)
+        self.level, self.calls, self.trace = self.random.randrange(50), 0, list[Any]()
+        self._decided: dict[str, int] = {}
+        self._remembered: dict[str, int] = {}
+        self._given = iter(self.answers)
+        self._steps = 0
+        try:
+            for point, entity in self.design.program:
+                value = self._decide(point, entity)
+                self.calls += 1
+                self.level = (self.level * 3 + value + self.random.randrange(4)) % 101
+                self.trace.append((point, value, self.level))
+            self._end(truncated=self.design.truncates)
+        except _PendingError:
+            pass
+
+    def _end(self, *, truncated: bool) -> None:
+        self.truncated = truncated
+        self.ends = {
+            agent: Told(agent, watched(self.level, self.calls), self._paid(agent, point))
+            for agent, point in self._decided.items()
+        }
+
+    def _paid(self, agent: str, point: int) -> float:
+        if point not in self.design.differences:
+            return paid(self.level, point)
+        before, self._remembered[agent] = self._remembered.get(agent, self.level), self.level
+        return (self.level - before) / 4
+
+    def _decide(self, point: int, entity: int) -> int:
+        kind = self.design.kinds[point]
+        agent = agent_of(kind, point, entity)
+        if agent is None or point in self.design.rules:
+            return self._rule(point)
+        if point in self.design.policies:
+            return self._value(kind, self.level)
+        if self._steps == self.design.max_steps:
+            self._end(truncated=True)
+            raise _PendingError
+        reward = self._paid(agent, point)
+        if agent not in self._decided:
+            reward = 0.0  # nothing was done yet
+        self._decided[agent] = point
+        self.turns.append(Told(agent, watched(self.level, self.calls), reward))
+        answer = next(self._given, None)
+        if answer is None:
+            raise _PendingError
+        self._steps += 1
+        if answer is RULE:
+            return self._rule(point)
+        return self._value(kind, answer)
+
+    def _value(self, kind: str, answer: int) -> int:
+        if kind == "choices":
+            choices = offered(self.level)
+            return choices[answer % len(choices)]
+        action = answer % 10
+        return action + self.random.randrange(3) if kind == "apply" else action
+
+    def _rule(self, point: int) -> int:
+        value = self.random.randrange(7)
+        if self.design.kinds[point] == "nested" and point > 0:
+            value += self._decide(point - 1, value % 3)
+        return value

@@ -3,16 +3,20 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-clients test-rllib test-oldest test-clusters coverage soak lint docs benchmark clean
+.PHONY: demo test test-clients test-rllib test-oldest test-clusters coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
 
 test: lint docs
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --order random
 
 coverage: .venv/.test
 	$(BIN)/python -m pytest --cov --cov-report=term
+
+# Small mistakes, put into a copy of the library one at a time: which of them does no test find? MUTANTS="--number 20"
+mutants: .venv/.test
+	$(BIN)/python -m tools.mutants $(MUTANTS)
 
 soak: .venv/.test
 	$(BIN)/python -m benchmarks.soak --driver greenlet
@@ -31,8 +35,9 @@ test-rllib: .venv-rllib/.rllib
 	touch $@
 
 # The oldest versions of everything that this library builds on, with the tests of what happens when.
-OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,conformance definitions drivers ends environments episodes errors \
-	goals_and_time identity joint many_agents rounds side_by_side simulate simulate_many vector workers))
+OLDEST_TESTS := $(addprefix tests/contract/test_,$(addsuffix .py,conformance ends environments episodes errors goals_and_time identity \
+	joint many_agents rounds side_by_side simulate simulate_many)) \
+	tests/core/test_drivers.py tests/envs/test_vector.py tests/many/test_workers.py tests/test_definitions.py
 test-oldest: .venv-oldest/.oldest
 	.venv-oldest/bin/python -m pytest --driver greenlet $(OLDEST_TESTS)
 
@@ -72,7 +77,7 @@ benchmark: .venv/.test
 	touch $@
 
 clean:
-	rm -rf .venv .venv-* docs/_build
+	rm -rf .venv .venv-* .mutants docs/_build
 
 # One policy for all sheep of Mesa's model: trained, compared, and drawn into docs/figures.
 .PHONY: wolf-sheep

@@ -1,0 +1,64 @@
+"""A plugin of pytest's for ``tools.mutants``: it notes how long tests take, and runs chosen ones in a given order.
+
+It is told what to do by two environment variables, each with the name of a file: ``MUTANTS_NOTE``, to which each test's
+name, outcome and seconds are written, and ``MUTANTS_TESTS``, a JSON object of names of tests, in the order in which
+they are to run, and the seconds that each may take. A test that takes longer ends the whole process.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+_NOTE = os.environ.get("MUTANTS_NOTE")
+_TESTS = os.environ.get("MUTANTS_TESTS")
+_ROOT = os.environ["MUTANTS_ROOT"]
+_limits: dict[str, float] = json.loads(Path(_TESTS).read_text(encoding="utf-8")) if _TESTS else {}
+_seconds: dict[str, float] = {}
+
+
+def pytest_configure(config: Any) -> None:
+    """See to it that the copy of the library is tested, and no other."""
+    import simenv_marl
+
+    if not Path(simenv_marl.__file__).is_relative_to(_ROOT):
+        raise pytest.UsageError(f"{simenv_marl.__file__} is not below {_ROOT}")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
+    """Keep the chosen tests, in their order."""
+    if _TESTS:
+        place = {name: number for number, name in enumerate(_limits)}
+        chosen = sorted((item for item in items if item.nodeid in place), key=lambda item: place[item.nodeid])
+        config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in place])
+        items[:] = chosen
+
+
+def pytest_runtest_logstart(nodeid: str) -> None:
+    """From here on the test's time runs."""
+    if nodeid in _limits:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, _limits[nodeid])
+
+
+def pytest_runtest_logfinish(nodeid: str) -> None:
+    """The test has ended within its time."""
+    if nodeid in _limits:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def pytest_runtest_logreport(report: Any) -> None:
+    """Note what became of a test. With several processes, the one that collects the reports does it."""
+    if _NOTE is None or "PYTEST_XDIST_WORKER" in os.environ:
+        return
+    _seconds[report.nodeid] = _seconds.get(report.nodeid, 0.0) + report.duration
+    if report.failed or report.when == "teardown":
+        note = [report.nodeid, "failed" if report.failed else "passed", round(_seconds[report.nodeid], 4)]
+        with Path(_NOTE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(note) + "\n")

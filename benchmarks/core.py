@@ -1,7 +1,7 @@
 """What it costs to leave a simulation in the lead: this library's views beside what they replace, in one run.
 
-Run with ``make benchmark``, which pins it to one core. A section is a module with a function ``measure``; one
-can be run alone with ``--only``.
+Run with ``make benchmark``, which pins it to one core. A section is a module with a function ``measure``; some
+can be run alone with ``--only``. Which source is measured says ``PYTHONPATH``.
 """
 
 from __future__ import annotations
@@ -13,9 +13,12 @@ from pathlib import Path
 from benchmarks.measure import Report
 from benchmarks.picture import draw
 
-SECTIONS = ("decisions", "rounds", "plugins", "vector", "many", "wolf_sheep", "greenhouse")
+SECTIONS = ("decisions", "extras", "rounds", "plugins", "vector", "suspended", "many", "wolf_sheep", "greenhouse")
 """In the order in which they run. The greenhouse comes last, and each is imported when it runs, because the
-greenhouse's ``difference()`` makes all environments that are made afterwards say for whom they evaluate a mapping."""
+greenhouse makes a ``difference()``, which stays."""
+
+QUICK = {"rounds": 2, "number": 200}
+"""Enough to see that all of it runs."""
 
 
 def main() -> None:
@@ -24,17 +27,23 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="sections to run (all)")
     parser.add_argument("--rounds", type=int, default=31, help="how many rounds (%(default)s)")
     parser.add_argument("--number", type=int, default=20_000, help="decisions per round (%(default)s)")
+    parser.add_argument("--quick", action="store_true", help="a smoke run, whose figures say nothing")
     parser.add_argument("--write", type=Path, help="a Markdown file for the tables; a picture comes beside it")
+    parser.add_argument("--json", type=Path, help="a file for the figures")
     arguments = parser.parse_args()
+    effort = QUICK if arguments.quick else {"rounds": arguments.rounds, "number": arguments.number}
     report = Report("What a decision costs")
     for name in SECTIONS:
         if name in arguments.only:
-            section = import_module(f"benchmarks.{name}").measure(arguments.rounds, arguments.number)
-            report.add(section)
-            if name == "vector" and arguments.write is not None:
-                draw(section, arguments.write.with_name("vector.png"))
+            report.add(import_module(f"benchmarks.{name}").measure(**effort))
+    if len(arguments.only) > 1:
+        report.conclude()
     if arguments.write is not None:
         report.write(arguments.write)
+        if {"vector", "suspended"} <= set(arguments.only):
+            draw(report.times, arguments.write.with_name("vector.png"))
+    if arguments.json is not None:
+        report.dump(arguments.json)
 
 
 if __name__ == "__main__":

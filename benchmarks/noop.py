@@ -16,9 +16,15 @@ DEFINITION: dict[str, Any] = {
     "reward_mapping": lambda entity: 1.0,
 }
 
+BY: dict[str, Any] = DEFINITION | {
+    "observation_space_mapping": lambda entity, amount: entity.observe(),
+    "reward_mapping": lambda entity, amount: 1.0,
+}
+"""The same for decisions whose calls have an argument besides ``self``."""
+
 
 class Model(State):
-    """Two decisions that change nothing."""
+    """Decisions that change nothing."""
 
     @make_step(**DEFINITION, agent="agent_0")
     def left(self) -> int:
@@ -26,6 +32,14 @@ class Model(State):
 
     @make_step(**DEFINITION, agent="agent_1")
     def right(self) -> int:
+        return 0
+
+    @make_step(**BY, agent="agent_0")
+    def left_by(self, amount: float) -> int:
+        return 0
+
+    @make_step(**BY, agent="agent_1")
+    def right_by(self, amount: float) -> int:
         return 0
 
 
@@ -42,6 +56,16 @@ class Turns:
             model.right()
 
 
+class TurnsBy(Turns):
+    """The same, with an argument."""
+
+    def run(self) -> None:
+        model = self.model
+        while True:
+            model.left_by(1.0)
+            model.right_by(1.0)
+
+
 class Alone(Turns):
     """One agent, without an end."""
 
@@ -49,6 +73,15 @@ class Alone(Turns):
         model = self.model
         while True:
             model.left()
+
+
+class AloneBy(Turns):
+    """The same, with an argument."""
+
+    def run(self) -> None:
+        model = self.model
+        while True:
+            model.left_by(1.0)
 
 
 class Entity(State):
@@ -60,6 +93,10 @@ class Entity(State):
 
     @make_step(**DEFINITION, agent=lambda entity: entity.name)
     def decide(self) -> int:
+        return 0
+
+    @make_step(**BY, agent=lambda entity, amount: entity.name)
+    def decide_by(self, amount: float) -> int:
         return 0
 
 
@@ -84,8 +121,17 @@ class Crowd:
             done += 1
 
 
+class CrowdBy(Crowd):
+    """The same without an end, and with an argument."""
+
+    def run(self) -> None:
+        while True:
+            for entity in self.entities:
+                entity.decide_by(1.0)
+
+
 class ForetoldCrowd(Crowd):
-    """The same, and it knows who is going to decide."""
+    """Many agents, and it knows who is going to decide."""
 
     def expected_calls(self, point: str) -> list[tuple[Entity]]:
         return [(entity,) for entity in self.entities]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-
-from benchmarks.measure import Section
 
 COLOURS = {
     "vector_env": "#1b6f5f",
@@ -17,14 +16,13 @@ COLOURS = {
 OTHERS = {"a thread with queues for each, 64": ("a thread with queues for each", "#b3402e", 64)}
 
 
-def draw(section: Section, path: Path) -> None:
-    """Draw what the section on vector environments has measured.
+def draw(times: Mapping[str, float], path: Path) -> None:
+    """Draw what the sections on vector environments and on what they replace have measured.
 
     Args:
-        section: The section.
+        times: The times of both, by what took them.
         path: Where to put it.
     """
-    times = {what: float(value) for what, value in section.rows}
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
     FigureCanvasAgg(figure)  # no window, no state of pyplot
     axes = figure.add_subplot()

@@ -1,40 +1,31 @@
-"""What many simulations at once cost: suspended side by side, in workers, and in ways that they replace.
+"""What a step of many simulations costs, suspended side by side in one process, beside Gymnasium's own.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only vector``. The scaling over two cores is
-measured in a process of its own that may use two, wherever the others are pinned.
+Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only vector``.
 """
 
 from __future__ import annotations
 
 import gc
-import json
-import os
-import queue
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Callable
-from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 
 from benchmarks.hand_written import TemplateEnv
-from benchmarks.measure import Contender, Section, ratio, side_by_side
-from benchmarks.noop import Alone, Model
+from benchmarks.measure import Contender, Section, now, ratio, side_by_side
+from benchmarks.noop import Alone, AloneBy, Model
 from simenv_marl import single_env, vector_env
 
 SIZES = (1, 64, 1_000, 10_000)
 
-MICROSECONDS = 100.0
-"""What a decision costs the simulation that is spread over two cores."""
-
 
 def ours(number: int, **options: Any) -> Any:
     return vector_env(Alone, Model.left, num_envs=number, **options)
+
+
+def with_argument(number: int) -> Any:
+    return vector_env(AloneBy, Model.left_by, num_envs=number)
 
 
 def over_views(number: int) -> Any:
@@ -45,196 +36,55 @@ def by_hand(number: int) -> Any:
     return SyncVectorEnv([TemplateEnv] * number)
 
 
+KINDS = {
+    "vector_env": ours,
+    "vector_env, with another argument": with_argument,
+    "SyncVectorEnv, our single view": over_views,
+    "SyncVectorEnv, by hand": by_hand,
+}
+
+
 def measure(rounds: int, number: int) -> Section:
     """Measure in so many rounds, with so many decisions of a contender in each."""
-    section = Section("Vector environments", "microseconds per simulation and step, and KiB")
-    rounds = max(3, rounds // 3)
+    section = Section("Vector environments", "microseconds per simulation and step")
     for size in SIZES:
-        _compare(section, size, rounds, number)
-    _compare_others(section, rounds, number)
-    kibibytes = _alone("memory")
-    section.ratio("KiB of memory for each of 10,000 suspended simulations", kibibytes, bar=12, aim=9)
-    speedup, one, two = _alone("cores", cores="0,1")
-    section.ratio(
-        f"two workers on two cores: steps per second / one process, {MICROSECONDS:g} us per decision (above the bar)",
-        speedup,
-        bar=1.7,
-        aim=1.9,
-    )
-    section.time(f"one process, 64 simulations of {MICROSECONDS:g} us", one)
-    section.time(f"two workers on two cores, 64 simulations of {MICROSECONDS:g} us", two)
-    section.remarks.append(
-        "The scaling over two workers is measured in a process pinned to two cores, all else to one."
-    )
+        _compare(section, size, max(3, rounds if size == 64 else rounds // 3), number)
     return section
 
 
 def _compare(section: Section, size: int, rounds: int, number: int) -> None:
     """Ours beside Gymnasium's, over our views and over environments written by hand."""
-    kinds = {"vector_env": ours, "SyncVectorEnv, our single view": over_views, "SyncVectorEnv, by hand": by_hand}
-    envs = {f"{name}, {size:,}": make(size) for name, make in kinds.items()}
+    envs = {name: make(size) for name, make in KINDS.items()}
     times = side_by_side({name: steps(env, size, number) for name, env in envs.items()}, rounds)
-    names = list(envs)
-    limits = (1.5, 1.2) if size == 64 else ()
+    what, hand = f"{size:,} simulations: ours", "SyncVectorEnv, by hand"
+    for name, suffix, limits in (
+        ("vector_env", "", (1.3, 1.15)),
+        ("vector_env, with another argument", ", another argument", (1.4, 1.25)),
+    ):
+        section.ratio(
+            f"{what} / SyncVectorEnv over hand-written ones{suffix}",
+            ratio(times, name, hand),
+            *(limits if size == 64 else ()),
+        )
     section.ratio(
-        f"{size:,} simulations: ours / SyncVectorEnv over hand-written ones", ratio(times, names[0], names[2]), *limits
+        f"{what} / SyncVectorEnv over our single view", ratio(times, "vector_env", "SyncVectorEnv, our single view")
     )
-    section.ratio(f"{size:,} simulations: ours / SyncVectorEnv over our single view", ratio(times, names[0], names[1]))
-    section.times(times)
+    section.times({f"{name}, {size:,}": values for name, values in times.items()})
     for env in envs.values():
         env.close()
-    del envs
+    del envs, env
     gc.collect()
 
 
-def _compare_others(section: Section, rounds: int, number: int) -> None:
-    """Ours beside a thread for each simulation, and beside a process for each."""
-    size = 64
-    threads, alone = Threads(size), ours(size)
-    contenders = {
-        "vector_env, 64, beside threads": steps(alone, size, number),
-        "a thread with queues for each, 64": steps(threads, size, number // 10),
-    }
-    times = side_by_side(contenders, rounds)
-    section.ratio(
-        "64 simulations: a thread with queues for each / ours (above the bar)",
-        1 / ratio(times, *contenders),
-        bar=10,
-        aim=20,
-    )
-    section.times(times)
-    threads.close()
-    alone.close()
-    few = 4
-    processes, in_workers, alone = AsyncVectorEnv([TemplateEnv] * few), ours(few, workers=2), ours(few)
-    contenders = {
-        "vector_env, 4, beside processes": steps(alone, few, number),
-        "vector_env, 4, in two workers": steps(in_workers, few, number // 20),
-        "AsyncVectorEnv, by hand, 4": steps(processes, few, number // 20),
-    }
-    times = side_by_side(contenders, rounds)
-    section.ratio("4 simulations: ours in two workers / AsyncVectorEnv", ratio(times, *list(contenders)[1:]))
-    section.times(times)
-    for env in (processes, in_workers, alone):
-        env.close()
-
-
-def steps(env: Any, size: int, number: int) -> Contender:
+def steps(env: Any, size: int, number: int, clock: Callable[[], float] = now) -> Contender:
     """Steps of a vector environment that does not end."""
     env.reset(seed=0)
     actions, times = np.ones(size, np.int64), max(number // size, 1)
 
     def run() -> float:
-        step, start = env.step, time.perf_counter()
+        step, start = env.step, clock()
         for _ in range(times):
             step(actions)
-        return (time.perf_counter() - start) / (times * size) * 1e6
+        return (clock() - start) / (times * size) * 1e6
 
     return run
-
-
-class Threads:
-    """A thread for each simulation, which takes turns with its user as RLlib's ExternalEnv has it.
-
-    Each has a queue for what it tells and one for its actions, and all share a condition that says that somebody has
-    told something.
-    """
-
-    def __init__(self, number: int) -> None:
-        self.told = threading.Condition()
-        self.queues: list[Any] = [(queue.Queue(), queue.Queue()) for _ in range(number)]
-        self.threads = [threading.Thread(target=self._run, args=pair, daemon=True) for pair in self.queues]
-
-    def _run(self, observed: queue.Queue[Any], decided: queue.Queue[Any]) -> None:
-        model, reward = Model(), 0.0
-        while True:
-            with self.told:
-                observed.put_nowait((model.observe(), reward, False, False, {}))
-                self.told.notify()
-            if decided.get(timeout=60.0) is None:
-                return
-            reward = 1.0
-
-    def reset(self, seed: int) -> None:
-        for thread in self.threads:
-            thread.start()
-        self._observe()
-
-    def _observe(self) -> Any:
-        rows: dict[int, Any] = {}
-        while len(rows) < len(self.queues):
-            with self.told:
-                while not (ready := [n for n, (observed, _) in enumerate(self.queues) if not observed.empty()]):
-                    self.told.wait()
-                for number in ready:
-                    rows[number] = self.queues[number][0].get_nowait()
-        told = [rows[number] for number in range(len(rows))]
-        return np.stack([row[0] for row in told]), np.array([row[1] for row in told])
-
-    def step(self, actions: Any) -> Any:
-        for (_, decided), action in zip(self.queues, actions.tolist(), strict=True):
-            decided.put(action)
-        return self._observe()
-
-    def close(self) -> None:
-        for _, decided in self.queues:
-            decided.put(None)
-        for thread in self.threads:
-            thread.join()
-
-
-# -- in processes of their own --------------------------------------------------------------------
-
-
-class Busy(Alone):
-    """One agent, whose simulation takes its time."""
-
-    def run(self) -> None:
-        model, clock = self.model, time.thread_time_ns
-        while True:
-            until = clock() + int(MICROSECONDS * 1000)
-            while clock() < until:
-                pass
-            model.left()
-
-
-def _alone(what: str, cores: str | None = None) -> Any:
-    """Measure something in a process that has done nothing before."""
-    command = [sys.executable, "-m", "benchmarks.vector", what]
-    if cores is not None:
-        command = ["taskset", "-c", cores, *command]
-    root = Path(__file__).parent.parent
-    done = subprocess.run(command, cwd=root, check=True, capture_output=True, text=True, env=dict(os.environ))
-    return json.loads(done.stdout)
-
-
-def memory(number: int = 10_000) -> float:
-    """KiB of resident memory for each of many suspended simulations."""
-    warm = ours(100)
-    warm.reset(seed=0)
-    gc.collect()
-    before = _resident()
-    env = ours(number)
-    env.reset(seed=0)
-    env.step(np.ones(number, np.int64))
-    gc.collect()
-    return (_resident() - before) / number
-
-
-def _resident() -> float:
-    fields = Path("/proc/self/statm").read_text(encoding="ascii").split()
-    return int(fields[1]) * os.sysconf("SC_PAGE_SIZE") / 1024
-
-
-def cores(size: int = 64, rounds: int = 9) -> tuple[float, float, float]:
-    """How much faster two workers are than one process; and the microseconds of both."""
-    envs = {workers: vector_env(Busy, Model.left, num_envs=size, workers=workers) for workers in (0, 2)}
-    times = side_by_side({str(workers): steps(env, size, size * 20) for workers, env in envs.items()}, rounds)
-    for env in envs.values():
-        env.close()
-    return 1 / ratio(times, "2", "0"), median(times["0"]), median(times["2"])
-
-
-if __name__ == "__main__":
-    functions: dict[str, Callable[[], Any]] = {"memory": memory, "cores": cores}
-    print(json.dumps(functions[sys.argv[1]]()))

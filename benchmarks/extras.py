@@ -1,0 +1,139 @@
+"""What a decision costs beside a clock, a plugin that is not called, and what else is in use in the process.
+
+Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only extras``. Each extra has a process of its
+own: a ``difference`` that was once made stays, and what one environment uses may be paid for by its neighbours.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from benchmarks.measure import Elsewhere, Section, Times, ratio, serve, side_by_side
+from benchmarks.noop import DEFINITION, Alone, Model, Turns, aec, single
+from simenv_marl import aec_env, difference, expose_to_plugins, make_step, single_env
+
+GENERATIONS = 5
+"""How often the processes are started anew, because two that do the same differ by some percent."""
+
+NEIGHBOURS = 1_000
+"""How many other environments, or decision points, make a crowd."""
+
+
+class TimedTurns(Turns):
+    """Two agents, whose simulation has a clock."""
+
+    def time(self) -> float:
+        return 1.0
+
+
+class TimedAlone(Alone):
+    """One agent, whose simulation has a clock."""
+
+    def time(self) -> float:
+        return 1.0
+
+
+@expose_to_plugins
+def idle() -> None:
+    """A function of the model that is not called while it is measured."""
+
+
+def nothing() -> None:
+    """Handle nothing."""
+
+
+def plain() -> dict[str, Any]:
+    return views()
+
+
+def clock() -> dict[str, Any]:
+    return views(TimedTurns, TimedAlone)
+
+
+def plugin() -> dict[str, Any]:
+    return views(plugins=[(nothing, idle, "before")])
+
+
+def elsewhere() -> dict[str, Any]:
+    """A ``difference`` that another environment uses, which stands in mid-episode."""
+    rewarded = make_step(**DEFINITION | {"reward_mapping": difference(lambda model: 1.0)})
+    other = single_env(Alone, {Model.left: rewarded})
+    other.reset(seed=0)
+    return {**views(), "others": other}
+
+
+def environments() -> dict[str, Any]:
+    """Very many other environments that stand in mid-episode."""
+    others = [single_env(Alone, Model.left) for _ in range(NEIGHBOURS)]
+    for env in others:
+        env.reset(seed=0)
+    return {**views(), "others": others}
+
+
+def points() -> dict[str, Any]:
+    """Very many other decision points."""
+    return {**views(), "others": [other_point(number) for number in range(NEIGHBOURS)]}
+
+
+def other_point(number: int) -> Any:
+    def decide(model: Any) -> int:
+        return 0
+
+    decide.__qualname__ = decide.__name__ = f"decide_{number}"
+    return make_step(**DEFINITION)(decide)
+
+
+def views(turns: type = Turns, alone: type = Alone, **options: Any) -> dict[str, Any]:
+    """An AEC and a single environment of the simulation that does nothing."""
+    return {
+        "AEC": aec_env(turns, [Model.left, Model.right], **options),
+        "single": single_env(alone, Model.left, **options),
+    }
+
+
+EXTRAS: dict[str, Callable[[], dict[str, Any]]] = {
+    "without": plain,
+    "with a clock": clock,
+    "with an idle plugin": plugin,
+    "with a difference elsewhere": elsewhere,
+    f"with {NEIGHBOURS:,} other environments": environments,
+    f"with {NEIGHBOURS:,} other decision points": points,
+}
+HELD = ("AEC, with a clock", "AEC, with an idle plugin", "AEC, with a difference elsewhere")
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure in so many rounds, with so many decisions of a contender in each."""
+    times: Times = {}
+    generations = min(GENERATIONS, rounds)
+    for _ in range(generations):
+        processes = {extra: Elsewhere(__name__, extra, str(number)) for extra in EXTRAS}
+        contenders = {
+            f"{view}, {extra}": process.contender(view)
+            for view in ("AEC", "single")
+            for extra, process in processes.items()
+        }
+        for name, values in side_by_side(contenders, max(rounds // generations, 1)).items():
+            times.setdefault(name, []).extend(values)
+        for process in processes.values():
+            process.close()
+    section = Section("What else is in use", "microseconds per decision")
+    for name in times:
+        view, _, extra = name.partition(", ")
+        if extra != "without":
+            limits = (1.08, 1.04) if name in HELD else ()
+            section.ratio(f"{name} / without", ratio(times, name, f"{view}, without"), *limits)
+    section.times(times)
+    return section
+
+
+def main(extra: str, number: int) -> None:
+    """Measure one extra when told to, in this process."""
+    made = EXTRAS[extra]()
+    serve({"AEC": aec(made["AEC"], number), "single": single(made["single"], number)})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))

@@ -1,0 +1,200 @@
+"""What simulations suspended side by side replace, a thread or a process for each; what they hold; what workers bring.
+
+Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only suspended``. Memory and the scaling over
+two cores are measured in processes of their own, the latter in one that may use two, wherever the others are pinned.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AsyncVectorEnv
+
+from benchmarks.hand_written import TemplateEnv
+from benchmarks.measure import ROOT, Section, ratio, side_by_side
+from benchmarks.noop import Alone, Model
+from benchmarks.vector import ours, steps
+from simenv_marl import vector_env
+
+MICROSECONDS = 100.0
+"""What a decision costs the simulation that is spread over two cores."""
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure in so many rounds, with so many decisions of a contender in each."""
+    section = Section("Suspended simulations", "microseconds per simulation and step")
+    rounds = max(3, rounds // 3)
+    _beside_threads(section, rounds, number)
+    _beside_processes(section, rounds, number)
+    section.ratio("KiB of memory for each of 10,000 suspended simulations", _alone("memory"), bar=10, aim=9)
+    speedup, one, two = _alone("cores", str(min(rounds, 9)), cores="0,1")
+    section.ratio(
+        f"two workers on two cores: steps per second / one process, {MICROSECONDS:g} us per decision",
+        speedup,
+        bar=1.7,
+        aim=1.9,
+        at_least=True,
+    )
+    section.time(f"one process, 64 simulations of {MICROSECONDS:g} us", one)
+    section.time(f"two workers on two cores, 64 simulations of {MICROSECONDS:g} us", two)
+    section.remarks.append(
+        "The scaling over two workers is measured in a process pinned to two cores, all else to one."
+    )
+    return section
+
+
+def _beside_threads(section: Section, rounds: int, number: int) -> None:
+    """Ours beside a thread for each simulation."""
+    size = 64
+    threads, alone = Threads(size), ours(size)
+    contenders = {
+        "vector_env, 64, beside threads": steps(alone, size, number),
+        "a thread with queues for each, 64": steps(threads, size, number // 10),
+    }
+    times = side_by_side(contenders, rounds)
+    section.ratio(
+        "64 simulations: a thread with queues for each / ours",
+        ratio(times, *reversed(contenders)),
+        bar=11,
+        aim=20,
+        at_least=True,
+    )
+    section.times(times)
+    threads.close()
+    alone.close()
+
+
+def _beside_processes(section: Section, rounds: int, number: int) -> None:
+    """Ours beside a process for each simulation."""
+    few = 4
+    processes, in_workers, alone = AsyncVectorEnv([TemplateEnv] * few), ours(few, workers=2), ours(few)
+    contenders = {
+        "vector_env, 4, beside processes": steps(alone, few, number, time.perf_counter),
+        "vector_env, 4, in two workers": steps(in_workers, few, number // 20, time.perf_counter),
+        "AsyncVectorEnv, by hand, 4": steps(processes, few, number // 20, time.perf_counter),
+    }
+    times = side_by_side(contenders, rounds)
+    section.ratio("4 simulations: ours in two workers / AsyncVectorEnv", ratio(times, *list(contenders)[1:]))
+    section.times(times)
+    for env in (processes, in_workers, alone):
+        env.close()
+
+
+class Threads:
+    """A thread for each simulation, which takes turns with its user as RLlib's ExternalEnv has it.
+
+    Each has a queue for what it tells and one for its actions, and all share a condition that says that somebody has
+    told something.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.told = threading.Condition()
+        self.queues: list[Any] = [(queue.Queue(), queue.Queue()) for _ in range(number)]
+        self.threads = [threading.Thread(target=self._run, args=pair, daemon=True) for pair in self.queues]
+
+    def _run(self, observed: queue.Queue[Any], decided: queue.Queue[Any]) -> None:
+        model, reward = Model(), 0.0
+        while True:
+            with self.told:
+                observed.put_nowait((model.observe(), reward, False, False, {}))
+                self.told.notify()
+            if decided.get(timeout=60.0) is None:
+                return
+            reward = 1.0
+
+    def reset(self, seed: int) -> None:
+        for thread in self.threads:
+            thread.start()
+        self._observe()
+
+    def _observe(self) -> Any:
+        rows: dict[int, Any] = {}
+        while len(rows) < len(self.queues):
+            with self.told:
+                while not (ready := [n for n, (observed, _) in enumerate(self.queues) if not observed.empty()]):
+                    self.told.wait()
+                for number in ready:
+                    rows[number] = self.queues[number][0].get_nowait()
+        told = [rows[number] for number in range(len(rows))]
+        return np.stack([row[0] for row in told]), np.array([row[1] for row in told])
+
+    def step(self, actions: Any) -> Any:
+        for (_, decided), action in zip(self.queues, actions.tolist(), strict=True):
+            decided.put(action)
+        return self._observe()
+
+    def close(self) -> None:
+        for _, decided in self.queues:
+            decided.put(None)
+        for thread in self.threads:
+            thread.join()
+
+
+# -- in processes of their own --------------------------------------------------------------------
+
+
+class Busy(Alone):
+    """One agent, whose simulation takes its time."""
+
+    def run(self) -> None:
+        model, clock = self.model, time.thread_time_ns
+        while True:
+            until = clock() + int(MICROSECONDS * 1000)
+            while clock() < until:
+                pass
+            model.left()
+
+
+def _alone(what: str, *arguments: str, cores: str | None = None) -> Any:
+    """Measure something in a process that has done nothing before."""
+    command = [sys.executable, "-m", "benchmarks.suspended", what, *arguments]
+    if cores is not None:
+        command = ["taskset", "-c", cores, *command]
+    done = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout)
+
+
+def memory(number: int = 10_000) -> float:
+    """KiB of resident memory for each of many suspended simulations."""
+    warm = ours(100)
+    warm.reset(seed=0)
+    gc.collect()
+    before = _resident()
+    env = ours(number)
+    env.reset(seed=0)
+    env.step(np.ones(number, np.int64))
+    gc.collect()
+    return (_resident() - before) / number
+
+
+def _resident() -> float:
+    fields = Path("/proc/self/statm").read_text(encoding="ascii").split()
+    return int(fields[1]) * os.sysconf("SC_PAGE_SIZE") / 1024
+
+
+def cores(rounds: int, size: int = 64) -> tuple[float, float, float]:
+    """How much faster two workers are than one process; and the microseconds of both."""
+    envs = {workers: vector_env(Busy, Model.left, num_envs=size, workers=workers) for workers in (0, 2)}
+    times = side_by_side(
+        {str(workers): steps(env, size, size * 20, time.perf_counter) for workers, env in envs.items()}, rounds
+    )
+    for env in envs.values():
+        env.close()
+    return ratio(times, "0", "2"), median(times["0"]), median(times["2"])
+
+
+if __name__ == "__main__":
+    functions: dict[str, Callable[..., Any]] = {"memory": memory, "cores": cores}
+    print(json.dumps(functions[sys.argv[1]](*map(int, sys.argv[2:]))))

@@ -1,17 +1,28 @@
 """Lets each page's examples import the models that lie beside it, as if no other page had."""
 
+import gc
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 collect_ignore = ["bakery_env.py"]  # it imports a model that is only found from a page
 
 
 @pytest.fixture(autouse=True)
-def _models_beside_the_page(monkeypatch):
+def _models_beside_the_page(request, monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent)
     for model in ("bakery", "bakery_env", "lake"):
         monkeypatch.delitem(sys.modules, model, raising=False)
     if "joblib" in sys.modules:  # its workers were started by somebody else, and would look for models elsewhere
         sys.modules["joblib"].externals.loky.get_reusable_executor().shutdown(wait=True)
+    before = dict(gymnasium.registry)
+    yield
+    # What a page has decorated would be found by the next page's names, as long as anything keeps it.
+    request.node.dtest.globs.clear()
+    for model in ("bakery", "bakery_env", "lake"):
+        sys.modules.pop(model, None)
+    gymnasium.registry.clear()
+    gymnasium.registry.update(before)
+    gc.collect()

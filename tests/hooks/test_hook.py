@@ -136,17 +136,20 @@ def test_what_a_stack_has_spawned_on_a_hub_of_others_is_refused(stack):
     hook = Hook(Model.decide, f"{__name__}.Model.decide")
     made = hook.stand_in()
     hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
-    here, said = getcurrent(), []
+    here, said, going = getcurrent(), [], threading.Event()
 
     class Spawned(greenlet):
         spawning_greenlet = staticmethod(weakref.ref(here))
 
     def hub():
+        assert going.wait(10)
         spawned = Spawned(lambda: made(Model()))
         return spawned.switch()
 
     thread = threading.Thread(target=lambda: said.append(hub()))  # where no parent is the stack
-    thread.start()
+    with outside_simulation():  # where threads are watched, it would be one that the simulation has started
+        thread.start()
+    going.set()
     thread.join()
     assert "refused in a greenlet that the simulation has spawned" in said[0]
 

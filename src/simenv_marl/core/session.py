@@ -89,11 +89,11 @@ class Session:
         """The simulation's stack, or a new one where that has ended or is another thread's."""
         before = self._driver
         if before is None or not before.usable:
+            if before is not None:
+                before.end()  # first, so that an interrupt leaves no stack that is not known here
             make = DRIVERS[self.plan.options.driver]
             # Generators of the simulation's own must be put in place around each step.
             self._driver = make(plugins=self.plan.plugins, before=before, direct=self._rng is None)
-            if before is not None:
-                before.end()
         assert self._driver is not None
         return self._driver
 

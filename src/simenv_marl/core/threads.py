@@ -184,21 +184,26 @@ class ThreadDriver(BaseDriver):
         return getpid() != self._process
 
     def end(self) -> None:
-        """End the stack, whose job has ended or is lost; wait for its thread to be gone."""
-        if self._ended:
+        """End the stack, whose job has ended or is lost; wait for its thread to be gone.
+
+        Where this is interrupted, it can be called again.
+        """
+        if self._ended and not self._idle:
             return
-        self._forget_stack()
-        thread, self._thread = self._thread, None
+        thread = self._thread
         self._event = self._end = None
-        if thread is None or thread is current_thread() or self.lost() or not self._idle:
-            return
-        self._reply = _END
-        _wake(self._resumed)
-        thread.join(SECONDS_TO_UNWIND)
-        if thread.is_alive():
-            warn_user(
-                f"the thread of a simulation that has ended is still there after {SECONDS_TO_UNWIND} s", ResourceWarning
-            )
+        if self._idle and thread is not None and thread is not current_thread() and not self.lost():
+            self._reply = _END
+            _wake(self._resumed)
+            if thread.ident is not None:  # else it was interrupted before it started
+                thread.join(SECONDS_TO_UNWIND)
+            if thread.is_alive():
+                warn_user(
+                    f"the thread of a simulation that has ended is still there after {SECONDS_TO_UNWIND} s",
+                    ResourceWarning,
+                )
+        self._forget_stack()
+        self._thread = None
 
     def give_up(self) -> None:
         """Leave a job that does not unwind where it is; at its next decision it gets another chance."""

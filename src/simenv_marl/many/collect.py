@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -78,8 +79,7 @@ def simulate_many(
     arguments = (simulation, dict(_checked_policies(policies)), points, collect, int(batch_size), options)
     # Made here also where the work is done elsewhere, so that what cannot work is found out before.
     plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unanswered=True)
-    bar = progress_bar(len(checked)) if progress else None
-    try:
+    with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:
             return _simulate(plan, collect, int(batch_size), checked, bar)
         results: list[Any] = []
@@ -88,9 +88,6 @@ def simulate_many(
             if bar is not None:
                 bar.update(number)
         return results
-    finally:
-        if bar is not None:
-            bar.close()
 
 
 def _simulate_part(
@@ -169,8 +166,7 @@ def collect_episodes(
     _check_collect(collect)
     given = dict(_checked_policies(policies))
     plan, keys = learners_plan(simulation, given, points, options)
-    bar = progress_bar(len(checked)) if progress else None
-    try:
+    with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:
             found = _collect(plan, keys, collect, int(batch_size), checked, bar)
         else:
@@ -181,9 +177,6 @@ def collect_episodes(
                 if bar is not None:
                     bar.update(number)
             found = {place: merged([part[place] for part in parts]) for place in keys.values()}
-    finally:
-        if bar is not None:
-            bar.close()
     return {key: found[place] for key, place in keys.items()}
 
 

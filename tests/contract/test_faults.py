@@ -407,6 +407,7 @@ def deep_down(function, room):
     return down(sys.getrecursionlimit() - here - room)
 
 
+@pytest.mark.usefixtures("_collected")
 @VIEWS
 def test_an_environment_survives_the_end_of_its_users_stack(view):
     decide = decision()
@@ -447,6 +448,7 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
     assert ends >= {"went well", "came to the end"}
 
 
+@pytest.mark.usefixtures("_collected")
 @VIEWS
 @pytest.mark.parametrize("where", ["observation", "reward", "action", "rule", "model", "finally"])
 def test_a_runaway_recursion_surfaces_as_itself(view, where):

@@ -765,6 +765,7 @@ def test_decimal_contexts_and_handled_errors_do_not_leak():
     env.close()
 
 
+@pytest.mark.usefixtures("_collected")
 def test_models_may_recurse_as_deeply_as_without_an_environment():
     decide = decision()
 
@@ -779,6 +780,7 @@ def test_models_may_recurse_as_deeply_as_without_an_environment():
     assert env.unwrapped.simulation.log == [1, 2]
 
 
+@pytest.mark.usefixtures("_collected")
 def test_a_runaway_recursion_of_the_model_is_its_error():
     def runaway():
         return runaway()

@@ -28,8 +28,6 @@ WARM = 0.1
 """The part of the episodes after which nothing may grow any more."""
 MEGABYTES = 8
 """How much more memory may be in use at the end: allocators keep some for later."""
-SETTLED = 5.0
-"""For how many seconds the last threads may take to be freed."""
 
 
 class Failed(Exception):
@@ -152,27 +150,16 @@ def play(driver: str, number: int, draw: random.Random) -> None:
         env.close()
 
 
-def figures(at_most: dict[str, int] | None = None) -> dict[str, int]:
-    """What there is in this process.
-
-    Args:
-        at_most: Earlier figures. A thread's own greenlet is freed a moment after the thread was joined: for so long,
-            but for ``SETTLED`` seconds at most, this waits where there are more of them.
-    """
-    until = time.monotonic() + SETTLED
-    while True:
-        gc.collect()
-        things = gc.get_objects()
-        greenlets = sum(isinstance(thing, greenlet) for thing in things)
-        if at_most is None or greenlets <= at_most["greenlets"] or time.monotonic() > until:
-            break
-        del things
-        time.sleep(0.01)
+def figures() -> dict[str, int]:
+    """What there is in this process."""
+    gc.collect()
+    things = gc.get_objects()
     with open("/proc/self/statm") as statm:
         resident = int(statm.read().split()[1]) * resource.getpagesize()
     return {
         "threads": threading.active_count(),
-        "greenlets": greenlets,
+        # A thread's own, which has no parent, is freed a moment after the thread has ended.
+        "greenlets": sum(isinstance(thing, greenlet) and thing.parent is not None for thing in things),
         "descriptors": len(os.listdir("/proc/self/fd")),
         "objects": len(things),
         "KiB": resident // 1024,
@@ -192,7 +179,7 @@ def main() -> int:
     start = time.perf_counter()
     play(chosen.driver, chosen.episodes - warm, draw)
     seconds = time.perf_counter() - start
-    after = figures(before)
+    after = figures()
     print(f"{chosen.driver}: {chosen.episodes} episodes, {(chosen.episodes - warm) / seconds:.0f} a second")
     for name, value in after.items():
         print(f"  {name:12} {before[name]:>9} after {warm}, {value:>9} after all")

@@ -58,7 +58,7 @@ def test_thousands_of_episodes_that_are_cut_short_leave_nothing():
     soak.play(driver(), 200, draw)
     before = soak.figures()
     soak.play(driver(), 1500, draw)
-    after = soak.figures(before)
+    after = soak.figures()
     for name in ("threads", "greenlets", "descriptors"):
         assert after[name] <= before[name], name
     assert after["objects"] <= before["objects"] + 100

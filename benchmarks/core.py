@@ -13,7 +13,18 @@ from pathlib import Path
 from benchmarks.measure import Report
 from benchmarks.picture import draw
 
-SECTIONS = ("decisions", "extras", "rounds", "plugins", "vector", "suspended", "many", "wolf_sheep", "greenhouse")
+SECTIONS = (
+    "decisions",
+    "stages",
+    "extras",
+    "rounds",
+    "plugins",
+    "vector",
+    "suspended",
+    "many",
+    "wolf_sheep",
+    "greenhouse",
+)
 """In the order in which they run. The greenhouse comes last, and each is imported when it runs, because the
 greenhouse makes a ``difference()``, which stays."""
 

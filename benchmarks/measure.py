@@ -258,7 +258,8 @@ class Report:
 
 def _tables(section: Section) -> Iterator[tuple[str, list[str], list[list[str]]]]:
     """Title, columns and rows of a section's tables."""
-    yield f"{section.title}: ratios", COLUMNS, [figure.row() for figure in section.ratios]
+    if section.ratios:
+        yield f"{section.title}: ratios", COLUMNS, [figure.row() for figure in section.ratios]
     rows = [[what, f"{value:.2f}" if value >= 0.1 else f"{value:.3f}"] for what, value in section.medians.items()]
     yield f"{section.title}: {section.unit}", ["what", "time"], rows
 

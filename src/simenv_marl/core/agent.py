@@ -133,27 +133,12 @@ class Agent:
             # At its end an agent is asked nothing more, and so nothing needs to be legal.
             self.mask, self.choices = self.point.open_mask(), None
 
-    def read_clock(self) -> float | None:
-        """Note the time of a decision that has arisen."""
-        if self.clock is not None:
-            self.now = float(self.clock())
-        return self.now
-
-    def answer(self, action: Any) -> Any:
-        """Turn a checked action into the reply that the simulation gets; let go of what only the decision needed.
-
-        Args:
-            action: A legal action, as ``BoundPoint.checked`` returns it, or ``RULE``, which is its own reply.
-        """
-        self.answered_at = self.now
-        choices = self.choices
-        if choices is not None:
-            self.offered, self.choices = (choices if self.point.recorded else None), None
-            return action if action is RULE else [choices[action]]
-        if action is RULE:
-            return action
-        convert = self.point.convert  # fetched before it is called: calling it at its attribute is slower
-        return convert(action)
+    def choose(self, action: Any) -> Any:
+        """Turn a checked action into the choice that it stands for, in a box, or leave it to ``RULE``."""
+        choices, self.choices = self.choices, None
+        if self.point.recorded:
+            self.offered = choices
+        return action if action is RULE else [choices[action]]
 
     def learn_rule_action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Find out which action a decision of the rule corresponds to.

@@ -158,14 +158,14 @@ class Episode(Ending):
             self._enter(self.step, action)
             return
         try:
+            agent = self.pending
             if action is not RULE:
-                agent = self.pending
                 check = agent.point.check
                 legal = check(action)
                 if legal is ILLEGAL or agent.mask is not None:
                     legal = agent.point.checked(action, agent.name, agent.mask)
                 action = legal
-            self.go_on(self.answer(action))
+            self.go_on(self.answer(agent, action))
         except BaseException as error:
             if self.pending is None:
                 self.fail(error)
@@ -191,30 +191,40 @@ class Episode(Ending):
         finally:
             self._entered = False
 
-    def answer(self, action: Any) -> Any:
-        """Answer the pending decision. The reply is to be given to the driver's ``resume``.
+    def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
+        """Turn an agent's action into the reply that the simulation gets, and let go of what only the decision needed.
 
         Args:
-            action: An action that was checked, or ``RULE``.
+            agent: The agent, whose decision has arisen.
+            action: An action that was checked, or ``RULE``, which is its own reply.
+            turn: Whether it answers the pending decision.
 
         Returns:
-            The reply to the simulation.
+            The reply, for the driver's ``resume``.
 
         Raises:
             BaseException: Whatever a mapping raises. The decision stays pending.
         """
-        agent: Any = self.pending
-        kept = action if type(action) is int else duplicate(action)
+        kept = action if type(action) is int or not turn else duplicate(action)  # before a mapping can change it
         try:
             self.pending = None  # while mappings run, an action of theirs is refused
-            reply = agent.answer(action)
+            if agent.choices is not None:
+                reply = agent.choose(action)
+            elif action is RULE:
+                reply = action
+            else:
+                convert = agent.point.convert  # fetched before it is called: calling it at its attribute is slower
+                reply = convert(action)
         except BaseException:
-            self.pending = agent
+            if turn:
+                self.pending = agent
             raise
-        self.turns = turns = self.turns + 1
-        if turns == self.limit:
-            self.decide = Episode._decide_too_late
-        self._keep(kept)
+        agent.answered_at = agent.now
+        if turn:
+            self.turns = turns = self.turns + 1
+            if turns == self.limit:
+                self.decide = Episode._decide_too_late
+            self._keep(kept)
         return reply
 
     def _keep(self, answer: Any) -> None:
@@ -325,7 +335,7 @@ class Episode(Ending):
         """
         if agent.policy is RULE:
             return RULE
-        agent.settle(agent, args, kwargs, reward=False)
+        agent.settle(agent, args, kwargs, False)
         if agent.deferred:
             self.pending = agent
             return WAIT
@@ -333,7 +343,7 @@ class Episode(Ending):
         self._keep(duplicate(action))
         if action is not RULE:
             action = agent.point.checked(action, agent.name, agent.mask)
-        return agent.answer(action)
+        return self.answer(agent, action, False)
 
     # -- decisions --------------------------------------------------------------------------------
 
@@ -344,8 +354,10 @@ class Episode(Ending):
 
     def _decide_in_round(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Answer a decision of an agent of the user's with its action of the round, or wait for the next round."""
-        agent.restrict(args, kwargs)
-        agent.read_clock()
+        if agent.point.legal is not None:
+            agent.restrict(args, kwargs)
+        if self.clock is not None:
+            agent.now = float(self.clock())
         return self._answer_in_round(agent)
 
     def _answer_in_round(self, agent: Agent) -> Any:
@@ -358,7 +370,7 @@ class Episode(Ending):
         agent.acted = True
         if not agent.decided:  # it was never settled, and acts at once
             agent.settle(agent, agent.arguments(), agent.kwargs, observe=False)
-        return agent.answer(action)
+        return self.answer(agent, action, False)
 
     def _return(self, *, settle: bool = True, truncate: bool = False) -> None:
         """See to the agents that wait for their turns, as a step or a reset returns.

@@ -14,6 +14,7 @@ from greenlet import getcurrent
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate
 
+from ..core.agent import Agent
 from ..core.episode import Episode, When
 from ..core.events import WAIT
 from ..core.plan import Plan
@@ -100,8 +101,11 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
         BaseException: As ``Episode.step``. The other episodes have moved or not, and can be closed.
     """
     here, number, together = getcurrent(), 0, not EVALUATING
+    agents: list[Agent] = []
     for episode in episodes:
-        if episode.pending is None:
+        if episode.pending is not None:
+            agents.append(episode.pending)
+        else:
             blame(episodes.index(episode), error := episode.refusal())
             raise error
         if episode.driver.caller is not here:
@@ -115,7 +119,7 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
             return
         replies: list[Any] = []
         for number, episode in enumerate(episodes):
-            replies.append(episode.answer(actions[number]))
+            replies.append(episode.answer(agents[number], actions[number]))
         for number, episode in enumerate(episodes):
             resume = episode.driver.resume
             events.append(resume(replies[number]))

@@ -217,11 +217,15 @@ class Elsewhere:
             WrongThreadError: It is a decision of a simulation that cannot wait here for its answer.
         """
         hook = self.hook
-        if not EVALUATING and (here := getcurrent()).parent is None and here not in STACKS:  # a thread of the user's
+        here = getcurrent()
+        if here.parent is None and not EVALUATING and here not in STACKS:  # a thread of the user's
             taker = hook.takers.get(None)
         else:
-            taker = hook.taker_at(getcurrent())
-        return hook.rule(*args, **kwargs) if taker is None else taker(args, kwargs)
+            taker = hook.taker_at(here)
+        if taker is not None:
+            return taker(args, kwargs)
+        rule = hook.rule
+        return rule(*args, **kwargs) if kwargs else rule(*args)
 
 
 class Hook(Target):

@@ -1,0 +1,74 @@
+"""Where the time of one AEC decision goes: stage by stage, from the bare switch to ``env.step`` and ``last``.
+
+A section of ``benchmarks.core``. Each row is the time up to and with that stage. The last rows show what a switch of
+stacks adds to what runs after it, which no stage can save: NumPy makes an array more slowly right after a switch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from greenlet import getcurrent, greenlet
+
+from benchmarks.measure import Contender, Section, now, side_by_side
+from benchmarks.noop import Model, Turns
+from simenv_marl import aec_env
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure in so many rounds, with so many decisions of a contender in each."""
+    env: Any = aec_env(Turns, [Model.left, Model.right])
+    env.reset(seed=0)
+    episode = env.unwrapped._session.episode
+    bare, resume, values = _switch(), episode.driver.resume, np.zeros(4, np.float32)
+
+    def arise() -> None:
+        event, args, kwargs = resume(1)
+        event.arise(episode, args, kwargs)
+
+    def array_after_switch() -> None:
+        bare()
+        np.array(values)
+
+    def last() -> None:
+        env.step(1)
+        env.last()
+
+    stages = {
+        "an empty call": lambda: None,
+        "a bare switch there and back": bare,
+        "driver.resume: the model goes on and decides again": lambda: resume(1),
+        "and event.arise: reward, info and observation": arise,
+        "Episode.step: the action checked and mapped, too": lambda: episode.step(1),
+        "env.step": lambda: env.step(1),
+        "env.step and env.last": last,
+        "an array made": lambda: np.array(values),
+        "a bare switch, and an array made after it": array_after_switch,
+    }
+    times = side_by_side({name: _calls(stage, number) for name, stage in stages.items()}, rounds)
+    env.close()
+    section = Section("Stages of an AEC decision, each with those above it", "microseconds per decision")
+    section.times(times)
+    return section
+
+
+def _calls(stage: Any, number: int) -> Contender:
+    def run() -> float:
+        start = now()
+        for _ in range(number):
+            stage()
+        return (now() - start) / number * 1e6
+
+    return run
+
+
+def _switch() -> Any:
+    def answer() -> None:
+        parent: Any = getcurrent().parent
+        while True:
+            parent.switch()
+
+    other = greenlet(answer)
+    other.switch()
+    return other.switch

@@ -18,7 +18,9 @@ import pytest
 
 from simenv_marl import RULE, ReentrancyError, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.core import threads
-from tests.worlds.models import calling, decision, notes, play, script
+from simenv_marl.core.contexts import Claim
+from simenv_marl.core.plan import Plan
+from tests.worlds.models import Script, calling, decision, notes, play, script
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 
@@ -240,6 +242,59 @@ def test_two_threads_at_once_are_refused_and_nothing_has_happened(view, what):
     env.step(3)
     assert env.simulation.log == [1, 3]
     assert env.simulation.episodes == 1
+
+
+@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+@pytest.mark.parametrize("move", ["reset", "step"])
+def test_what_comes_of_a_move_is_read_before_another_thread_may_move(view, move):
+    action = {"choose_0": 1} if view in (parallel_env, joint_env) else 1
+
+    class Drawn(Script):
+        render_modes = ("human",)
+
+        def render(self, mode):
+            pass
+
+    armed, decide = [], decision()
+    base = type(view(calling(decide), decide))
+
+    class Shown(base):
+        def render(self):
+            if armed:
+                armed.clear()
+                with pytest.raises(ReentrancyError, match="another thread"):
+                    in_a_thread(env.step, action)
+
+    main = calling(*[decide] * 4)().main
+    env = Shown(Plan.draw_up(lambda: Drawn(main), decide, {"driver": "thread", "render_mode": "human"}))
+    env.reset()
+    armed.append(True)
+    env.reset() if move == "reset" else env.step(action)
+    assert not armed
+    assert env.simulation.log == [1] * (move == "step")
+    in_a_thread(env.step, action)
+    env.close()
+
+
+@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+def test_a_move_that_is_about_to_begin_lets_no_other_pass(view, monkeypatch):
+    action = {"choose_0": 1} if view in (parallel_env, joint_env) else 1
+    decide = decision()
+    env = view(calling(*[decide] * 4), decide, driver="thread")
+    env.reset()
+    claims, enter = [], Claim.__enter__
+
+    def slowly(claim):
+        claims.append(threading.get_ident())
+        if len(claims) == 1:
+            in_a_thread(env.step, action)
+        enter(claim)
+
+    monkeypatch.setattr(Claim, "__enter__", slowly)
+    env.step(action)
+    assert len(set(claims)) == 2
+    assert env.simulation.log == [1, 1]
+    env.close()
 
 
 def test_many_threads_at_once_get_a_step_each_or_none():

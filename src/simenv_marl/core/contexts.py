@@ -16,7 +16,15 @@ class Claim:
     """Makes sure that one thread at a time uses an environment that any thread may use."""
 
     def __init__(self) -> None:
-        self._lock, self._process = RLock(), os.getpid()
+        # Its ``_is_owned`` is what ``threading.Condition`` asks of a lock.
+        self._lock: Any = RLock()
+        self._process = os.getpid()
+
+    @property
+    def held(self) -> bool:
+        """Whether it is this thread that uses the environment."""
+        owned: bool = self._lock._is_owned()
+        return owned and self._process == os.getpid()
 
     def __enter__(self) -> None:
         if self._process != os.getpid():  # a fork: the thread that may have held the lock is not in this process

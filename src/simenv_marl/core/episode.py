@@ -83,7 +83,7 @@ class Episode(Ending):
         last_time: The time at the latest step of a joint view.
     """
 
-    __slots__ = ("_entered", "_left", "decide", "last_time", "limit", "script", "tape", "when")
+    __slots__ = ("_left", "decide", "last_time", "limit", "script", "tape", "when")
 
     def __init__(
         self,
@@ -113,7 +113,6 @@ class Episode(Ending):
         self.last_time: float | None = None
         self.tape: Any = LOST if plan.unanswered else []
         self.script: deque[Any] | None = deque(script) or None
-        self._entered = False  # whether what is to be around a move is there
         self._left: dict[str, Any] = {}  # the actions of a round that are not used yet
 
     def begin(self) -> None:
@@ -141,11 +140,12 @@ class Episode(Ending):
 
     # -- answers ----------------------------------------------------------------------------------
 
-    def step(self, action: Any) -> None:
+    def step(self, action: Any, entered: bool = False) -> None:
         """Answer the pending decision and run to the next one that the user is to answer, or to the end.
 
         Args:
             action: An action of the pending agent, or ``RULE``.
+            entered: Whether it is made at work already.
 
         Raises:
             InvalidActionError: The action is not legal. Nothing has moved.
@@ -154,7 +154,7 @@ class Episode(Ending):
         """
         if self.pending is None:
             raise self.refusal()
-        if (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None) and not self._entered:
+        if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
             self._enter(self.step, action)
             return
         try:
@@ -173,23 +173,19 @@ class Episode(Ending):
                 self.annotate(error)
             raise
 
-    def _enter(self, move: Callable[[Any], None], given: Any) -> None:
+    def _enter(self, move: Callable[[Any, bool], None], given: Any) -> None:
         """Make a move at work."""
         here = getcurrent()
+        if here is not self.driver.caller or EVALUATING:
+            with self.at_work():
+                move(given, True)
+            return
+        assert self.plugins is not None
+        EVALUATING[here] = self.plugins  # as ``at_work`` does it, where nothing else is to be seen to
         try:
-            self._entered = True
-            if here is not self.driver.caller or EVALUATING:
-                with self.at_work():
-                    move(given)
-                return
-            assert self.plugins is not None
-            EVALUATING[here] = self.plugins  # as ``at_work`` does it, where nothing else is to be seen to
-            try:
-                move(given)
-            finally:
-                EVALUATING.pop(here, None)
+            move(given, True)
         finally:
-            self._entered = False
+            EVALUATING.pop(here, None)
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
         """Turn an agent's action into the reply that the simulation gets, and let go of what only the decision needed.
@@ -246,13 +242,14 @@ class Episode(Ending):
             reply = event.arise(self, args, kwargs)
             event = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
 
-    def play(self, actions: Mapping[str, Any]) -> None:
+    def play(self, actions: Mapping[str, Any], entered: bool = False) -> None:
         """Play a round: answer decisions, each agent's once, up to the first whose action is missing, or to the end.
 
         Then all live agents are settled.
 
         Args:
             actions: By agent: an action, or ``RULE``.
+            entered: Whether it is made at work already.
 
         Raises:
             UnknownAgentError: An action is for an agent that does not live. Nothing has moved.
@@ -263,7 +260,7 @@ class Episode(Ending):
         """
         if self.pending is None:
             raise self.refusal()
-        if (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None) and not self._entered:
+        if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
             self._enter(self.play, actions)
             return
         left = self.check(actions)

@@ -39,6 +39,7 @@ class Session:
         options: What the latest ``reset`` of the environment was given.
         episode: The episode that goes on, or was the latest; None before the first one, and once it was closed.
         np_random_seed: What ``np_random`` was seeded with; -1 where it was set.
+        claim: What keeps other threads away while one uses it; None where only one thread can.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -58,7 +59,7 @@ class Session:
         self._starting = False
         self._held: list[Any] = []  # what is set, and is to be put back
         self._rng = GlobalRandom() if plan.options.global_rng else None
-        self._claim = Claim() if plan.options.driver == "thread" else None
+        self.claim = Claim() if plan.options.driver == "thread" else None
         self._driver: BaseDriver | None = None
         self.simulation: Any = None
         self._hold_patches()
@@ -103,10 +104,11 @@ class Session:
 
     def at_work(self) -> AbstractContextManager[None]:
         """Keep what runs for the environment apart from what runs around it."""
-        return at_work(self.plan.plugins, self._rng, self._claim)
+        return at_work(self.plan.plugins, self._rng, self.claim)
 
-    def _claimed(self) -> AbstractContextManager[None]:
-        return nullcontext() if self._claim is None else self._claim
+    def claimed(self) -> AbstractContextManager[None]:
+        """Keep other threads away."""
+        return nullcontext() if self.claim is None else self.claim
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -140,7 +142,7 @@ class Session:
             NoDecisionError: The simulation ended without one.
             BaseException: What the model raises.
         """
-        with self._claimed():
+        with self.claimed():
             self.end()
             try:
                 self._closed, self._starting = False, True
@@ -176,7 +178,7 @@ class Session:
         driver = self._usable_driver()
         run = self.simulation.run if self._rng is None else self._rng.around(self.simulation.run)
         driver.prepare(run, self.plan.decisions, context)
-        episode = Episode(self.plan, self.simulation, driver, seed, when, (self._rng, self._claim), script)
+        episode = Episode(self.plan, self.simulation, driver, seed, when, (self._rng, self.claim), script)
         try:
             self.episode = episode  # whenever an interrupt comes from now on, its end is seen to
             episode.begin()
@@ -241,7 +243,7 @@ class Session:
             raise refusal("resetting")
         if self.episode is not None:
             try:
-                with self._claimed():
+                with self.claimed():
                     self.episode.close()
             finally:
                 if self.episode.unwound:

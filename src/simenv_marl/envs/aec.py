@@ -61,9 +61,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        self._enter(self._start(seed, options, When.DECISION))
-        if self._shows:
-            self.render()
+        with self._session.claimed():
+            self._enter(self._start(seed, options, When.DECISION))
+            if self._shows:
+                self.render()
 
     def step(self, action: Any) -> None:
         """Answer the decision of ``agent_selection`` and run to the next one.
@@ -76,6 +77,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
+        claim = self._session.claim
+        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
+            with claim:
+                SimulationAECEnv.step(self, action)
+            return
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()

@@ -181,10 +181,11 @@ class SimulationJointEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        episode = self._begin(seed, options, When.RETURN)
-        if self._shows:
-            self.render()
-        return self.joint.observe(episode), self.joint.inform(episode)
+        with self._session.claimed():
+            episode = self._begin(seed, options, When.RETURN)
+            if self._shows:
+                self.render()
+            return self.joint.observe(episode), self.joint.inform(episode)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a round with an action for each agent.
@@ -204,6 +205,10 @@ class SimulationJointEnv(OneAgentView):
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
+        claim = self._session.claim
+        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
+            with claim:
+                return SimulationJointEnv.step(self, action)
         episode, joint = self._running(), self.joint
         episode.play(joint.actions(episode, action))
         if self._shows:

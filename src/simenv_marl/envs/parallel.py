@@ -56,12 +56,13 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        episode = self._start(seed, options, When.RETURN)
-        self.agents = list(episode.agents)
-        if self._shows:
-            self.render()
-        observations, _, _, _, infos = self._results(episode)
-        return observations, infos
+        with self._session.claimed():
+            episode = self._start(seed, options, When.RETURN)
+            self.agents = list(episode.agents)
+            if self._shows:
+                self.render()
+            observations, _, _, _, infos = self._results(episode)
+            return observations, infos
 
     def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
         """Play a round.
@@ -81,6 +82,10 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
+        claim = self._session.claim
+        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
+            with claim:
+                return SimulationParallelEnv.step(self, actions)
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()

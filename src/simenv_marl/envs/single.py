@@ -80,11 +80,12 @@ class SimulationEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        episode = self._begin(seed, options, When.DECISION)
-        self._own = own = episode.agents[self._agent]
-        if self._shows:
-            self.render()
-        return own.observation, own.info
+        with self._session.claimed():
+            episode = self._begin(seed, options, When.DECISION)
+            self._own = own = episode.agents[self._agent]
+            if self._shows:
+                self.render()
+            return own.observation, own.info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision and run to the next one.
@@ -100,6 +101,10 @@ class SimulationEnv(OneAgentView):
             ResetNeededError: There is no episode to go on with.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
+        claim = self._session.claim
+        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
+            with claim:
+                return SimulationEnv.step(self, action)
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()

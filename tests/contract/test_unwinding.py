@@ -13,12 +13,13 @@ from simenv_marl import (
     RULE,
     ClosedError,
     InvalidActionError,
+    ReentrancyError,
     aec_env,
     joint_env,
     parallel_env,
     single_env,
 )
-from tests.worlds.models import Script, alive, calling, decision, script, stacks
+from tests.worlds.models import Script, alive, calling, decision, notes, script, stacks
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 TRIGGERS = pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
@@ -525,3 +526,59 @@ def test_refusals_are_not_errors_of_the_next_episode():
         env.close()
         with pytest.raises(ClosedError, match="call reset"):
             env.step(1)
+
+
+# -- from inside ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+@pytest.mark.parametrize("where", ["stop", "finally"])
+@pytest.mark.parametrize("use", ["close", "reset", "step"])
+def test_an_environment_that_is_used_while_it_unwinds_its_simulation_says_so(view, where, use):
+    action = {"choose_0": 1} if view in (parallel_env, joint_env) else 1
+
+    class Model(Script):
+        def stop(self):
+            if where == "stop":
+                use_it()
+
+    def main(simulation):
+        try:
+            decide()
+            decide()
+        finally:
+            if where == "finally":
+                use_it()
+
+    def use_it():
+        with pytest.raises(ReentrancyError):
+            env.step(action) if use == "step" else getattr(env, use)()
+        used.append(use)
+
+    used, decide = [], decision()
+    env = view(lambda: Model(main), decide)
+    env.reset()
+    env.close()
+    env.reset()
+    env.reset()
+    env.close()
+    assert used == [use] * 3
+    with pytest.raises(ClosedError):
+        env.step(action)
+
+
+@pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])
+@pytest.mark.parametrize("use", ["close", "reset"])
+def test_a_stop_that_passes_that_on_has_it_raised_once(view, use):
+    class Model(Script):
+        def stop(self):
+            getattr(env, use)()
+
+    decide = decision()
+    env = view(lambda: Model(calling(decide, decide)().main), decide)
+    env.reset()
+    with pytest.raises(ReentrancyError) as caught:
+        env.close()
+    assert "decision 1" in notes(caught.value)
+    env.close()
+    env.reset()

@@ -52,6 +52,7 @@ class Ending(Participants):
         begun: Whether the reset of the environment is over.
         over: Whether the episode is over.
         running: Whether the simulation's ``run`` has not ended yet.
+        unwinding: Whether it is being ended.
         failed_in_model: Whether the error that has ended the episode came from the simulation.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
         turns: How many actions the environment's user has given.
@@ -62,7 +63,7 @@ class Ending(Participants):
 
     __slots__ = (
         "_around", "begun", "driver", "failed_in_model", "over", "pending", "plugins", "running", "seed", "terminated",
-        "truncated", "turns",
+        "truncated", "turns", "unwinding",
     )  # fmt: skip
 
     def __init__(
@@ -80,7 +81,7 @@ class Ending(Participants):
         super().__init__(plan, simulation, clock)
         self.driver, self.seed, self.plugins, self._around = driver, seed, plan.plugins, around
         self.pending: Agent | None = None
-        self.over = self.terminated = self.truncated = self.failed_in_model = self.begun = False
+        self.over = self.terminated = self.truncated = self.failed_in_model = self.begun = self.unwinding = False
         self.running = True
         self.turns = 0
 
@@ -97,6 +98,8 @@ class Ending(Participants):
 
     def refusal(self) -> Exception:
         """The error that says why no action can be taken now."""
+        if self.unwinding:
+            return refusal("moving")
         return refusal("over" if self.over else "moving" if self.begun else "resetting")
 
     def fail(self, error: BaseException) -> None:
@@ -126,13 +129,13 @@ class Ending(Participants):
         """Unwind the simulation, if it is suspended; answer none of its decisions.
 
         Raises:
-            ReentrancyError: The simulation is moving.
+            ReentrancyError: The simulation is moving, or is being unwound.
             WrongThreadError: It is suspended in another thread.
             BaseException: What the simulation raises in its ``stop`` or while it unwinds.
         """
         if self.running and self.driver.lost():
             self.running, self.over = False, True
-        if self.pending is None and not self.over:
+        if self.unwinding or (self.pending is None and not self.over):
             raise self.refusal()
         if self.running:
             with self.at_work():
@@ -160,15 +163,19 @@ class Ending(Participants):
         """Unwind the simulation, if it is suspended. Returns what it has raised."""
         if not self.running:
             return []
+        self.unwinding = True
         problems: list[BaseException] = []
         try:
-            stop = getattr(self._simulation, "stop", None)
-            if stop is not None:
-                stop()
-        except BaseException as error:
-            problems.append(error)
-        problems += self.driver.unwind()
-        self.running = False
+            try:
+                stop = getattr(self._simulation, "stop", None)
+                if stop is not None:
+                    stop()
+            except BaseException as error:
+                problems.append(error)
+            problems += self.driver.unwind()
+            self.running = False
+        finally:
+            self.unwinding = False
         if self.driver.given_up is not None:
             warn_user(f"{type(self._simulation).__name__} {self.driver.given_up}.", ResourceWarning)
         return problems

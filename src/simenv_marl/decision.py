@@ -133,7 +133,8 @@ def make_step(
             ``MultiDiscrete`` are legal: 1 or 0 for each.
         removed_by: The model's functions whose calls end an agent's episode: a dotted name, several, or a
             dict from such a name to a callable of that call's arguments that names the agent. Without one
-            it is the agent that ``agent`` names for the call's first argument.
+            it is the agent that ``agent`` names for the call's first argument; where that is None by now, the
+            agent that it named when this first argument decided last.
         goal_space: The space of goals; with it, and the three below, the single view is goal-based.
         achieved_goal_mapping: Called like ``observation_space_mapping``; returns the goal that was achieved.
         desired_goal_mapping: Called likewise; returns the goal that is desired.

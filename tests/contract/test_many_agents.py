@@ -788,6 +788,56 @@ def test_a_bare_name_means_the_agent_of_its_first_argument(removed_by):
     assert [turn.agent for turn in turns] == ["being_0"] * 3
 
 
+class Bound:
+    """A being that cannot be referred to weakly."""
+
+    __slots__ = ("health", "hunt", "number", "whole")
+
+    def __init__(self, number):
+        self.number, self.health, self.whole, self.hunt = number, 0, True, None
+
+    def act(self):
+        return "rule"
+
+    def leave(self):
+        self.whole = False
+
+
+@pytest.mark.parametrize("kind", [Being, Bound])
+def test_a_bare_name_means_who_the_entity_was_where_it_is_named_no_more(kind):
+    def main(simulation):
+        crowd = [kind(number) for number in range(4)]
+        for being in crowd[:3]:
+            being.act()
+        for being in (crowd[1], crowd[3], crowd[1]):  # one was never met, and one has gone already
+            being.whole = False
+            being.leave()
+        crowd[2].number = 7
+        crowd[2].act()
+        crowd[2].whole = False
+        crowd[2].leave()
+        crowd[0].act()
+
+    points = {
+        kind.act: define(
+            agent=lambda being: f"being_{being.number}" if being.whole else None,
+            removed_by=f"{__name__}.Bound.leave" if kind is Bound else f"{HERE}.Being.leave",
+        )
+    }
+    turns = play(aec_env(script(main), points), 1)
+    ends = [turn.agent for turn in turns if turn.terminated]
+    assert ends[:2] == ["being_1", "being_7"]
+    assert [turn.agent for turn in turns if not turn.terminated][-1] == "being_0"
+    env = parallel_env(script(main), points)
+    env.reset()
+    gone = []
+    while env.agents:
+        *_, terminations, _, _ = env.step(dict.fromkeys(env.agents, 1))
+        gone += [agent for agent, over in terminations.items() if over]
+    assert gone[:2] == ["being_1", "being_7"]
+    assert sorted(gone) == ["being_0", "being_1", "being_2", "being_7"]
+
+
 def test_a_bare_name_that_can_never_mean_an_agent_is_warned_of():
     """A method of something else is called on that, and not on an entity."""
     with pytest.warns(UserWarning, match=r"leave.*no Being.*ends no agent.*callable"):

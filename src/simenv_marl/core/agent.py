@@ -84,24 +84,28 @@ class Agent:
 
     # -- the arguments of its decision ------------------------------------------------------------
 
-    def keep(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    def keep(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
         """Keep the arguments of a decision.
 
         The first one of an entity-level point is kept weakly where it can be, so that the model can let go of the
         entity. While its decision is pending, the simulation holds it.
+
+        Returns:
+            Whether the entity is another one than before.
         """
         self.kwargs = kwargs
         if args and self.point.agent is None:
             entity = self.entity
-            if entity is None or entity() is not args[0]:
-                try:
-                    self.entity = ref(args[0])
-                except TypeError:
-                    self.entity, self.rest = None, args
-                    return
-            self.rest = args[1:]
-        else:
-            self.rest = args
+            if entity is not None and entity() is args[0]:
+                self.rest = args[1:]
+                return False
+            try:
+                self.entity, self.rest = ref(args[0]), args[1:]
+            except TypeError:
+                self.entity, self.rest = None, args
+            return True
+        self.rest = args
+        return False
 
     def arguments(self) -> tuple[Any, ...] | None:
         """The positional arguments of the latest decision; None where there was none, or the entity is gone."""

@@ -381,8 +381,8 @@ class Episode(Ending):
         for agent, call in self.announced():
             if agent is not following and agent not in announced:  # of several calls the next one counts
                 announced[agent] = call
-                if settle or not agent.decided:
-                    agent.keep(call, {})
+                if (settle or not agent.decided) and agent.keep(call, {}):
+                    self.remember(agent, call[0])
         if truncate:
             self.finish(truncated=True)
             return

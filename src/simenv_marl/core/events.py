@@ -49,8 +49,8 @@ class Decision(BoundPoint):
                 return agent  # the reply of the rule or of a policy
         if name_agent is None:
             agent.rest, agent.kwargs = args, kwargs  # what it is called on is no entity that a model would let go
-        else:
-            agent.keep(args, kwargs)
+        elif agent.keep(args, kwargs):
+            episode.remember(agent, args[0])
         episode.latest = agent
         decide = episode.decide
         if decide is not None:  # in a round, or when the last step has been taken
@@ -97,20 +97,21 @@ class Removed:
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Give the agents their last rewards and observations while they are whole, and let the call go on."""
         latest = episode.latest
-        for point, name in self._named(args, kwargs):
+        for point, name in self._named(episode, args, kwargs):
             agent = episode.agents.get(name)
             if agent is not None and agent.point is point:
                 episode.finish_agent(agent)
         episode.latest = latest  # after whose decision the model goes on
         return RULE
 
-    def _named(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[tuple[BoundPoint, Any]]:
+    def _named(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[tuple[BoundPoint, Any]]:
         named: list[tuple[BoundPoint, Any]] = []  # a generator could not pass on a StopIteration
         for point, name, owner in self.of:
             if name is not None:
                 named.append((point, name(*args, **kwargs)))
             elif args and (owner is None or isinstance(args[0], owner)):
-                named.append((point, point.agent or point.name_agent(args[0])))
+                found = point.agent or point.name_agent(args[0])
+                named.append((point, episode.named_before(point, args[0]) if found is None else found))
         return named
 
 

@@ -23,7 +23,7 @@ class Participants:
         clock: Returns the simulation's time; None where it has none.
     """
 
-    __slots__ = ("_plan", "_simulation", "agents", "answered", "clock", "ended", "just_ended", "latest")
+    __slots__ = ("_entities", "_plan", "_simulation", "agents", "answered", "clock", "ended", "just_ended", "latest")
 
     def __init__(self, plan: Plan, simulation: Any, clock: Callable[[], float] | None) -> None:
         """Have the agents take part that are known beforehand."""
@@ -35,6 +35,17 @@ class Participants:
         self.ended: dict[str, Agent] = {}
         self.just_ended: list[Agent] = []
         self.latest: Agent | None = None
+        self._entities: dict[tuple[BoundPoint, int], Agent] = {}
+
+    def remember(self, agent: Agent, entity: Any) -> None:
+        """Note which agent an entity is at its point, for ``named_before``."""
+        self._entities[agent.point, id(entity)] = agent
+
+    def named_before(self, point: BoundPoint, entity: Any) -> str | None:
+        """The name of the agent that an entity was when it decided last at a point; None where it was none."""
+        agent = self._entities.get((point, id(entity)))
+        args = None if agent is None else agent.arguments()  # of another one, whose memory this one has, it is gone
+        return agent.name if agent is not None and args and args[0] is entity else None
 
     def agent_for(self, point: BoundPoint, name: Any) -> Agent:
         """Find the agent of a name that decides at a point, or let it join.

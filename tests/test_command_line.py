@@ -127,7 +127,7 @@ def test_points_by_name(capsys):
         (":Walk", "not of the form module:Simulation"),
         ("walkin:Walk", "did you mean walking?"),
         ("walking:Wlak", "did you mean Walk?"),
-        ("walking:Xyz", "it has the simulations Walk, Limping"),
+        ("walking:Xyz", "it has the simulations Walk, Limping\n"),
         ("walking:Walk.nothing", "Walk has no 'nothing'"),
         ("simenv_marl.registraton:x", "did you mean simenv_marl.registration"),
         ("broken_walk:Walk", "needs 'no_such_package_at_all'"),

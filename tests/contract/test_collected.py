@@ -424,6 +424,9 @@ def test_what_is_collected_of_each_simulation():
     assert collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1])[ant].collected is None
     with pytest.raises(OptionValueError, match="collect"):
         collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1], collect=3)
+    for wrong in ({"batch_size": 0}, {"batch_size": 1.5}, {"workers": 1.5}):
+        with pytest.raises(OptionValueError, match=next(iter(wrong))):
+            collect_episodes(script(main), {ant: ones}, points=ant, seeds=[1], **wrong)
 
 
 def test_one_name_at_points_whose_spaces_differ():

@@ -288,3 +288,27 @@ print(generators._State.__name__, np.random.get_state(legacy=False)["state"]["po
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert ran.stdout.split() == ["PortableState", "True"], ran.stderr
+
+
+def test_a_state_is_the_same_by_either_way():
+    def drawn(kind):
+        random.seed(5)
+        np.random.seed(5)
+        random.gauss(0, 1)
+        np.random.standard_normal()
+        state = kind()
+        first = rng._draws(state)
+        state.load()
+        return first, rng._draws(None)
+
+    before = rng.PortableState()
+    before.save()
+    try:
+        found = []
+        for kind in (rng.PortableState, rng._State):
+            first, again = drawn(kind)
+            assert first == again
+            found.append(first)
+        assert found[0] == found[1]
+    finally:
+        before.load()

@@ -23,7 +23,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from tests.worlds.models import decision, notes, play, script
+from tests.worlds.models import calling, decision, notes, play, script
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
@@ -130,6 +130,18 @@ def test_a_mapping_that_raises_surfaces_outside_the_models_own_try():
         env.step(RULE)
     assert "seed 3" in notes(caught.value)
     assert env.simulation.log == []
+
+
+def test_its_note_names_whose_rule_has_decided():
+    inner = decision(counting(), agent="inner_0")
+    outer = decision(lambda: inner(), agent="outer_0", rule_action_mapping=lambda tens: 1 / 0)
+    env = aec_env(calling(outer), [outer, inner])
+    env.reset()
+    env.step(RULE)
+    assert env.agent_selection == "inner_0"
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(1)
+    assert "of 'outer_0'" in notes(caught.value)
 
 
 @pytest.mark.parametrize("wrong", [3, "name"])

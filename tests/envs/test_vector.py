@@ -275,7 +275,9 @@ def test_one_illegal_action_moves_nobody():
         with pytest.raises(InvalidActionError, match=f"^sub-environment {number}: "):
             envs.step(actions)
         assert counts(envs) == [0, 0, 0]
-    for actions in ([1, 1], [1, 1, 1, 1], 1, None, RULE, "111", np.ones((3, 2), int)):
+    with pytest.raises(InvalidActionError, match="RULE is no action in vector environments"):
+        envs.step(RULE)
+    for actions in ([1, 1], [1, 1, 1, 1], 1, None, "111", np.ones((3, 2), int)):
         with pytest.raises(InvalidActionError):
             envs.step(actions)
         assert counts(envs) == [0, 0, 0]

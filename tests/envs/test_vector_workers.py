@@ -540,3 +540,16 @@ def test_modes_are_kept_by_the_workers():
     envs.reset(options={"reset_mask": terminations | truncations})
     envs.step(ONES)
     envs.close()
+
+
+def test_a_worker_that_cannot_be_started_leaves_no_descriptors(monkeypatch):
+    def refuse(process):
+        raise OSError("no more processes")
+
+    gc.collect()
+    before = len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(multiprocessing.get_context(FORK).Process, "start", refuse)
+    with pytest.raises(OSError, match="no more processes") as caught:
+        workers()
+    assert len(os.listdir("/proc/self/fd")) == before
+    del caught

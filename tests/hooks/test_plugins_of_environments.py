@@ -129,6 +129,7 @@ def test_plugins_apply_wherever_the_environments_simulation_is_at_work():
     assert observation.tolist() == [4, 0]
     observation, *_ = env.step(1)
     assert observation.tolist() == [4, 1]
+    assert simulation.word() == "plain"
     assert env.render() == "mine"
     assert env.unwrapped.state().tolist() == [4]
     env.close()

@@ -47,7 +47,7 @@ def test_mixtures_leave_each_decision_to_one_of_their_policies():
 
 def test_mixtures_draw_by_seed_and_decision_alone():
     ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
-    mixture = Mixture([(ones, 0.5), (twos, 0.5)])
+    mixture = Mixture(iter([(ones, 0.5), (twos, 0.5)]))
 
     def actions(seeds, **options):
         policies = {ant: mixture, bee: mixture}

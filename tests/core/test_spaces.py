@@ -119,6 +119,14 @@ def test_observations_are_shared_with_no_model(space, value):
     assert same(kept, value)
 
 
+def test_what_lies_in_other_spaces_is_copied_too():
+    space = spaces.Sequence(BOX)
+    value = (np.ones(2, np.float32),)
+    found = observation_cast(space)(value)
+    assert same(found, value)
+    assert found[0] is not value[0]
+
+
 def leaves(value):
     """What a nested observation consists of."""
     if isinstance(value, dict):

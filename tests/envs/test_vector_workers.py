@@ -553,3 +553,16 @@ def test_a_worker_that_cannot_be_started_leaves_no_descriptors(monkeypatch):
         workers()
     assert len(os.listdir("/proc/self/fd")) == before
     del caught
+
+
+def test_a_script_without_its_guard_is_told_what_it_lacks(tmp_path):
+    path = tmp_path / "script.py"
+    text = SCRIPT.format(context="spawn", end="").replace('if __name__ == "__main__":', "if True:")
+    path.write_text(text, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "src"), str(ROOT)])}
+    done = subprocess.run(
+        [sys.executable, str(path)], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("simenv_marl.errors.WorkerError: ")
+    assert 'if __name__ == "__main__":' in last

@@ -19,6 +19,7 @@ from simenv_marl import (
     save_dataset,
     simulate_many,
 )
+from simenv_marl.many.mixture import _drawn
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, plainly, script
 
@@ -43,6 +44,18 @@ def test_mixtures_leave_each_decision_to_one_of_their_policies():
     assert (found.actions[found.extras["component"] == 0] == 1).all()
     assert (found.actions[found.extras["component"] == 1] == 2).all()
     assert found.by_rule.tolist() == (found.extras["component"] == 2).tolist()
+
+
+def test_a_mixture_draws_by_splitmix():
+    def mixed(state):
+        state = (state + 0x9E3779B97F4A7C15) % 2**64
+        state = (state ^ (state >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+        state = (state ^ (state >> 27)) * 0x94D049BB133111EB % 2**64
+        return state ^ (state >> 31)
+
+    identities = [(0, 0), (7, 3), (2**64 - 1, 9), (2**31, 10**6)]
+    expected = [(mixed((mixed(seed) + turn) % 2**64) >> 11) * 2.0**-53 for seed, turn in identities]
+    assert _drawn(identities).tolist() == expected
 
 
 def test_mixtures_draw_by_seed_and_decision_alone():
@@ -320,6 +333,9 @@ def test_decisions_that_correspond_to_no_action():
     points = beings(rule_action_mapping=lambda decided, being: None if being.number == 2 else 1)
     with pytest.raises(DefinitionError, match=r"in 3 of 9 decisions .*'being_2' at turn 2 of the episode of seed 8"):
         compare_with_rule(script(crowd), {Being.act: ones}, points=points, seeds=[8])
+    ant = decision(rule_action_mapping=lambda decided: None)
+    with pytest.raises(DefinitionError, match=r"in 2 of 2 decisions .* of the episode of seed 8"):
+        compare_with_rule(calling(ant), {ant: ones}, seeds=[8, 9])
 
 
 @pytest.mark.parametrize(

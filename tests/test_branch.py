@@ -1,13 +1,20 @@
 """Branches: exact continuations of an episode that is going on."""
 
+import asyncio
+import mmap
 import os
 import random
+import select
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import textwrap
+import threading
 import time
 import types
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +22,8 @@ import pytest
 from examples.greenhouse_coop.env import GreenhouseSim
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from simenv_marl import (
@@ -34,7 +43,9 @@ from simenv_marl import (
     single_env,
 )
 from simenv_marl.core import episode
+from tests.worlds import filing
 from tests.worlds.copied import Walk
+from tests.worlds.filing import Archive
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import decision, define, script
 
@@ -508,3 +519,192 @@ def test_answers_of_policies_are_replayed_as_they_were_given():
         env.step(1)
     places = branch(env, lambda twin, number: twin.simulation.place, 1, method="replay")
     assert places == [env.simulation.place]
+
+
+# -- what a fork would share ----------------------------------------------------------------------
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**31), st.integers(0, 11))
+def test_files_and_global_generators_go_on_exactly(seed, taken):
+    env = single_env(Archive, filing.choose)
+    env.reset(seed=seed)
+    for _ in range(taken):
+        env.step(3)
+    found = branch(env, filing.left, 2, method="fork")
+    own = filing.left(env)
+    assert found[0] == found[1] == own
+    env.close()
+
+
+class Holding:
+    """Has something open while it runs."""
+
+    def reset(self, seed=None):
+        self.chance, self.log = random.Random(seed), []
+
+    def run(self):
+        with self.open():
+            for _ in range(6):
+                self.log.append((filing.choose(), self.chance.random()))
+
+
+class WithSocket(Holding):
+    what = "a socket"
+
+    @contextmanager
+    def open(self):
+        one, other = socket.socketpair()
+        with one, other:
+            yield
+
+
+class WithPipe(Holding):
+    what = "a pipe"
+
+    @contextmanager
+    def open(self):
+        ends = os.pipe()
+        yield
+        for end in ends:
+            os.close(end)
+
+
+class WithSelector(Holding):
+    what = "an eventpoll"
+
+    def open(self):
+        return closing(select.epoll())
+
+
+class WithChild(Holding):
+    what = "a child process"
+
+    @contextmanager
+    def open(self):
+        with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+            yield
+            child.communicate(b"\n")
+
+
+class WithThread(Holding):
+    what = "a thread"
+
+    @contextmanager
+    def open(self):
+        over = threading.Event()
+        thread = threading.Thread(target=over.wait)
+        thread.start()
+        yield
+        over.set()
+        thread.join()
+
+
+class WithSharedMemory(Holding):
+    what = "shared memory"
+
+    @contextmanager
+    def open(self):
+        with tempfile.TemporaryFile() as file:
+            file.truncate(4096)
+            with mmap.mmap(file.fileno(), 4096):
+                yield
+
+
+@pytest.mark.parametrize(
+    "model", [WithSocket, WithPipe, WithSelector, WithChild, WithThread, WithSharedMemory], ids=lambda it: it.what
+)
+def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(model):
+    env = single_env(model, filing.choose)
+    env.reset(seed=4)
+    env.step(1)
+    with pytest.raises(BranchError, match=f"{model.what}.*replay"):
+        branch(env, filing.left, method="fork")
+    found = branch(env, filing.left, 2)
+    assert found[0] == found[1] == filing.left(env)
+    env.close()
+
+
+def test_what_was_open_before_any_simulation_is_no_obstacle():
+    code = """
+        import os, socket
+        from simenv_marl import branch, single_env
+        from tests.test_branch import Holding
+        from tests.worlds import filing
+        from contextlib import nullcontext
+
+        one, other = socket.socketpair()
+        Holding.open = lambda self: nullcontext()
+        env = single_env(Holding, filing.choose)
+        env.reset(seed=1)
+        assert branch(env, lambda env, number: os.getpid(), method="fork") != [os.getpid()]
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, check=True, timeout=60)
+
+
+class Clerks(Holding):
+    """Tasks of asyncio, woken by time and by each other."""
+
+    async def clerk(self, number):
+        for _ in range(3):
+            await asyncio.sleep(0)
+            self.log.append((number, filing.choose(), self.chance.random()))
+        asyncio.get_running_loop().call_soon_threadsafe(self.log.append, number)
+        await asyncio.sleep(0.002)
+
+    async def all(self):
+        await asyncio.gather(self.clerk(1), self.clerk(2))
+
+    def run(self):
+        asyncio.run(self.all())
+
+
+def test_event_loops_of_asyncio_go_on_in_a_fork():
+    env = single_env(Clerks, filing.choose)
+    env.reset(seed=4)
+    for _ in range(3):
+        found = branch(env, filing.left, 2, method="fork")
+        env.step(3)
+    assert found[0] == found[1] == filing.left(env)
+    env.close()
+
+
+def test_a_duplicate_shares_its_offset_in_a_branch_too(tmp_path):
+    path = tmp_path / "letters"
+    path.write_text("abcdefghij")
+
+    class Model(Holding):
+        def run(self):
+            one = os.open(path, os.O_RDONLY)
+            numbers = [one, os.dup(one), os.open(path, os.O_RDONLY)]
+            for number in numbers * 3:
+                filing.choose()
+                self.log.append(os.read(number, 1).decode())
+            for number in numbers:
+                os.close(number)
+
+    env = single_env(Model, filing.choose)
+    env.reset()
+    for _ in range(4):
+        env.step(1)
+        found = branch(env, filing.left, 2, method="fork")
+    assert found[0] == found[1] == filing.left(env) == list("abacdbefc")
+
+
+def test_the_standard_streams_stay_what_they_are(tmp_path):
+    path = tmp_path / "out"
+    code = """
+        import sys
+        from simenv_marl import branch, single_env
+        from tests.worlds.models import calling, decision
+
+        choose = decision()
+        env = single_env(calling(choose, choose), choose)
+        env.reset()
+        print("parent", flush=True)
+        branch(env, lambda env, number: print("branch", flush=True), method="fork")
+        print("parent", flush=True)
+    """
+    with path.open("w") as out:
+        subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=ROOT, check=True, timeout=60, stdout=out)
+    assert path.read_text().split() == ["parent", "branch", "parent"]

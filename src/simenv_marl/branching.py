@@ -14,6 +14,7 @@ from contextlib import suppress
 from selectors import EVENT_READ, DefaultSelector
 from typing import Any, Final, NoReturn, TypeVar
 
+from .core.forking import Standing
 from .core.processes import pack, pack_error, unpack, unpack_error
 from .envs import View
 from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate
@@ -42,10 +43,12 @@ def branch(
         function: Called with the continuation and its number, from 0 to ``n - 1``. It may do as it likes with it.
         n: How many continuations.
         method: "fork": each in a process of its own, split off with the simulation suspended (POSIX, and
-            ``driver="greenlet"``). They run on as many cores as there are, and their results are pickled. "replay":
+            ``driver="greenlet"``), with open files and global generators of its own. They run on as many cores as
+            there are, and their results are pickled. "replay":
             one after the other in this process, in a new simulation with the same seed that is given the same
             actions; the policies of the option ``policies`` answer as they did, and from there on are asked
-            themselves. None: "fork" where that is possible.
+            themselves. None: "fork" where that is possible. It is not where the simulation has opened what two
+            processes cannot both go on with: threads, sockets, pipes, child processes, shared memory.
         time_limit: After how many seconds a forked continuation is ended.
 
     Returns:
@@ -53,8 +56,8 @@ def branch(
 
     Raises:
         ResetNeededError: There is no episode that could be continued.
-        BranchError: A forked continuation has died, took too long, or has returned what cannot be pickled; or a
-            replay did not come to the same decision.
+        BranchError: A forked continuation has died, took too long, or has returned what cannot be pickled; it could
+            not go on with what the simulation has opened; or a replay did not come to the same decision.
         OptionValueError: There is no such method, or not here.
         BaseException: What the function raises, with a note that says in which continuation.
     """
@@ -72,7 +75,13 @@ def branch(
             ' other threads; use "replay"'
         )
     view.check_pending()
-    if method == "replay" or not forks:
+    found = view.obstacles() if forks and method != "replay" else []
+    if found and method == "fork":
+        raise BranchError(
+            f"a forked process could not go on with {', '.join(found)} that the simulation has opened; use"
+            ' method="replay"'
+        )
+    if found or not forks or method == "replay":
         return [_replayed(env, view, function, number) for number in range(n)]
     return _forked(env, function, n, time_limit)
 
@@ -114,12 +123,12 @@ def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: f
     results: list[Any] = [None] * n
     children: dict[int, _Child] = {}
     at_once = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    started = 0
+    started, standing = 0, Standing()
     with DefaultSelector() as selector:
         try:
             while started < n or children:
                 while started < n and len(children) < at_once:
-                    child = _fork(env, function, started, list(children), time_limit)
+                    child = _fork(standing, env, function, started, list(children), time_limit)
                     children[child.pipe] = child
                     selector.register(child.pipe, EVENT_READ)
                     started += 1
@@ -142,7 +151,9 @@ def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: f
     return results
 
 
-def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: list[int], time_limit: float) -> _Child:
+def _fork(
+    standing: Standing, env: Any, function: Callable[[Any, int], Any], number: int, pipes: list[int], time_limit: float
+) -> _Child:
     for stream in (sys.stdout, sys.stderr):
         with suppress(Exception):  # what is in it would be written by both processes
             stream.flush()
@@ -153,12 +164,14 @@ def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: lis
         warnings.simplefilter("ignore", DeprecationWarning)
         process = os.fork()
     if process == 0:
-        _be_child(env, function, number, [reading, *pipes], writing)
+        _be_child(standing, env, function, number, [reading, *pipes], writing)
     os.close(writing)
     return _Child(number, process, reading, time_limit)
 
 
-def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others: list[int], pipe: int) -> NoReturn:
+def _be_child(
+    standing: Standing, env: Any, function: Callable[[Any, int], Any], number: int, others: list[int], pipe: int
+) -> NoReturn:
     """Answer, and end without anything that ends with the parent."""
     try:
         for other in others:
@@ -167,6 +180,7 @@ def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others
         if torch is not None:
             torch.set_num_threads(1)  # its threads have stayed behind, and would be waited for
         try:
+            standing.resume()
             message = pickle.dumps((True, _answer(function(env, number))))
         except BaseException as error:
             message = pickle.dumps((False, pack_error(error)))

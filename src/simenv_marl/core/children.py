@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from greenlet import getcurrent, greenlet
 
 from ..hooks.hook import Hook
-from ..hooks.stacks import STACKS, Taker, stack_of
+from ..hooks.stacks import LOCK, STACKS, Taker, stack_of
+from .forking import note_what_is_open
 
 if TYPE_CHECKING:
     from .switch import BaseDriver
@@ -27,6 +28,10 @@ class ChildThreads:
 
     def __init__(self) -> None:
         self.driver: BaseDriver | None = None
+
+    def running(self) -> int:
+        """How many of them are running."""
+        return sum(isinstance(thread, ChildThread) and thread.children is self for thread in STACKS.values())
 
 
 class ChildThread:
@@ -87,16 +92,21 @@ def watch_threads() -> None:
     Threads do not know by whom they were started, and inherit nothing that would tell.
     """
     global _start, _watching
-    if not _watching:
-        _watching, _start = True, Thread.start
-        Thread.start = _watched_start  # type: ignore[method-assign]
+    with LOCK:
+        if not _watching:
+            note_what_is_open()
+            _start, Thread.start = Thread.start, _watched_start  # type: ignore[method-assign]
+            _watching = True
 
 
 def unwatch_threads() -> None:
     """Undo it if there are no simulations any more, unless something else has been set meanwhile."""
     global _watching
-    if not STACKS and Thread.start is _watched_start:  # else what has been set meanwhile may well call it
-        Thread.start, _watching = _start, False  # type: ignore[method-assign]
+    if STACKS:
+        return
+    with LOCK:
+        if not STACKS and Thread.start is _watched_start:  # else what has been set meanwhile may well call it
+            Thread.start, _watching = _start, False  # type: ignore[method-assign]
 
 
 def _adopt(thread: Thread, children: ChildThreads) -> Callable[[], None]:

@@ -1,0 +1,107 @@
+"""Simulations that keep files and draw from everybody's generators, as a fork must not disturb."""
+
+from __future__ import annotations
+
+import os
+import random
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.worlds.models import decision
+
+choose = decision()
+
+
+class Archive:
+    """Between two decisions it does something with a file, drawn at random; all that it reads is in its log."""
+
+    def __init__(self, days: int = 12) -> None:
+        self.days = days
+
+    def reset(self, seed: int | None = None) -> None:
+        self.seed, self.log = seed, []
+        self.chance = random.Random(seed)
+        random.seed(seed)
+        np.random.seed(seed)
+        self.files: list[Any] = []
+        self.numbers: list[int] = []
+
+    def run(self) -> None:
+        with tempfile.TemporaryDirectory() as self.folder, tempfile.NamedTemporaryFile("w+") as self.named:
+            Path(self.folder, "0").write_text("".join(f"{line} " * 3 + "\n" for line in range(3000)))
+            try:
+                for _ in range(self.chance.randrange(6)):  # what is found by its name is every branch's alike
+                    self.open()
+                self.numbers.append(os.open(Path(self.folder, "0"), os.O_RDWR))
+                for day in range(self.days):
+                    self.log.append((day, choose(), random.random(), random.gauss(0, 1), np.random.random()))
+                    for _ in range(self.chance.randrange(4)):
+                        self.chance.choice(DEEDS)(self)
+                self.look()
+            finally:
+                while self.files:
+                    self.files.pop().close()
+                while self.numbers:
+                    os.close(self.numbers.pop())
+
+    def open(self) -> None:
+        path = Path(self.folder, str(self.chance.randrange(3)))
+        mode = self.chance.choice(["r+", "a+", "w+", "a", "r"])
+        self.files.append(open(path, mode if path.exists() else "w+"))  # noqa: SIM115 - closed at the end
+
+    def open_nameless(self) -> None:
+        self.files.append(tempfile.TemporaryFile("w+"))  # noqa: SIM115
+
+    def write(self) -> None:
+        file = self.any_file()
+        if file.writable():
+            file.write(f"{self.log[-1]}\n" * self.chance.randrange(1, 400))
+        if self.chance.random() < 0.5:
+            file.flush()
+
+    def read(self) -> None:
+        file = self.any_file()
+        if file.readable():
+            self.log.append((file.read(self.chance.randrange(9000)), file.tell()))
+
+    def seek(self) -> None:
+        file = self.any_file()
+        file.seek(0 if self.chance.random() < 0.5 else self.chance.randrange(2000))
+
+    def duplicate(self) -> None:
+        self.numbers.append(os.dup(self.chance.choice(self.numbers)))
+
+    def use_numbers(self) -> None:
+        for number in self.numbers:
+            self.log.append(os.read(number, self.chance.randrange(50)))
+            if self.chance.random() < 0.3:
+                os.write(number, repr(self.log[0]).encode())
+
+    def forget(self) -> None:
+        if self.files:
+            self.files.pop(self.chance.randrange(len(self.files))).close()
+
+    def look(self) -> None:
+        self.log.append((sorted(os.listdir(self.folder)), Path(self.named.name).exists()))
+
+    def any_file(self) -> Any:
+        return self.chance.choice([*self.files, self.named])
+
+
+DEEDS: list[Callable[[Archive], None]] = [
+    Archive.open_nameless, Archive.write, Archive.write, Archive.read, Archive.read, Archive.seek,
+    Archive.duplicate, Archive.use_numbers, Archive.forget,
+]  # fmt: skip
+
+
+def left(env: Any, number: int = 0) -> list[Any]:
+    """Play what is left of an episode. Returns its log."""
+    over = False
+    while not over:
+        over = env.step(3)[2]
+    log: list[Any] = env.unwrapped.simulation.log
+    return log

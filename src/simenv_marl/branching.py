@@ -48,7 +48,7 @@ def branch(
             one after the other in this process, in a new simulation with the same seed that is given the same
             actions; the policies of the option ``policies`` answer as they did, and from there on are asked
             themselves. None: "fork" where that is possible. It is not where the simulation has opened what two
-            processes cannot both go on with: threads, sockets, pipes, child processes, shared memory.
+            processes cannot both go on with: threads, sockets, child processes.
         time_limit: After how many seconds a forked continuation is ended.
 
     Returns:
@@ -75,15 +75,15 @@ def branch(
             ' other threads; use "replay"'
         )
     view.check_pending()
-    found = view.obstacles() if forks and method != "replay" else []
-    if found and method == "fork":
+    obstacles, loops = view.opened() if forks and method != "replay" else ([], [])
+    if obstacles and method == "fork":
         raise BranchError(
-            f"a forked process could not go on with {', '.join(found)} that the simulation has opened; use"
+            f"a forked process could not go on with {', '.join(obstacles)} that the simulation has opened; use"
             ' method="replay"'
         )
-    if found or not forks or method == "replay":
+    if obstacles or not forks or method == "replay":
         return [_replayed(env, view, function, number) for number in range(n)]
-    return _forked(env, function, n, time_limit)
+    return _forked(Standing(loops), env, function, n, time_limit)
 
 
 # -- by replaying ---------------------------------------------------------------------------------
@@ -119,11 +119,11 @@ class _Child:
         os.waitpid(self.process, 0)
 
 
-def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: float) -> list[Any]:
+def _forked(standing: Standing, env: Any, function: Callable[[Any, int], Any], n: int, time_limit: float) -> list[Any]:
     results: list[Any] = [None] * n
     children: dict[int, _Child] = {}
     at_once = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    started, standing = 0, Standing()
+    started = 0
     with DefaultSelector() as selector:
         try:
             while started < n or children:

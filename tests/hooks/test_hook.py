@@ -10,7 +10,7 @@ import cloudpickle
 import pytest
 from greenlet import getcurrent, greenlet
 
-from simenv_marl.core.children import ChildThreads
+from simenv_marl.core.children import Children
 from simenv_marl.hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
 from simenv_marl.hooks.stacks import EVALUATING, OUTSIDE, STACKS, outside_simulation, stack_of
 
@@ -37,7 +37,7 @@ class Stack:
 
     def __init__(self, plugins=None):
         self.plugins, self.asked, self.hidden = plugins, [], 0
-        self.children = ChildThreads()  # where other tests have left environments, threads are watched
+        self.children = Children()  # where other tests have left environments, threads are watched
 
     def taker(self, hook, here):
         self.asked.append(here)

@@ -1,37 +1,59 @@
-"""The threads that simulations start, in which decisions are refused: the simulation itself goes on meanwhile."""
+"""The threads, processes and sockets that simulations open.
+
+In a thread that a simulation has started decisions are refused: the simulation itself goes on meanwhile. A forked
+process cannot go on with any of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from multiprocessing.process import BaseProcess
+from socket import socket
+from subprocess import Popen
 from threading import Thread, get_ident
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakSet
 
 from greenlet import getcurrent, greenlet
 
 from ..hooks.hook import Hook
 from ..hooks.stacks import LOCK, STACKS, Taker, stack_of
-from .forking import note_what_is_open
 
 if TYPE_CHECKING:
     from .switch import BaseDriver
 
 
-class ChildThreads:
-    """The threads that one simulation has started, over all its episodes.
+class Children:
+    """What one simulation has started and opened, over all its episodes.
 
     Attributes:
         driver: The simulation's; None once its stack has ended, when decision functions run their rule.
     """
 
-    __slots__ = ("driver",)
+    __slots__ = ("_opened", "driver")
 
     def __init__(self) -> None:
         self.driver: BaseDriver | None = None
+        self._opened: WeakSet[Any] = WeakSet()
 
-    def running(self) -> int:
-        """How many of them are running."""
-        return sum(isinstance(thread, ChildThread) and thread.children is self for thread in STACKS.values())
+    def note(self, thing: Any) -> None:
+        """Note what the simulation has opened."""
+        self._opened.add(thing)
+
+    def alive(self) -> dict[Any, str]:
+        """What of all that is not over yet: in some words each, sockets by descriptor."""
+        found: dict[Any, str] = {}
+        for thread in STACKS.values():
+            if isinstance(thread, ChildThread) and thread.children is self:
+                found[thread] = "a thread"
+        for thing in list(self._opened):
+            if isinstance(thing, socket):
+                if thing.fileno() >= 0:
+                    found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
+            elif (thing.returncode if isinstance(thing, Popen) else thing.exitcode) is None:
+                found[thing] = f"a child process ({thing.pid})"
+        return found
 
 
 class ChildThread:
@@ -39,7 +61,7 @@ class ChildThread:
 
     plugins: Any = None
 
-    def __init__(self, children: ChildThreads) -> None:
+    def __init__(self, children: Children) -> None:
         self.children = children
         self._thread = get_ident()
 
@@ -68,48 +90,85 @@ class ChildThread:
                 del STACKS[stack]
 
 
-_start: Any = Thread.start
-_watching = False
+def _starting(start: Any) -> Any:
+    @wraps(start)
+    def watched(self: Thread) -> None:
+        stack = stack_of(getcurrent()) if STACKS else None
+        if stack is None:
+            start(self)
+            return
+        disown = _adopt(self, stack.children)
+        try:
+            start(self)
+        except BaseException:
+            disown()
+            raise
+
+    return watched
 
 
-@wraps(Thread.start)
-def _watched_start(self: Thread) -> None:
-    stack = stack_of(getcurrent()) if STACKS else None
-    if stack is None:
-        _start(self)
-        return
-    disown = _adopt(self, stack.children)
-    try:
-        _start(self)
-    except BaseException:
-        disown()
-        raise
+def _opening(open_it: Any) -> Any:
+    @wraps(open_it)
+    def watched(self: Any, *args: Any, **kwargs: Any) -> None:
+        open_it(self, *args, **kwargs)
+        stack = stack_of(getcurrent()) if STACKS else None
+        if stack is not None:
+            stack.children.note(self)
+
+    return watched
 
 
-def watch_threads() -> None:
-    """Find out, until ``unwatch_threads``, which threads are started by simulations.
+class _Watch:
+    """A method that tells, while there are simulations, what they open: of a class, for the whole process."""
+
+    def __init__(self, owner: type, name: str, watching: Callable[[Any], Any]) -> None:
+        self._owner, self._name, self._watching = owner, name, watching
+        self._before: Any = None
+        self._set: Any = None
+
+    def set(self) -> None:
+        """Set it, unless it is set."""
+        if self._set is None:
+            self._before = vars(self._owner)[self._name]
+            self._set = self._watching(self._before)
+            setattr(self._owner, self._name, self._set)
+
+    def put_back(self) -> None:
+        """Put back what stood there, unless something else has been set meanwhile, which may well call it."""
+        if self._set is not None and vars(self._owner)[self._name] is self._set:
+            setattr(self._owner, self._name, self._before)
+            self._before = self._set = None
+
+
+_WATCHES: Final = (
+    _Watch(Thread, "start", _starting),
+    _Watch(socket, "__init__", _opening),
+    _Watch(Popen, "__init__", _opening),
+    _Watch(BaseProcess, "start", _opening),
+)
+
+
+def watch() -> None:
+    """Find out, until ``unwatch``, what simulations start and open.
 
     Threads do not know by whom they were started, and inherit nothing that would tell.
     """
-    global _start, _watching
     with LOCK:
-        if not _watching:
-            note_what_is_open()
-            _start, Thread.start = Thread.start, _watched_start  # type: ignore[method-assign]
-            _watching = True
+        for watched in _WATCHES:
+            watched.set()
 
 
-def unwatch_threads() -> None:
-    """Undo it if there are no simulations any more, unless something else has been set meanwhile."""
-    global _watching
+def unwatch() -> None:
+    """Undo it if there are no simulations any more."""
     if STACKS:
         return
     with LOCK:
-        if not STACKS and Thread.start is _watched_start:  # else what has been set meanwhile may well call it
-            Thread.start, _watching = _start, False  # type: ignore[method-assign]
+        if not STACKS:
+            for watched in _WATCHES:
+                watched.put_back()
 
 
-def _adopt(thread: Thread, children: ChildThreads) -> Callable[[], None]:
+def _adopt(thread: Thread, children: Children) -> Callable[[], None]:
     """Enter a thread that is about to be started as one of a simulation's. Returns what undoes that."""
     run, own = thread.run, vars(thread).get("run")
 

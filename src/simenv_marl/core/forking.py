@@ -2,24 +2,22 @@
 
 ``fork`` copies the memory, but not what the system keeps for a process: both share the offsets of open files and what
 is written to them; Python seeds its global generator anew; directories for a while are deleted by both. ``Standing``
-puts that right in the forked process. What it cannot put right, ``obstacles`` names.
+puts that right in the forked process.
 """
 
 from __future__ import annotations
 
-import gc
 import os
 import random
-import re
 import shutil
 import signal
 import stat
-import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from gc import get_objects
+from sys import modules
 from typing import Any, Final
 from weakref import finalize
 
@@ -36,12 +34,6 @@ LASTING: Final = (
     | os.O_RDWR
 )
 """The flags of an open file that say how it is read and written, and not how it is found or made."""
-
-BOOT: Final = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC if hasattr(time, "CLOCK_MONOTONIC") else 0)
-"""The clock by which the system says when a process has started."""
-
-SHARED: Final = re.compile(rb"^\S+ rw.s \S+ (.*)$", re.MULTILINE)
-"""A line of ``/proc/self/maps``: what is shared, and can be written."""
 
 Identity = tuple[int, int]
 """Device and inode."""
@@ -68,119 +60,21 @@ def _path(number: int) -> str:
     return f"{DESCRIPTORS}/{number}"
 
 
-# -- what cannot go on ----------------------------------------------------------------------------
-
-
-class _Before:
-    """What was there before there was any simulation, and so is the user's own."""
-
-    open: dict[int, Identity]
-    ticks: float
-    shared: set[str]
-
-    def __init__(self, shared: set[str] | None = None) -> None:
-        self.open = {number: _identity(status) for number, status in _open_now().items()}
-        self.ticks = time.clock_gettime(BOOT) * os.sysconf("SC_CLK_TCK") - 1
-        # Found out only once, for it takes ten times as long as all else.
-        self.shared = _shared_memory() if shared is None else shared
-
-
-_before: _Before | None = None
-
-
-def note_what_is_open() -> None:
-    """Take all that this process has open for the user's own. Called before the first of the simulations is made."""
-    global _before
-    if hasattr(os, "fork"):
-        _before = _Before(None if _before is None else _before.shared)
-
-
-def obstacles() -> list[str]:
-    """What simulations have opened that a forked process could not go on with: each in some words.
-
-    What was opened since the first simulation of those that live was made is taken to be a simulation's.
-    """
-    before, opened = _before or _Before(), _opened_since()
-    found = {number: what for number, status in opened.items() if (what := _shared(number, status))}
-    for loop in _loops(opened):
-        for number in _descriptors_of(loop):
-            found.pop(number, None)
-    processes = _child_processes(before.ticks)
-    return [
-        *(f"{what} (descriptor {number})" for number, what in found.items()),
-        *(f"a child process ({number})" for number in processes),
-        *(f"shared memory ({path})" for path in sorted(_shared_memory() - before.shared)),
-    ]
-
-
-def _opened_since() -> dict[int, os.stat_result]:
-    """What simulations have opened, by descriptor."""
-    before = {} if _before is None else _before.open
-    return {
-        number: status
-        for number, status in _open_now().items()
-        if number >= STANDARD and before.get(number) != _identity(status)
-    }
-
-
-def _shared(number: int, status: os.stat_result) -> str | None:
-    """What a descriptor is, where two processes cannot each have it for itself."""
-    if stat.S_ISSOCK(status.st_mode):
-        return "a socket"
-    if stat.S_ISFIFO(status.st_mode):
-        return "a pipe"
-    if stat.S_IFMT(status.st_mode) == 0:  # has no kind: what the kernel makes for a process, such as an epoll
-        with suppress(OSError):
-            return f"an {os.readlink(f'{DESCRIPTORS}/{number}').removeprefix('anon_inode:').strip('[]')}"
-    return None
-
-
-def _child_processes(since: float) -> list[int]:
-    """The child processes that have started since a number of the system's ticks."""
-    found: list[int] = []
-    with suppress(OSError):  # not everywhere
-        for thread in os.listdir("/proc/self/task"):
-            with suppress(OSError), open(f"/proc/self/task/{thread}/children", encoding="ascii") as children:
-                found += map(int, children.read().split())
-    return [process for process in sorted(found) if _started(process) >= since]
-
-
-def _started(process: int) -> int:
-    try:
-        with open(f"/proc/{process}/stat", "rb") as file:
-            return int(file.read().rpartition(b")")[2].split()[19])
-    except OSError:  # it has just ended
-        return 0
-
-
-def _shared_memory() -> set[str]:
-    """The files that are mapped to memory that processes share, and can be written: device, inode and path."""
-    try:
-        with open("/proc/self/maps", "rb") as maps:
-            return {os.fsdecode(line) for line in SHARED.findall(maps.read())}
-    except OSError:  # not everywhere
-        return set()
-
-
 # -- event loops ----------------------------------------------------------------------------------
 
 
-def _loops(opened: dict[int, os.stat_result]) -> list[Any]:
-    """The event loops of asyncio that simulations have opened; a loop has sockets."""
-    events = sys.modules.get("asyncio.selector_events")
-    if events is None or not any(stat.S_ISSOCK(status.st_mode) for status in opened.values()):
+def loops_on(descriptors: Container[int]) -> list[Any]:
+    """The open event loops of asyncio whose own sockets are among some."""
+    events = modules.get("asyncio.selector_events")
+    if events is None:
         return []
-    kind = events.BaseSelectorEventLoop
-    loops = [thing for thing in gc.get_objects() if isinstance(thing, kind) and not thing.is_closed()]
-    return [loop for loop in loops if opened.keys() >= _descriptors_of(loop)]
+    loops = [thing for thing in get_objects() if isinstance(thing, events.BaseSelectorEventLoop)]
+    return [loop for loop in loops if not loop.is_closed() and loop._ssock.fileno() in descriptors]
 
 
-def _descriptors_of(loop: Any) -> set[int]:
-    """A loop's own descriptors: its selector, and the pair of sockets by which it is woken."""
-    own = {loop._ssock.fileno(), loop._csock.fileno()}
-    if hasattr(loop._selector, "fileno"):
-        own.add(loop._selector.fileno())
-    return own
+def sockets_of(loop: Any) -> set[int]:
+    """The descriptors of the pair of sockets by which a loop is woken."""
+    return {loop._ssock.fileno(), loop._csock.fileno()}
 
 
 def _rebuild(loop: Any) -> None:
@@ -218,6 +112,7 @@ class _Opened:
 class _File:
     """A file, and all the ways in which it is open."""
 
+    identity: Identity
     opened: tuple[_Opened, ...]
 
     @property
@@ -231,12 +126,15 @@ class Standing:
     In a forked process ``resume`` is called before anything else.
     """
 
-    def __init__(self) -> None:
-        """Note what a fork does not take along."""
-        self._python, self._open = random.getstate(), set(_open_now())
+    def __init__(self, loops: Iterable[Any] = ()) -> None:
+        """Note what a fork does not take along.
+
+        Args:
+            loops: The event loops that are to go on, too.
+        """
+        self._python, self._loops = random.getstate(), list(loops)
         self._files = list(_files())
         self._paths = {os.path.realpath(_path(number)) for number in _numbers(self._files)}
-        self._loops = _loops(_opened_since())
 
     def resume(self) -> None:
         """Have this forked process go on by itself.
@@ -247,9 +145,6 @@ class Standing:
         random.setstate(self._python)  # a fork has seeded it
         for file in self._files:
             _reopen(file)
-        if _before is not None:  # by what was opened meanwhile its parent waits for this process
-            new = {number: _identity(status) for number, status in _open_now().items() if number not in self._open}
-            _before.open.update(new)
         for loop in self._loops:
             _rebuild(loop)
         _keep_temporary(self._paths)
@@ -265,14 +160,14 @@ def _files() -> Iterator[_File]:
     for number, status in sorted(_open_now().items()):
         if stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode):
             by_identity.setdefault(_identity(status), []).append(number)
-    for numbers in by_identity.values():
+    for identity, numbers in by_identity.items():
         if numbers[0] >= STANDARD:  # what is a standard stream, too, stays what it is
             left, opened = [number for number in numbers if _has_an_offset(number)], []
             while left:
                 alike = [number for number in left if number == left[0] or _share_an_offset(left[0], number)]
                 opened.append(_Opened(tuple(alike), _flags(left[0]), os.lseek(left[0], 0, os.SEEK_CUR)))
                 left = [number for number in left if number not in alike]
-            yield _File(tuple(opened))
+            yield _File(identity, tuple(opened))
 
 
 def _has_an_offset(number: int) -> bool:
@@ -302,8 +197,19 @@ def _share_an_offset(one: int, other: int) -> bool:
         os.lseek(one, here, os.SEEK_SET)
 
 
+def _is_still(number: int, identity: Identity) -> bool:
+    """Whether a file is still open; one that only a thread has held is not, since no thread comes along."""
+    try:
+        return _identity(os.fstat(number)) == identity
+    except OSError:
+        return False
+
+
 def _reopen(file: _File) -> None:
-    path, copy = _path(file.opened[0].numbers[0]), None
+    numbers = [number for number in _numbers([file]) if _is_still(number, file.identity)]
+    if not numbers:
+        return
+    path, copy = _path(numbers[0]), None
     if file.written:
         copy = tempfile.TemporaryFile()  # noqa: SIM115 - the descriptors below keep it
         shutil.copyfile(path, _path(copy.fileno()))
@@ -311,7 +217,7 @@ def _reopen(file: _File) -> None:
     for opened in file.opened:
         again = os.open(path, opened.flags)
         os.lseek(again, opened.offset, os.SEEK_SET)
-        for number in opened.numbers:
+        for number in set(opened.numbers) & set(numbers):
             os.dup2(again, number, inheritable=os.get_inheritable(number))
         os.close(again)
     if copy is not None:

@@ -23,6 +23,7 @@ from .contexts import Claim, at_work
 from .drivers import DRIVERS, run_job
 from .ending import refusal
 from .episode import LONGEST_TAPE, LOST, Episode, When
+from .forking import loops_on, sockets_of
 from .plan import Plan
 from .rng import GlobalRandom
 from .spaces import same
@@ -221,6 +222,19 @@ class Session:
                 " global_rng=True if it draws from Python's or NumPy's global generators"
             )
         return again
+
+    def opened(self) -> tuple[list[str], list[Any]]:
+        """What the simulation has opened that a forked process would share.
+
+        Returns:
+            What cannot go on there, in some words each; and the event loops of asyncio, which can.
+        """
+        found = {} if self._driver is None else self._driver.children.alive()
+        loops = loops_on(found) if found else []
+        for loop in loops:
+            for number in sockets_of(loop):
+                found.pop(number, None)
+        return list(found.values()), loops
 
     def kept(self) -> dict[str, Any]:
         """What a copy takes over: the latest seed, and the generator."""

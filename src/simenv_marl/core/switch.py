@@ -24,7 +24,7 @@ from ..errors import WrongThreadError, annotate
 from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Taker
 from ..simulation import Sentinel
-from .children import ChildThreads, unwatch_threads, watch_threads
+from .children import Children, unwatch, watch
 from .events import FAILED, FINISHED, REFUSED
 
 
@@ -111,7 +111,7 @@ class BaseDriver:
         self._context: Context | None = None
         self._events: Mapping[Hook, Crossing] = NO_DECISIONS
         self._refused: WrongThreadError | None = None
-        self._children: ChildThreads | None = None
+        self._children: Children | None = None
         if before is not None and before._children is not None:
             self._children = before._children
             self._children.driver = self
@@ -194,10 +194,10 @@ class BaseDriver:
         return not self._ended and self._idle and self.reachable()
 
     @property
-    def children(self) -> ChildThreads:
+    def children(self) -> Children:
         """The threads that the simulation has started, over all its episodes."""
         if self._children is None:
-            self._children = ChildThreads()
+            self._children = Children()
             self._children.driver = self
         return self._children
 
@@ -214,7 +214,7 @@ class BaseDriver:
         """On the stack: it is one of a simulation's from now on."""
         self.stack = stack = getcurrent()
         STACKS[stack] = self
-        watch_threads()
+        watch()
         self.show()
 
     def _work(self) -> Event:
@@ -255,7 +255,7 @@ class BaseDriver:
             STACKS.pop(stack, None)
         if self._children is not None and self._children.driver is self:
             self._children.driver = None
-        unwatch_threads()
+        unwatch()
 
     # -- decisions --------------------------------------------------------------------------------
 

@@ -12,7 +12,6 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.episode import Episode
-from ..core.forking import obstacles
 from ..core.plan import Plan
 from ..core.provenance import describe
 from ..core.session import Session
@@ -228,10 +227,9 @@ class View:
         if self._running().pending is None:
             raise self._session.refusal()
 
-    def obstacles(self) -> list[str]:
-        """What a forked process could not go on with: of this simulation's threads, and of all that is open."""
-        running = self._running().driver.children.running()
-        return [*(["a thread"] if running else []), *obstacles()]
+    def opened(self) -> tuple[list[str], list[Any]]:
+        """What the simulation has opened that a forked process would share: see ``Session.opened``."""
+        return self._session.opened()
 
     def _running(self) -> Episode:
         """The episode that goes on, or has just ended.

@@ -48,7 +48,8 @@ class SimulationInterface(ABC):
       name is going to be called, so that agents can be observed before their first decision.
     - ``time(self)``: its clock, from which ``info["time"]`` and ``info["elapsed"]`` come.
     - ``state(self)``: all that a centralised critic may see, as an array.
-    - ``render(self, mode)``: a picture of the present state, for a ``mode`` out of ``render_modes``.
+    - ``render(self, mode)``: a picture of the present state, for a ``mode`` out of ``render_modes``; with
+      ``render_fps``, how many of them make a second of a film (4).
     """
 
     @abstractmethod

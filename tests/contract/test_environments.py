@@ -21,6 +21,8 @@ from simenv_marl import (
     ViewError,
     aec_env,
     generate_env,
+    joint_env,
+    parallel_env,
     single_env,
 )
 from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, rewards_of, script
@@ -522,6 +524,28 @@ def test_rendering(make):
         make(Rendering, PUMP, render_mode="human")
     with pytest.warns(UserWarning, match="render_mode"):
         assert make(Rendering, PUMP).render() is None
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
+def test_metadata_say_what_clients_ask_for(make):
+    class Slow(Rendering):
+        render_fps = 0.5
+
+    assert make(Rendering, PUMP).metadata["render_fps"] == 4
+    metadata = make(Slow, PUMP, max_steps=3).metadata
+    assert metadata["render_fps"] == 0.5
+    assert metadata.get("is_parallelizable") == {aec_env: False, parallel_env: True}.get(make)
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])
+def test_every_view_has_a_generator(make):
+    env = make(Rendering, PUMP)
+    env.reset(seed=3)
+    assert env.unwrapped.np_random_seed == 3
+    assert env.unwrapped.np_random.random() == np.random.default_rng(3).random()
+    env.unwrapped.np_random = generator = np.random.default_rng(5)
+    assert env.unwrapped.np_random is generator
+    assert env.unwrapped.np_random_seed == -1
 
 
 def test_instances_may_choose_their_render_mode():

@@ -20,6 +20,7 @@ from simenv_marl import (
     RULE,
     TRUNCATED,
     AgentError,
+    ClosedError,
     EpisodeOverError,
     InvalidActionError,
     MaskError,
@@ -432,6 +433,24 @@ def test_a_mask_that_cannot_be_ends_the_episode(mask):
         env.step({"ant_0": 1})
     assert env.agents == []
     with pytest.raises(EpisodeOverError, match="begin the next one"):
+        env.step({})
+
+
+@pytest.mark.parametrize("padded", [False, True])
+@pytest.mark.parametrize("end", [None, TRUNCATED])
+def test_a_step_without_actions_after_the_end_brings_nothing(end, padded):
+    """PettingZoo's own environments do so, and wrappers rely on it."""
+    ant = decision(agent="ant_0")
+    env = parallel_env(calling(ant, ends=end), ant, padded=padded)
+    env.reset()
+    env.step({"ant_0": 1})
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    with pytest.raises(EpisodeOverError, match="begin the next one"):
+        env.step({"ant_0": 1})
+    with pytest.raises(EpisodeOverError, match="begin the next one"):
+        env.step(RULE)
+    env.close()
+    with pytest.raises(ClosedError):
         env.step({})
 
 
@@ -875,9 +894,9 @@ def test_nothing_goes_on_after_max_steps():
     env = parallel_env(endless(ant, bee), [ant, bee], max_steps=1)
     env.reset()
     env.step({"ant_0": 1, "bee_0": 1})
-    for actions in ({}, {"ant_0": 1, "bee_0": 1}):
-        with pytest.raises(EpisodeOverError, match="begin the next one"):
-            env.step(actions)
+    assert not any(env.step({}))
+    with pytest.raises(EpisodeOverError, match="begin the next one"):
+        env.step({"ant_0": 1, "bee_0": 1})
     assert env.simulation.log == [1, 1]
 
 
@@ -924,7 +943,7 @@ def test_steps_out_of_place():
     env.reset()
     env.step({"ant_0": 1, "bee_0": 1})
     with pytest.raises(EpisodeOverError, match="begin the next one"):
-        env.step({})
+        env.step({"ant_0": 1})
     env.reset()
     env.close()
     with pytest.raises(ResetNeededError, match="call reset"):

@@ -35,6 +35,9 @@ from .variant import Variant
 RENDER_MODES = ("ansi", "human", "rgb_array")
 """What a simulation with a method ``render`` is taken to render, unless it has ``render_modes``."""
 
+RENDER_FPS = 4
+"""How many pictures make a second, unless it has ``render_fps``."""
+
 
 class Plan:
     """What an environment is made of.
@@ -44,6 +47,7 @@ class Plan:
         variant: The variant that it is made of; None if it is of none.
         options: Its options.
         render_modes: What its simulation can be rendered as.
+        render_fps: How many of its pictures make a second of a film.
         points: The decision points that do not run their rule.
         active: Those of them that the environment's user answers.
         events: By decision point, what crosses from the simulation when it is called.
@@ -67,13 +71,14 @@ class Plan:
         *,
         unanswered: bool = False,
         rewarded: bool = False,
+        render_fps: float = RENDER_FPS,
         spare: list[Spare] | None = None,
         variant: Variant | None = None,
     ) -> None:
         self.source, self.options, self._named = source, options, named
         self.variant = variant
         self._spare = [] if spare is None else spare  # the simulation that was looked at, until an environment takes it
-        self.render_modes = render_modes
+        self.render_modes, self.render_fps = render_modes, render_fps
         if options.render_mode is not None and options.render_mode not in render_modes:
             raise OptionValueError(
                 f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
@@ -214,8 +219,9 @@ class Plan:
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
         named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
         return cls(
-            source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded, spare=spare, variant=variant
-        )
+            source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded,
+            render_fps=getattr(model, "render_fps", RENDER_FPS), spare=spare, variant=variant,
+        )  # fmt: skip
 
     def __deepcopy__(self, memory: Any) -> Plan:
         return self  # it holds nothing of any environment
@@ -277,7 +283,10 @@ class Plan:
         return self._like(self._named, self.options.amended(options))
 
     def _like(self, named: list[NamedPoint], options: Options) -> Plan:
-        return Plan(self.source, named, options, self.render_modes, spare=self._spare, variant=self.variant)
+        return Plan(
+            self.source, named, options, self.render_modes, render_fps=self.render_fps, spare=self._spare,
+            variant=self.variant,
+        )  # fmt: skip
 
 
 def _remade(source: Any, points: Any, options: dict[str, Any], variant: Variant | None, unanswered: bool) -> Plan:

@@ -12,6 +12,7 @@ from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..errors import InvalidActionError
 from ..simulation import RULE
+from .base import View
 from .padded import presence
 from .pettingzoo_base import AgentsView
 
@@ -46,6 +47,11 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         """
         super().__init__(plan)
         self._clear()
+
+    @staticmethod
+    def metadata_of(plan: Plan) -> dict[str, Any]:
+        """What the environments of a plan say about themselves; the order of its agents is no order of rounds."""
+        return View.metadata_of(plan) | {"is_parallelizable": False}
 
     # -- episodes ---------------------------------------------------------------------------------
 

@@ -67,7 +67,26 @@ class View:
     @staticmethod
     def metadata_of(plan: Plan) -> dict[str, Any]:
         """What the environments of a plan say about themselves."""
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": 4}
+        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": plan.render_fps}
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator that the last given seed has seeded, and from which other seeds are drawn."""
+        return self._session.np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self._session.np_random = generator
+
+    @property
+    def np_random_seed(self) -> int:
+        """What the generator was seeded with; -1 where it was set."""
+        seed = self._session.np_random_seed
+        if seed is None:
+            _ = self._session.np_random  # which a seed is drawn for
+            seed = self._session.np_random_seed
+        assert seed is not None
+        return seed
 
     @property
     def simulation(self) -> Any:

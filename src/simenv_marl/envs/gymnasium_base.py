@@ -52,28 +52,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
     def action_space(self, space: spaces.Space[Any]) -> None:
         self._own_spaces = self._spaces[0], space
 
-    @property
-    def np_random(self) -> np.random.Generator:
-        """The generator that the last given seed has seeded, and from which other seeds are drawn."""
-        return self._session.np_random
-
-    @np_random.setter
-    def np_random(self, generator: np.random.Generator) -> None:
-        self._session.np_random = generator
-
-    _np_random = np_random  # where Gymnasium's checks look
-
-    @property
-    def np_random_seed(self) -> int:
-        """What the generator was seeded with; -1 where it was set."""
-        seed = self._session.np_random_seed
-        if seed is None:
-            _ = self._session.np_random  # which a seed is drawn for
-            seed = self._session.np_random_seed
-        assert seed is not None
-        return seed
-
-    _np_random_seed = np_random_seed
+    _np_random, _np_random_seed = View.np_random, View.np_random_seed  # where Gymnasium's checks look
 
     def _seed_spaces(self, seed: int) -> None:
         for space in self._spaces:

@@ -12,6 +12,7 @@ from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.spaces import duplicate
 from ..simulation import Sentinel
+from .base import View
 from .padded import Results, of_present_agents, pad
 from .pettingzoo_base import AgentsView
 
@@ -38,6 +39,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         """
         super().__init__(plan)
         self.agents = []
+
+    @staticmethod
+    def metadata_of(plan: Plan) -> dict[str, Any]:
+        """What the environments of a plan say about themselves."""
+        return View.metadata_of(plan) | {"is_parallelizable": True}
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -69,7 +75,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
 
         Args:
             actions: By live agent: an action in its action space, or ``RULE``. ``RULE`` in place of the dict:
-                for all of them.
+                for all of them. An empty dict is accepted after the end, too, and nothing comes of it.
 
         Returns:
             By agent: observations, rewards (python floats), terminations, truncations (python bools) and
@@ -89,6 +95,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()
+        if not self.agents and not actions and (episode.terminated or episode.truncated):
+            return {}, {}, {}, {}, {}  # PettingZoo's own do so
         if isinstance(actions, Sentinel):
             actions = dict.fromkeys(episode.agents, actions)
         elif self._padded and isinstance(actions, Mapping):

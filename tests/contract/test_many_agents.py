@@ -788,6 +788,43 @@ def test_a_bare_name_means_the_agent_of_its_first_argument(removed_by):
     assert [turn.agent for turn in turns] == ["being_0"] * 3
 
 
+@pytest.mark.parametrize("view", [aec_env, parallel_env, single_env])
+def test_several_entities_under_one_name_are_warned_of_once(view):
+    """Nothing was said of agents, and so they are taken to be one, whose rewards and differences mix."""
+
+    def main(simulation):
+        for being in simulation.crowd * 2:
+            being.act()
+
+    class Model:
+        def reset(self):
+            self.crowd = [Being(number) for number in range(size)]
+
+        def run(self):
+            main(self)
+
+    def play_through(env):
+        env.reset()
+        if view is aec_env:
+            play(env, 1)
+        elif view is single_env:
+            while not env.step(1)[2]:
+                pass
+        else:
+            while env.agents:
+                env.step(dict.fromkeys(env.agents, 1))
+
+    size = 1
+    env = view(Model, {Being.act: define()})
+    play_through(env)
+    play_through(env)  # another one in each episode is the one of that episode
+    size = 2
+    with pytest.warns(UserWarning, match=r"several objects decide at .*Being\.act as one agent, 'act_0'.*agent="):
+        play_through(env)
+    play_through(env)
+    play_through(view(Model, {Being.act: define(agent="all_of_them")}))
+
+
 class Bound:
     """A being that cannot be referred to weakly."""
 

@@ -53,6 +53,9 @@ MARKET = "tests.foreign.market"
 HERE = __name__
 BID = f"{MARKET}.Trader.bid"
 
+# Traders and brokers decide under one name here: it is about functions, and not about agents.
+pytestmark = pytest.mark.filterwarnings("ignore:several objects decide")
+
 
 @pytest.fixture(autouse=True)
 def _nothing_stays_attached():

@@ -25,6 +25,9 @@ from tests.worlds.models import Script, calling, decision, decisions, define, pl
 
 MARKET = "tests.foreign.market"
 
+# Traders and brokers decide under one name here: it is about functions, and not about agents.
+pytestmark = pytest.mark.filterwarnings("ignore:several objects decide")
+
 
 OPEN: weakref.WeakSet = weakref.WeakSet()
 

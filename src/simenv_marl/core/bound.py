@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
-from ..errors import InvalidActionError, MaskError
+from ..errors import InvalidActionError, MaskError, warn_user
 from . import spaces
 from .points import NamedPoint
 from .spaces import ILLEGAL, MASK
@@ -44,11 +44,13 @@ class BoundPoint:
         recorded: Whether the episode is told what the rule decides.
         told: The event that tells it; None if it is not told.
         settle: Rewards and observes the agents of the point.
+        one_entity: Whether all its decisions are taken to be those of one object, since nothing was said of agents.
     """
 
     __slots__ = (
         "_inverse", "agent", "cast", "check", "convert", "definition", "deliver", "legal", "masked_parts",
-        "name_agent", "observation_mapping", "point", "policy", "recorded", "reward_mapping", "settle", "tells", "told",
+        "name_agent", "observation_mapping", "one_entity", "point", "policy", "recorded", "reward_mapping", "settle",
+        "tells", "told",
     )  # fmt: skip
 
     def __init__(
@@ -81,7 +83,16 @@ class BoundPoint:
         self.masked_parts = _masked_parts(definition.observation_space)
         self.told: Any = None
         self.settle: Any = None
+        self.one_entity = definition.agent is None and named.point.hook.bound
         self.legal = _legal(definition, named.point.name)
+
+    def warn_of_several(self, agent: str) -> None:
+        """Warn that several objects decide under one name; once."""
+        self.one_entity = False
+        warn_user(
+            f"several objects decide at {self.point.name} as one agent, {agent!r}: their rewards and differences mix."
+            " Give its make_step agent=, a callable that names an agent for each; or a string, where one agent is meant"
+        )
 
     # -- observations -----------------------------------------------------------------------------
 

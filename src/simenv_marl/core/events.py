@@ -48,6 +48,8 @@ class Decision(BoundPoint):
             if type(agent) is not Agent:
                 return agent  # the reply of the rule or of a policy
         if name_agent is None:
+            if self.one_entity and args and agent.rest and agent.rest[0] is not args[0]:
+                self.warn_of_several(agent.name)
             agent.rest, agent.kwargs = args, kwargs  # what it is called on is no entity that a model would let go
         elif agent.keep(args, kwargs):
             episode.remember(agent, args[0])

@@ -1,5 +1,6 @@
 """Section 3: make_step, and what it makes of a function."""
 
+import dataclasses
 import functools
 import inspect
 import math
@@ -983,3 +984,50 @@ def test_what_is_defined_in_this_process_stays_as_it_is():
         env.reset()
         env.step(0)
         assert env.unwrapped.simulation.log == [expected]
+
+
+# -- definitions made of definitions --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"action_space": "nonsense"}, "action_space must be a gymnasium space"),
+        ({"observation_space_mapping": 3}, "observation_space_mapping must be callable"),
+        ({"apply": print}, "give one of action_space_mapping, apply and choices"),
+        ({"action_space_mapping": None}, "give one of"),
+        ({"action_space_mapping": {0: 1}}, "must have just the actions"),
+        ({"action_space": spaces.Discrete(3)}, "must have just the actions"),
+        ({"rule_action_mapping": 3}, "rule_action_mapping must be a callable or a dict"),
+        ({"agent": ""}, "agent must be a name"),
+        ({"removed_by": {3: None}}, "removed_by goes from dotted names"),
+        ({"goal_space": spaces.Discrete(3)}, "a goal needs all of its parts"),
+    ],
+)
+def test_a_definition_that_is_replaced_in_part_is_checked_as_a_whole(changes, match):
+    definition = define(action_space=spaces.Discrete(2), action_space_mapping={0: "no", 1: "yes"})
+    with pytest.raises(DefinitionError, match=match):
+        dataclasses.replace(definition, **changes)
+
+
+def test_a_definition_that_is_replaced_in_part_is_made_ready_as_a_whole():
+    definition = define(
+        action_space=spaces.Discrete(2),
+        action_space_mapping={0: "no", 1: "yes"},
+        rule_action_mapping=lambda decided: 1,
+        removed_by="package.module.function",
+    )
+    same = dataclasses.replace(definition, agent="ant_0")
+    assert same.action_space_mapping(1) == "yes"
+    assert same.rule_action_mapping is definition.rule_action_mapping
+    assert same.removed_by == {"package.module.function": None}
+    other = dataclasses.replace(
+        definition,
+        action_space=spaces.Discrete(3),
+        action_space_mapping={0: "no", 1: "yes", 2: "maybe"},
+        rule_action_mapping={"no": 0},
+        removed_by=["package.module.other"],
+    )
+    assert other.action_space_mapping(2) == "maybe"
+    assert other.rule_action_mapping("no", "an argument") == 0
+    assert other.removed_by == {"package.module.other": None}

@@ -58,6 +58,23 @@ class Definition:
     desired_goal_mapping: Mapped | None
     compute_reward: Callable[[Any, Any, Any], Any] | None
 
+    def __post_init__(self) -> None:
+        """Check the definition, and make callables of dicts; for ``dataclasses.replace``, too.
+
+        Raises:
+            DefinitionError: The definition cannot work.
+        """
+        _check_kinds(self)
+        _check_together(self)
+        answers = answers_of(self)
+        if answers is not None:
+            object.__setattr__(self, "action_space_mapping", _look_up(answers, self.action_space))
+        rule_action = self.rule_action_mapping
+        if rule_action is not None:
+            made = _look_back(rule_action) if isinstance(rule_action, Mapping) else _of_decision(rule_action)
+            object.__setattr__(self, "rule_action_mapping", made)
+        object.__setattr__(self, "removed_by", _removals(self.removed_by))
+
     def __call__(self, function: Any) -> Any:
         """Make the decision function.
 
@@ -133,8 +150,7 @@ def make_step(
             ``MultiDiscrete`` are legal: 1 or 0 for each.
         removed_by: The model's functions whose calls end an agent's episode: a dotted name, several, or a
             dict from such a name to a callable of that call's arguments that names the agent. Without one
-            it is the agent that ``agent`` names for the call's first argument; where that is None by now, the
-            agent that it named when this first argument decided last.
+            it is the agent that ``agent`` names for the call's first argument, or has named for it last.
         goal_space: The space of goals; with it, and the three below, the single view is goal-based.
         achieved_goal_mapping: Called like ``observation_space_mapping``; returns the goal that was achieved.
         desired_goal_mapping: Called likewise; returns the goal that is desired.
@@ -148,73 +164,55 @@ def make_step(
     Raises:
         DefinitionError: The definition cannot work.
     """
-    for name, space in (("observation_space", observation_space), ("action_space", action_space)):
-        if not isinstance(space, spaces.Space):
+    return Definition(**locals())  # which checks them
+
+
+REQUIRED = ("observation_space_mapping", "reward_mapping")
+ANSWERS = ("action_space_mapping", "apply", "choices")
+GOALS = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
+"""Arguments of ``make_step``: what must be given, of what one must be given, and all or none."""
+
+
+def _check_kinds(definition: Definition) -> None:
+    """Make sure that each part of a definition is what it is to be."""
+    for name in ("observation_space", "action_space", "goal_space"):
+        space = getattr(definition, name)
+        if not isinstance(space, spaces.Space) and (name != "goal_space" or space is not None):
             raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {space!r}")
-    required = {"observation_space_mapping": observation_space_mapping, "reward_mapping": reward_mapping}
-    goals = {
-        "achieved_goal_mapping": achieved_goal_mapping,
-        "desired_goal_mapping": desired_goal_mapping,
-        "compute_reward": compute_reward,
-    }
-    optional = {"apply": apply, "choices": choices, "action_mask_mapping": action_mask_mapping, **goals}
-    for name, function in (*required.items(), *optional.items()):
-        if not callable(function) and (name in required or function is not None):
+    for name in (*REQUIRED, *ANSWERS[1:], "action_mask_mapping", *GOALS[1:]):
+        function = getattr(definition, name)
+        if not callable(function) and (name in REQUIRED or function is not None):
             raise DefinitionError(f"make_step: {name} must be callable, not {function!r}")
-    answers = {"action_space_mapping": action_space_mapping, "apply": apply, "choices": choices}
-    given = [name for name, value in answers.items() if value is not None]
+    for name in ("action_space_mapping", "rule_action_mapping"):
+        mapping = getattr(definition, name)
+        if mapping is not None and not callable(mapping) and not isinstance(mapping, Mapping):
+            raise DefinitionError(f"make_step: {name} must be a callable or a dict, not {mapping!r}")
+    agent = definition.agent
+    if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
+        raise DefinitionError(f"make_step: agent must be a name or a callable, not {agent!r}")
+
+
+def _check_together(definition: Definition) -> None:
+    """Make sure that the parts of a definition go together."""
+    given = [name for name in ANSWERS if getattr(definition, name) is not None]
     if len(given) != 1:
         raise DefinitionError(
             "make_step: give one of action_space_mapping, apply and choices, to say what an action decides;"
             f" given: {', '.join(given) or 'none'}"
         )
-    if isinstance(action_space_mapping, Mapping):
-        action_space_mapping = _look_up(action_space_mapping, action_space)
-    elif action_space_mapping is not None and not callable(action_space_mapping):
+    space, mask = definition.action_space, definition.action_mask_mapping
+    if mask is not None and not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
         raise DefinitionError(
-            f"make_step: action_space_mapping must be a callable or a dict, not {action_space_mapping!r}"
+            f"make_step: action_mask_mapping needs a Discrete or MultiDiscrete action_space, not {space}"
         )
-    if isinstance(rule_action_mapping, Mapping):
-        rule_action_mapping = _look_back(rule_action_mapping)
-    elif callable(rule_action_mapping):
-        rule_action_mapping = _of_decision(rule_action_mapping)
-    elif rule_action_mapping is not None:
-        raise DefinitionError(
-            f"make_step: rule_action_mapping must be a callable or a dict, not {rule_action_mapping!r}"
-        )
-    if action_mask_mapping is not None and not isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete)):
-        raise DefinitionError(
-            f"make_step: action_mask_mapping needs a Discrete or MultiDiscrete action_space, not {action_space}"
-        )
-    if choices is not None:
-        if not isinstance(action_space, spaces.Discrete) or action_space.start != 0:
-            raise DefinitionError(
-                f"make_step: choices needs a Discrete action_space that starts at 0, not {action_space}"
-            )
-        if action_mask_mapping is not None:
+    if definition.choices is not None:
+        if not isinstance(space, spaces.Discrete) or space.start != 0:
+            raise DefinitionError(f"make_step: choices needs a Discrete action_space that starts at 0, not {space}")
+        if mask is not None:
             raise DefinitionError("make_step: choices makes the mask itself; leave action_mask_mapping out")
-    if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
-        raise DefinitionError(f"make_step: agent must be a name or a callable, not {agent!r}")
-    if goal_space is not None and not isinstance(goal_space, spaces.Space):
-        raise DefinitionError(f"make_step: goal_space must be a gymnasium space, not {goal_space!r}")
-    missing = [name for name, value in {"goal_space": goal_space, **goals}.items() if value is None]
-    if 0 < len(missing) < 4:
+    missing = [name for name in GOALS if getattr(definition, name) is None]
+    if 0 < len(missing) < len(GOALS):
         raise DefinitionError(f"make_step: a goal needs all of its parts; missing: {', '.join(missing)}")
-    return Definition(
-        observation_space=observation_space,
-        observation_space_mapping=observation_space_mapping,
-        action_space=action_space,
-        reward_mapping=reward_mapping,
-        action_space_mapping=action_space_mapping,
-        apply=apply,
-        choices=choices,
-        rule_action_mapping=rule_action_mapping,
-        agent=agent,
-        action_mask_mapping=action_mask_mapping,
-        removed_by=_removals(removed_by),
-        goal_space=goal_space,
-        **goals,
-    )
 
 
 def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
@@ -243,10 +241,19 @@ def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[
     return dict(answers).__getitem__
 
 
+def answers_of(definition: Definition) -> Mapping[Any, Any] | None:
+    """From action to decision, where ``action_space_mapping`` is a dict, or was one; None where it is a callable."""
+    mapping: Any = definition.action_space_mapping
+    if isinstance(mapping, Mapping):
+        return mapping
+    held = getattr(mapping, "__self__", None)
+    return held if isinstance(held, dict) and mapping.__name__ == "__getitem__" else None
+
+
 def inverse(definition: Definition) -> dict[Any, Any] | None:
     """From decision to action, where ``action_space_mapping`` is a dict that can be read backwards."""
-    answers = getattr(definition.action_space_mapping, "__self__", None)
-    if not isinstance(answers, dict):
+    answers = answers_of(definition)
+    if answers is None:
         return None
     try:
         actions = {decision: action for action, decision in answers.items()}

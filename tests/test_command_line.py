@@ -113,10 +113,13 @@ def test_inspection(capsys):
 
 
 def test_points_by_name(capsys):
-    name = "examples.greenhouse_coop.model.Greenhouse.choose_water_amount"
+    greenhouse = "examples.greenhouse_coop.model.Greenhouse."
     assert main(["check", "walking:Walk", "--points", "walking.Walk.chose"]) == 2
     assert "chose" in capsys.readouterr().err
-    assert main(["inspect", "examples.greenhouse_coop.env:GreenhouseSim", "--points", name]) == 2
+    inspect = ["inspect", "examples.greenhouse_coop.env:GreenhouseSim", "--points"]
+    assert main([*inspect, f"{greenhouse}choose_water_amount"]) == 0
+    assert "choose_water_amount" in capsys.readouterr().out
+    assert main([*inspect, f"{greenhouse}__init__"]) == 2
     assert "has no definition" in capsys.readouterr().err
 
 

@@ -13,6 +13,7 @@ from simenv_marl import (
     RULE,
     TRUNCATED,
     AgentError,
+    DefinitionError,
     InvalidActionError,
     OptionValueError,
     SimEnvError,
@@ -546,6 +547,42 @@ def test_every_view_has_a_generator(make):
     env.unwrapped.np_random = generator = np.random.default_rng(5)
     assert env.unwrapped.np_random is generator
     assert env.unwrapped.np_random_seed == -1
+
+
+class Hut:
+    """What its simulation has a definition for."""
+
+    def heat(self):
+        return "rule"
+
+    def air(self):
+        return "rule"
+
+
+class Housed:
+    points = {  # noqa: RUF012 - as simulations have it
+        f"{__name__}.Hut.heat": define(agent="heat_0", action_space_mapping=lambda action: 10 * action),
+        f"{__name__}.Hut.air": define(agent="air_0"),
+    }
+
+    def reset(self):
+        self.log = []
+
+    def run(self):
+        self.log += [Hut().heat(), Hut().air()]
+
+
+@pytest.mark.parametrize("named", [f"{__name__}.Hut.heat", Hut.heat, [Hut.heat]])
+@pytest.mark.parametrize("source", [Housed, lambda: Housed(), Housed()], ids=["class", "factory", "instance"])
+def test_a_point_that_is_named_has_the_simulations_own_definition(source, named):
+    env = single_env(source, named)
+    env.reset()
+    env.step(3)
+    assert env.simulation.log == [30, "rule"]
+    env.close()
+    with pytest.raises(DefinitionError, match="has no definition here"):
+        single_env(Housed, Rendering.render)
+    assert single_env(source, {Hut.heat: define(agent="mine")}).unwrapped is not None
 
 
 def test_instances_may_choose_their_render_mode():

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from sys import modules
-from types import FunctionType
+from types import FunctionType, MappingProxyType
 from typing import Any, Final
 
 from ..decision import DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
@@ -74,7 +74,8 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
 
     Args:
         points: A dotted name, a function, a list of these, or a dict from these to definitions. None: the
-            attribute ``points`` of the simulation, else all decorated points.
+            attribute ``points`` of the simulation, else all decorated points. What is named without a definition has
+            the one that the simulation's ``points`` gives it, if they do.
         simulation: The simulation.
         required: Whether all decorated points are meant where none is named, and not none.
 
@@ -86,8 +87,9 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
         DefinitionError: A function has no definition, or a dict's value is none.
         PatchError: A function was named that cannot be made a decision point.
     """
+    own = getattr(simulation, "points", None)
     if points is None:
-        points = getattr(simulation, "points", None)
+        points = own
     if points is None:
         if not required:
             return []
@@ -97,7 +99,8 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
     else:
         if isinstance(points, str) or not hasattr(points, "__iter__"):
             points = [points]
-        found = [find_point(key) for key in points]
+        given = {locate(key)[0]: definition for key, definition in own.items()} if isinstance(own, Mapping) else {}
+        found = [find_point(key, given=given) for key in points]
     if not found:
         raise UnknownPointError("no decision point was named: points is empty")
     for number, named in enumerate(found):
@@ -106,12 +109,15 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
     return found
 
 
-def find_point(key: Any, definition: Any = None) -> NamedPoint:
+def find_point(
+    key: Any, definition: Any = None, *, given: Mapping[DecisionPoint, Definition] = MappingProxyType({})
+) -> NamedPoint:
     """Find one decision point.
 
     Args:
         key: A dotted name, or a function.
         definition: The definition to use it with. None: the one that it was decorated with.
+        given: Those that a simulation gives to what was not decorated, or was and is named.
 
     Returns:
         The point, with the definition.
@@ -122,7 +128,7 @@ def find_point(key: Any, definition: Any = None) -> NamedPoint:
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {definition!r}")
     point, own = locate(key)
-    definition = definition or own or point.definition
+    definition = definition or own or given.get(point) or point.definition
     if definition is None:
         raise DefinitionError(
             f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="

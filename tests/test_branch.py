@@ -604,7 +604,7 @@ def test_what_a_fork_could_not_go_on_with_is_replayed_or_named(model):
     env.close()
 
 
-def test_what_somebody_else_has_opened_is_no_obstacle():
+def test_what_the_user_has_opened_is_no_obstacle():
     code = """
         import os, socket, subprocess, sys
         from simenv_marl import branch, single_env

@@ -1,4 +1,4 @@
-"""Simulations that keep files and draw from everybody's generators, as a fork must not disturb."""
+"""A simulation that keeps files and draws from the global generators, which a fork must not disturb."""
 
 from __future__ import annotations
 

@@ -117,6 +117,7 @@ class _File:
 
     @property
     def written(self) -> bool:
+        """Whether it can be written by one of them."""
         return any(opened.flags & os.O_ACCMODE != os.O_RDONLY for opened in self.opened)
 
 

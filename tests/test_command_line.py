@@ -52,6 +52,10 @@ class Limping(Walk):
     points = {choose: definition(lambda walk: [walk.place + walk.random.random()])}
 
 
+class Boot:
+    """What walkers wear."""
+
+
 number = 3
 '''
 

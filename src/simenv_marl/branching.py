@@ -44,11 +44,11 @@ def branch(
         n: How many continuations.
         method: "fork": each in a process of its own, split off with the simulation suspended (POSIX, and
             ``driver="greenlet"``), with open files and global generators of its own. They run on as many cores as
-            there are, and their results are pickled. "replay":
-            one after the other in this process, in a new simulation with the same seed that is given the same
-            actions; the policies of the option ``policies`` answer as they did, and from there on are asked
-            themselves. None: "fork" where that is possible. It is not where the simulation has opened what two
-            processes cannot both go on with: threads, sockets, child processes.
+            there are, and their results are pickled. "replay": one after the other in this process, in a new
+            simulation with the same seed that is given the same actions; the policies of the option ``policies``
+            answer as they did, and from there on are asked themselves. None: "fork" where that is possible. It is
+            not where the simulation has opened what two processes cannot both go on with: threads, sockets, child
+            processes.
         time_limit: After how many seconds a forked continuation is ended.
 
     Returns:
@@ -83,7 +83,7 @@ def branch(
         )
     if obstacles or not forks or method == "replay":
         return [_replayed(env, view, function, number) for number in range(n)]
-    return _forked(Standing(loops), env, function, n, time_limit)
+    return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
 
 
 # -- by replaying ---------------------------------------------------------------------------------
@@ -119,7 +119,17 @@ class _Child:
         os.waitpid(self.process, 0)
 
 
-def _forked(standing: Standing, env: Any, function: Callable[[Any, int], Any], n: int, time_limit: float) -> list[Any]:
+def _standing_alike(function: Callable[[Any, int], Result], standing: Standing) -> Callable[[Any, int], Result]:
+    """A function for forked processes, each of which first puts right what it shares with its parent."""
+
+    def resume_and_call(env: Any, number: int) -> Result:
+        standing.resume()
+        return function(env, number)
+
+    return resume_and_call
+
+
+def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: float) -> list[Any]:
     results: list[Any] = [None] * n
     children: dict[int, _Child] = {}
     at_once = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -128,7 +138,7 @@ def _forked(standing: Standing, env: Any, function: Callable[[Any, int], Any], n
         try:
             while started < n or children:
                 while started < n and len(children) < at_once:
-                    child = _fork(standing, env, function, started, list(children), time_limit)
+                    child = _fork(env, function, started, list(children), time_limit)
                     children[child.pipe] = child
                     selector.register(child.pipe, EVENT_READ)
                     started += 1
@@ -151,9 +161,7 @@ def _forked(standing: Standing, env: Any, function: Callable[[Any, int], Any], n
     return results
 
 
-def _fork(
-    standing: Standing, env: Any, function: Callable[[Any, int], Any], number: int, pipes: list[int], time_limit: float
-) -> _Child:
+def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: list[int], time_limit: float) -> _Child:
     for stream in (sys.stdout, sys.stderr):
         with suppress(Exception):  # what is in it would be written by both processes
             stream.flush()
@@ -164,14 +172,12 @@ def _fork(
         warnings.simplefilter("ignore", DeprecationWarning)
         process = os.fork()
     if process == 0:
-        _be_child(standing, env, function, number, [reading, *pipes], writing)
+        _be_child(env, function, number, [reading, *pipes], writing)
     os.close(writing)
     return _Child(number, process, reading, time_limit)
 
 
-def _be_child(
-    standing: Standing, env: Any, function: Callable[[Any, int], Any], number: int, others: list[int], pipe: int
-) -> NoReturn:
+def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others: list[int], pipe: int) -> NoReturn:
     """Answer, and end without anything that ends with the parent."""
     try:
         for other in others:
@@ -180,7 +186,6 @@ def _be_child(
         if torch is not None:
             torch.set_num_threads(1)  # its threads have stayed behind, and would be waited for
         try:
-            standing.resume()
             message = pickle.dumps((True, _answer(function(env, number))))
         except BaseException as error:
             message = pickle.dumps((False, pack_error(error)))

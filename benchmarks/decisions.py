@@ -143,8 +143,8 @@ def dead_steps(env: Any, agents: int) -> Contender:
     return prepare_and_run
 
 
-def round_trip(number: int) -> Contender:
-    """To a bare greenlet and back."""
+def bare_greenlet() -> Any:
+    """A greenlet that only switches back; it waits for its first ``switch``."""
 
     def loop_in_greenlet() -> None:
         back = getcurrent().parent.switch
@@ -153,6 +153,12 @@ def round_trip(number: int) -> Contender:
 
     other = greenlet(loop_in_greenlet)
     other.switch()
+    return other
+
+
+def round_trip(number: int) -> Contender:
+    """To a bare greenlet and back."""
+    other = bare_greenlet()
 
     def loop(number: int) -> None:
         switch = other.switch

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from greenlet import getcurrent, greenlet
 
-from benchmarks.measure import Contender, Section, now, side_by_side
+from benchmarks.decisions import bare_greenlet
+from benchmarks.measure import Contender, Section, side_by_side, timed
 from benchmarks.noop import Model, Turns
 from simenv_marl import aec_env
 
@@ -21,7 +21,7 @@ def measure(rounds: int, number: int) -> Section:
     env: Any = aec_env(Turns, [Model.left, Model.right])
     env.reset(seed=0)
     episode = env.unwrapped._session.episode
-    bare, resume, values = _switch(), episode.driver.resume, np.zeros(4, np.float32)
+    bare, resume, values = bare_greenlet().switch, episode.driver.resume, np.zeros(4, np.float32)
 
     def arise() -> None:
         event, args, kwargs = resume(1)
@@ -54,21 +54,8 @@ def measure(rounds: int, number: int) -> Section:
 
 
 def _calls(stage: Any, number: int) -> Contender:
-    def run() -> float:
-        start = now()
+    def loop(number: int) -> None:
         for _ in range(number):
             stage()
-        return (now() - start) / number * 1e6
 
-    return run
-
-
-def _switch() -> Any:
-    def answer() -> None:
-        parent: Any = getcurrent().parent
-        while True:
-            parent.switch()
-
-    other = greenlet(answer)
-    other.switch()
-    return other.switch
+    return timed(loop, number)

@@ -4,11 +4,8 @@ import gc
 import sys
 from pathlib import Path
 
-import gymnasium
-import pettingzoo
 import pytest
-
-REGISTRIES = (gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry)
+from tests.worlds.undone import registries_put_back
 
 collect_ignore = ["bakery_env.py"]  # it imports a model that is only found from a page
 
@@ -21,13 +18,10 @@ def _models_beside_the_page(request, monkeypatch):
     gc.collect()  # what the collection after the page before has unwound
     if "joblib" in sys.modules:  # its workers were started by somebody else, and would look for models elsewhere
         sys.modules["joblib"].externals.loky.get_reusable_executor().shutdown(wait=True)
-    before = [dict(registry) for registry in REGISTRIES]
-    yield
+    with registries_put_back():
+        yield
     # What a page has decorated would be found by the next page's names, as long as anything keeps it.
     request.node.dtest.globs.clear()
     for model in ("bakery", "bakery_env", "lake"):
         sys.modules.pop(model, None)
-    for registry, entries in zip(REGISTRIES, before, strict=True):
-        registry.clear()
-        registry.update(entries)
     gc.collect()

@@ -21,6 +21,7 @@ from tests.worlds import many_registered
 from tests.worlds.many_registered import Boat, Voyage
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, define, play, script
+from tests.worlds.undone import registries_put_back
 
 ROOT = Path(__file__).parent.parent
 SINGLES = ["manyregistered/SteerBoat-v0", "manyregistered/SetSail-v0"]
@@ -30,12 +31,8 @@ JOINT, COOP = "manyregistered/Joint-v0", "manyregistered/coop_v0"
 @pytest.fixture
 def register():
     """Registers simulations until the test is over."""
-    registries = (gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry)
-    before = [dict(registry) for registry in registries]
-    yield register_simulation
-    for registry, entries in zip(registries, before, strict=True):
-        registry.clear()
-        registry.update(entries)
+    with registries_put_back():
+        yield register_simulation
 
 
 def made(identity, **options):

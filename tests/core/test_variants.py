@@ -31,6 +31,7 @@ from simenv_marl import (
     single_env,
 )
 from tests.worlds.models import Script, decision, define, play
+from tests.worlds.undone import registries_put_back
 
 
 class Farm(Script):
@@ -115,9 +116,7 @@ def test_variants_of_one_model_run_side_by_side():
 
 
 def test_registered_by_their_name():
-    registries = (gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry)
-    before = [dict(registry) for registry in registries]
-    try:
+    with registries_put_back():
         ids = register_simulation(DEAR) + register_simulation(replace(LARGE, options={"max_steps": 1}), name="other")
         assert ids[:3] == ["dear/Sow-v0", "dear/Joint-v0", "dear/coop_v0"]
         env = gymnasium.make(ids[0]).unwrapped
@@ -128,10 +127,6 @@ def test_registered_by_their_name():
         assert len(play(env, 1)) == 3
         with pytest.raises(OptionValueError, match="name="):
             register_simulation(Farm, POINTS)
-    finally:
-        for registry, entries in zip(registries, before, strict=True):
-            registry.clear()
-            registry.update(entries)
 
 
 def test_simulations_and_factories_of_every_kind():

@@ -33,6 +33,7 @@ from simenv_marl import (
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.worlds.models import calling, define, notes, play
+from tests.worlds.undone import left_as_they_were
 
 MARKET = "tests.foreign.market"
 HERE = __name__
@@ -40,18 +41,9 @@ HERE = __name__
 
 @pytest.fixture(autouse=True)
 def _nothing_stays_attached():
-    places = [market, shop, Trader, Broker, Junior, Dealer, Cautious, Greenhouse, Heated]
-    before = [held(place) for place in places]
-    yield
-    assert attached_handlers() == []
-    for place, then in zip(places, before, strict=True):
-        now = held(place)
-        assert now.keys() == then.keys()
-        assert all(now[name] is then[name] for name in now)
-
-
-def held(place):
-    return {name: value for name, value in vars(place).items() if not name.startswith("__") or name == "__init__"}
+    with left_as_they_were(market, shop, Trader, Broker, Junior, Dealer, Cautious, Greenhouse, Heated):
+        yield
+        assert attached_handlers() == []
 
 
 class Greenhouse:

@@ -48,6 +48,7 @@ from tests.worlds.models import (
     script,
     stacks,
 )
+from tests.worlds.undone import held, left_as_they_were
 
 MARKET = "tests.foreign.market"
 HERE = __name__
@@ -59,19 +60,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:several objects decide")
 
 @pytest.fixture(autouse=True)
 def _nothing_stays_attached():
-    places = [market, shop, Trader, Broker, House]
-    before = [held(place) for place in places]
-    yield
-    gc.collect()
-    assert attached_handlers() == []
-    for place, then in zip(places, before, strict=True):
-        now = held(place)
-        assert now.keys() == then.keys()
-        assert all(now[name] is then[name] for name in now)
-
-
-def held(place):
-    return {name: value for name, value in vars(place).items() if not name.startswith("__") or name == "__init__"}
+    with left_as_they_were(market, shop, Trader, Broker, House):
+        yield
+        gc.collect()
+        assert attached_handlers() == []
 
 
 class House:

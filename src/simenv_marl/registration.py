@@ -67,7 +67,7 @@ def register_simulation(
     where = {"recipe": f"{name}-v{version}", "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
     _RECIPES[where["recipe"]] = _Recipe(simulation, points, options, flatten, [b.point.name for b in plan.active])
     made: list[str] = []
-    named = [binding.point.name for binding in plan.active if binding.agent is not None]
+    named = [b.point.name for b in plan.active if b.agent is not None or plan.one_agent is not None]
     for point, title in zip(named, _titles(named), strict=True):
         made.append(f"{name}/{title}-v{version}")
         _register_gymnasium(made[-1], "make_single", **where, point=point)
@@ -131,8 +131,9 @@ def make_single_vector(recipe: str, module: str, point: str, num_envs: int = 1, 
 def _single_options(known: _Recipe, point: str, options: dict[str, Any]) -> dict[str, Any]:
     merged = {**known.options, **options}
     merged["policies"] = {other: RULE for other in known.active if other != point} | dict(merged.get("policies") or {})
-    for name in ("possible_agents", "undeclared"):
-        merged.pop(name, None)
+    if merged.get("agent") is None:
+        for name in ("possible_agents", "undeclared"):
+            merged.pop(name, None)
     return merged
 
 

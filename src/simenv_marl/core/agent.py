@@ -37,6 +37,8 @@ class Agent:
         ended: Whether its episode has ended before the simulation's.
         present: Whether its latest info comes from an observation; False where there was nothing to observe.
         reward: The reward of its action before, as of its latest decision or its end.
+        asked: Whether its user was asked for an action in this episode, where forced moves are skipped.
+        carried: The rewards of its forced moves that its next reward is to tell.
         observation: Its latest observation, cast to its space; None before its first observation.
         handed_out: The observation that a view has given away, and which is not to be given away again.
         info: The info of its latest decision, a dict of its own.
@@ -52,8 +54,8 @@ class Agent:
     """
 
     __slots__ = (
-        "acted", "answered_at", "choices", "clock", "decided", "deferred", "ended", "entity", "group",
-        "handed_out", "info", "kwargs", "mask", "memory", "name", "notes", "now", "observation", "offered",
+        "acted", "answered_at", "asked", "carried", "choices", "clock", "decided", "deferred", "ended", "entity",
+        "group", "handed_out", "info", "kwargs", "mask", "memory", "name", "notes", "now", "observation", "offered",
         "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again", "told",
     )  # fmt: skip
 
@@ -64,8 +66,8 @@ class Agent:
         self.settle = self.settle_again = point.settle
         self.plugins = plugins
         self.deferred = isinstance(policy, DeferredPolicy)
-        self.decided = self.acted = self.ended = self.present = self.told = False
-        self.reward = 0.0
+        self.asked = self.decided = self.acted = self.ended = self.present = self.told = False
+        self.reward = self.carried = 0.0
         self.observation: Any = None
         self.handed_out: Any = None
         self.info: dict[str, Any] = {}

@@ -54,7 +54,13 @@ class BoundPoint:
     )  # fmt: skip
 
     def __init__(
-        self, named: NamedPoint, agent: str | None, policy: Policy | None = None, *, recorded: bool = False
+        self,
+        named: NamedPoint,
+        agent: str | None,
+        policy: Policy | None = None,
+        *,
+        recorded: bool = False,
+        clips: bool = False,
     ) -> None:
         """Bind a decision point.
 
@@ -63,6 +69,7 @@ class BoundPoint:
             agent: The name of its agent; None where it has many.
             policy: The policy that answers all its decisions.
             recorded: Whether decisions are recorded, those of the rule included.
+            clips: Whether actions of ``Box`` spaces are clipped.
         """
         definition = named.definition
         self.point: DecisionPoint = named.point
@@ -73,7 +80,7 @@ class BoundPoint:
         self.reward_mapping: Any = definition.reward_mapping
         self.observation_mapping: Any = definition.observation_space_mapping
         self.cast = spaces.observation_cast(definition.observation_space)
-        self.check = spaces.action_check(definition.action_space)
+        self.check = (spaces.clipping_check if clips else spaces.action_check)(definition.action_space)
         self.convert: Any = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
         self.tells = definition.rule_action_mapping is not None

@@ -46,9 +46,10 @@ from .bound import BoundPoint
 from .contexts import Claim
 from .ending import Ending
 from .events import WAIT
+from .participants import listed
 from .plan import Plan
 from .rng import GlobalRandom
-from .spaces import ILLEGAL, duplicate
+from .spaces import ILLEGAL, duplicate, only_choice
 from .switch import BaseDriver
 
 LONGEST_TAPE: Final = 200_000
@@ -81,9 +82,11 @@ class Episode(Ending):
         tape: What the user and policies have answered, in that order; ``LOST`` where that is not kept.
         script: The answers of another episode's tape that are yet to be given again; None where there were none.
         last_time: The time at the latest step of a joint view.
+        skips: Whether decisions with one legal action are answered with it.
+        unheard: Whether the episode has ended so before its user was asked, who learns of it at the first step.
     """
 
-    __slots__ = ("_left", "decide", "last_time", "limit", "script", "tape", "when")
+    __slots__ = ("_left", "decide", "last_time", "limit", "script", "skips", "tape", "unheard", "when")
 
     def __init__(
         self,
@@ -109,7 +112,12 @@ class Episode(Ending):
         super().__init__(plan, simulation, driver, seed, around)
         self.when = when
         self.limit = plan.options.max_steps or -1  # never reached
-        self.decide: Callable[..., Any] | None = Episode._decide_in_round if when is When.RETURN else None
+        self.skips, self.unheard = plan.options.skip_forced, False
+        self.decide: Callable[..., Any] | None = None
+        if when is When.RETURN:
+            self.decide = Episode._decide_in_round
+        elif self.skips:
+            self.decide = Episode._decide_unless_forced
         self.last_time: float | None = None
         self.tape: Any = LOST if plan.unanswered else []
         self.script: deque[Any] | None = deque(script) or None
@@ -127,16 +135,28 @@ class Episode(Ending):
                 self.go_on(None)
                 if not self.over and self.when is not When.NEVER:
                     self._return(settle=self.when is When.RETURN)
+                    for agent in self.agents.values() if self.skips else ():
+                        agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # a reset tells no rewards
                 self.begun = True
             except BaseException as error:
                 self.fail(error)
                 raise
         if self.pending is None and not self._plan.unanswered:
-            raise NoDecisionError(
-                f"{type(self._simulation).__name__}.run() came to its end without a decision of"
-                f" {', '.join(point.point.name for point in self._plan.active)}; does the simulation call the"
-                " decision functions as attributes of their class or module?"
-            )
+            self.unheard = self.skips and any(agent.decided for agent in (*self.agents.values(), *self.just_ended))
+            if self.unheard:
+                return
+            raise NoDecisionError(self._without_decision())
+
+    def _without_decision(self) -> str:
+        """What there is to say of an episode that has ended without a decision of its user's."""
+        points = ", ".join(point.point.name for point in self._plan.active)
+        ended = f"{type(self._simulation).__name__}.run() came to its end without a decision of"
+        if self.answered:
+            wanted = f"{self._plan.one_agent!r} at {points}" if self._plan.one_agent else points
+            return f"{ended} {wanted}; these have decided: {listed(self.answered)}"
+        return (
+            f"{ended} {points}; does the simulation call the decision functions as attributes of their class or module?"
+        )
 
     # -- answers ----------------------------------------------------------------------------------
 
@@ -153,7 +173,8 @@ class Episode(Ending):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         if self.pending is None:
-            raise self.refusal()
+            self._hear()
+            return
         if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
             self._enter(self.step, action)
             return
@@ -172,6 +193,12 @@ class Episode(Ending):
             else:  # nothing has moved
                 self.annotate(error)
             raise
+
+    def _hear(self) -> None:
+        """Where no decision is pending: let the user learn of an end before the first one, or refuse."""
+        if not self.unheard:
+            raise self.refusal()
+        self.unheard = False
 
     def _enter(self, move: Callable[[Any, bool], None], given: Any) -> None:
         """Make a move at work."""
@@ -259,7 +286,8 @@ class Episode(Ending):
             BaseException: Whatever the model, a mapping or a policy raises.
         """
         if self.pending is None:
-            raise self.refusal()
+            self._hear()
+            return
         if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
             self._enter(self.play, actions)
             return
@@ -333,6 +361,9 @@ class Episode(Ending):
         if agent.policy is RULE:
             return RULE
         agent.settle(agent, args, kwargs, False)
+        forced = self._forced(agent) if self.skips else None
+        if forced is not None:
+            return self.answer(agent, forced, False)
         if agent.deferred:
             self.pending = agent
             return WAIT
@@ -349,6 +380,23 @@ class Episode(Ending):
         self.finish(truncated=True)
         return WAIT
 
+    def _decide_unless_forced(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Settle an agent, whose rewards add up until it has a choice."""
+        agent.settle_again(agent, args, kwargs)
+        agent.reward, agent.carried = agent.reward + agent.carried, 0.0
+        forced = self._forced(agent)
+        if forced is not None or not agent.asked:  # a reset, too, tells no rewards
+            agent.reward, agent.carried = 0.0, agent.reward
+        if forced is not None:
+            return self.answer(agent, forced, False)
+        agent.asked = True
+        self.pending = agent
+        return WAIT
+
+    def _forced(self, agent: Agent) -> Any:
+        """The one legal action of an agent; None where it has a choice."""
+        return only_choice(agent.point.definition.action_space, agent.mask)
+
     def _decide_in_round(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Answer a decision of an agent of the user's with its action of the round, or wait for the next round."""
         agent.restrict(args, kwargs)
@@ -357,13 +405,15 @@ class Episode(Ending):
         return self._answer_in_round(agent)
 
     def _answer_in_round(self, agent: Agent) -> Any:
-        action = self._left.pop(agent.name, MISSING)
-        mask = agent.mask
-        if action is MISSING or (mask is not None and action is not RULE and not agent.point.allows(mask, action)):
-            self.pending = agent
-            return WAIT
+        action = self._forced(agent) if self.skips else None
+        if action is None:
+            action = self._left.pop(agent.name, MISSING)
+            mask = agent.mask
+            if action is MISSING or (mask is not None and action is not RULE and not agent.point.allows(mask, action)):
+                self.pending = agent
+                return WAIT
+            agent.acted = True
         self.latest = agent
-        agent.acted = True
         if not agent.decided:  # it was never settled, and acts at once
             agent.settle(agent, agent.arguments(), agent.kwargs, observe=False)
         return self.answer(agent, action, False)
@@ -393,6 +443,8 @@ class Episode(Ending):
             self.latest = agent
             if settle:
                 agent.settle_again(agent, args, agent.kwargs)
+                if self.skips:
+                    agent.reward, agent.carried = agent.reward + agent.carried, 0.0
             elif agent in announced and not agent.decided:
                 agent.settle(agent, args, agent.kwargs, reward=False)
             if agent is not following:

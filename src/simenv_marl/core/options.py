@@ -27,8 +27,12 @@ class Options:
         possible_agents: The roster, where agents are named by a callable: their names, or a dict from
             decision point to names. Declared agents are there from ``reset`` on.
         undeclared: What a decision of an agent outside the roster becomes: "error", or "rule".
+        agent: The one agent of a single view, all others being left to their policies or their rule; None: the one
+            agent of the one active decision point.
         padded: Whether all agents of the roster stand in ``agents`` from the reset to the end of an episode: also those
             who are yet to be born or whom the model has removed, as agents that do not decide.
+        skip_forced: Whether decisions with one legal choice are answered with it, without asking for an action.
+        clip_actions: Whether actions of ``Box`` spaces that lie outside are clipped, and not refused.
         max_steps: After how many calls of ``step`` with an action an episode is truncated; None: never.
         policies: Who decides without being an agent of the environment: from the name of an agent, or from a
             decision point (dotted name or decision function), to a callable of the observation, or of the
@@ -48,7 +52,10 @@ class Options:
     driver: str = "greenlet"
     possible_agents: Any = None
     undeclared: str = "error"
+    agent: str | None = None
     padded: bool = False
+    skip_forced: bool = False
+    clip_actions: bool = False
     max_steps: int | None = None
     policies: Mapping[Any, Any] | None = None
     plugins: Iterable[Any] = ()
@@ -66,7 +73,9 @@ class Options:
             )
         if self.undeclared not in ("error", "rule"):
             raise OptionValueError(f'undeclared must be "error" or "rule", not {self.undeclared!r}')
-        for name in ("global_rng", "padded"):
+        if self.agent is not None and not (isinstance(self.agent, str) and self.agent):
+            raise OptionValueError(f"agent must be the name of an agent or None, not {self.agent!r}")
+        for name in ("clip_actions", "global_rng", "padded", "skip_forced"):
             if not isinstance(getattr(self, name), bool):
                 raise OptionValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
         state_space = self.state_space

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from ..errors import AgentError
@@ -101,8 +101,7 @@ class Participants:
 
     def names(self) -> str:
         """The names of the live agents, for messages."""
-        names = list(self.agents)
-        return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+        return listed(self.agents)
 
     def finish_agent(self, agent: Agent) -> None:
         """End the episode of one agent, in the midst of the simulation's."""
@@ -119,4 +118,11 @@ class Participants:
             agent.unsee()
         else:
             agent.settle(agent, args, agent.kwargs, last=True)
+        agent.reward, agent.carried = agent.reward + agent.carried, 0.0
         agent.release()
+
+
+def listed(names: Collection[str]) -> str:
+    """The first of some names, and how many more there are, for messages."""
+    first = ", ".join(list(names)[:10])
+    return f"{first} and {len(names) - 10} more" if len(names) > 10 else first

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
+from sys import modules
 from typing import Any
 
 from ..decision import DecisionPoint, Definition, unwrapped
@@ -17,6 +18,7 @@ from ..errors import (
     DefinitionError,
     OptionValueError,
     SimEnvError,
+    UnknownOptionError,
     UnknownPointError,
     warn_user,
 )
@@ -53,6 +55,7 @@ class Plan:
         events: By decision point, what crosses from the simulation when it is called.
         decisions: The same by the point's hook, for drivers.
         policies: By name: the policies of agents that are no agents of the environment.
+        one_agent: The name of the one agent that the environment's user answers for; None where there may be more.
         roster: By name: the points of the agents that are known beforehand, in the order of the points.
         complete: Whether no others may join.
         unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
@@ -85,12 +88,18 @@ class Plan:
             )
         self.unanswered, self.rewarded = unanswered, rewarded
         agents = _name_agents(named)
+        if options.agent is not None and options.agent not in agents and None not in agents:
+            raise AgentError(
+                f"agent={options.agent!r} names no agent; the agents are {', '.join(filter(None, agents))}"
+            )
         by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
         everything = [*named, *extra]
         self.points: list[Any] = []
         self.active: list[BoundPoint] = []
         for point, agent in zip(everything, _name_agents(everything), strict=True):
             policy = by_point.get(point.point)
+            if options.agent is not None and agent != (options.agent if options.agent in agents else None):
+                policy = policy or RULE
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
             if policy is not RULE or excepted:  # else its rule decides
                 self._bind(point, agent, policy)
@@ -114,6 +123,9 @@ class Plan:
             roster, self.complete = _call_the_roll(self.active, options.possible_agents)
             if not unanswered:
                 self.roster = {name: point for name, point in roster.items() if name not in self.policies}
+        if options.agent is not None:
+            self._single_out(options.agent)
+        self.one_agent = self.active[0].agent or options.agent if len(self.active) == 1 else None
 
     def _bind(self, named: NamedPoint, agent: str | None, policy: Any) -> None:
         """Bind a decision point that does not run its rule."""
@@ -123,12 +135,33 @@ class Plan:
         else:
             active = policy is None and agent not in self.policies
         kind: Any = Answered if policy is not None and not active else Decision
-        bound = kind(named, agent, policy, recorded=self.rewarded)
+        bound = kind(named, agent, policy, recorded=self.rewarded, clips=self.options.clip_actions)
         bound.settle, _ = settling(bound)
         bound.told = Told(bound) if bound.recorded else None
         self.points.append(bound)
         if active:
             self.active.append(bound)
+
+    def _single_out(self, agent: str) -> None:
+        """Leave all agents but one to their policies or their rule.
+
+        Raises:
+            AgentError: The agent is not declared, or its decision point is not known.
+            UnknownPointError: A policy answers for it.
+        """
+        if agent in self.policies:
+            raise UnknownPointError(
+                f"agent={agent!r} is answered by policies, and no decision is left to the environment"
+            )
+        if self.complete and agent not in self.roster:
+            raise AgentError(f"agent={agent!r} names no agent of the environment; known are {', '.join(self.roster)}")
+        points = [self.roster[agent]] if self.complete else self.active
+        if len(points) > 1:
+            raise AgentError(
+                f"the agent {agent!r} may decide at {', '.join(point.point.name for point in points)}; name its"
+                " decision point in points=, or declare the agents of each with possible_agents="
+            )
+        self.active, self.roster, self.complete = points, {agent: points[0]}, True
 
     def policy_of(self, agent: str, point: BoundPoint) -> Any:
         """The policy of an agent; None: the environment's user.
@@ -139,7 +172,7 @@ class Plan:
         policy = self.policies.get(agent) or point.policy
         if policy is not None:
             return policy
-        if self.unanswered:
+        if self.unanswered or (self.one_agent is not None and agent != self.one_agent):
             return RULE
         if not self.complete or agent in self.roster:
             return None
@@ -208,6 +241,8 @@ class Plan:
         if variant is not None:
             source, points, options = variant.applied(points, options)
         checked = Options().amended(options)
+        if unanswered and checked.agent is not None:
+            raise UnknownOptionError("agent is an option of the single view alone")
         model: Any = source
         spare: list[Spare] = []
         plain_factory = not isinstance(source, type) and not hasattr(source, "run")
@@ -369,7 +404,7 @@ def _assign(
             except SimEnvError as error:
                 if policy is RULE and isinstance(error, DefinitionError):
                     continue  # its rule decides there anyway
-                if isinstance(key, str) and isinstance(error, UnknownPointError) and None in agents:
+                if isinstance(error, UnknownPointError) and None in agents and not _is_path(key):
                     by_agent[key] = policy  # an agent that a callable may name
                     continue
                 names = sorted([a for a in agents if a] + [p.point.name for p in named])
@@ -381,6 +416,14 @@ def _assign(
                 extra.append(point)
         by_point[point.point] = policy
     return by_point, by_agent, extra
+
+
+def _is_path(key: Any) -> bool:
+    """Whether a key can only be the dotted name of something in a module, and not the name of an agent."""
+    if not isinstance(key, str):
+        return True
+    first, second = (*key.split("."), "")[:2]
+    return bool(second) and (f"{first}.{second}" in modules or hasattr(modules.get(first), second))
 
 
 def two_arguments(policy: Callable[..., Any]) -> Policy:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from sys import getrefcount
 from typing import Any, Final
 
@@ -280,6 +281,44 @@ def _box_check(space: spaces.Box) -> Check:
     return check
 
 
+def clipping_check(space: spaces.Space[Any]) -> Check:
+    """Make the function that checks actions against a space, once those of its ``Box`` spaces are clipped.
+
+    Args:
+        space: The action space, of any kind.
+
+    Returns:
+        A function that answers ``ILLEGAL`` for what is not in the space but for lying outside a ``Box``.
+    """
+    check, clip = action_check(space), partial(_clipped, space)
+
+    def check_clipped(action: Any) -> Any:
+        legal = check(action)
+        return check(clip(action)) if legal is ILLEGAL else legal
+
+    return check_clipped
+
+
+def _clipped(space: spaces.Space[Any], action: Any) -> Any:
+    """An action with its numbers clipped into the ``Box`` spaces of a space; what does not fit them, as it is."""
+    if isinstance(space, spaces.Dict) and isinstance(action, Mapping):
+        return {key: _clipped(space[key], part) if key in space.spaces else part for key, part in action.items()}
+    if isinstance(space, spaces.Tuple) and isinstance(action, (tuple, list)) and len(action) == len(space):
+        return tuple(_clipped(part, item) for part, item in zip(space.spaces, action, strict=True))
+    if not isinstance(space, spaces.Box):
+        return action
+    try:
+        array = np.asarray(action)
+    except (ValueError, TypeError):
+        return action
+    if array.dtype.kind not in "iuf" or (
+        array.shape != space.shape and not (array.shape == () and space.low.size == 1)
+    ):
+        return action
+    clipped = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape))
+    return type(action)(clipped) if type(action) in (int, float) else clipped
+
+
 # -- masks ----------------------------------------------------------------------------------------
 
 
@@ -336,6 +375,24 @@ def mask_allows(space: spaces.Space[Any], mask: Any, action: Any) -> bool:
         return all(part[choice] for part, choice in zip(mask, choices, strict=True))
     assert isinstance(space, spaces.Discrete)
     return bool(mask[action - int(space.start)])
+
+
+def only_choice(space: spaces.Space[Any], mask: Any) -> Any:
+    """The one legal action of a space; None where there are several.
+
+    Args:
+        space: The action space.
+        mask: What ``mask_cast`` has made; None: all of the space is legal.
+    """
+    if isinstance(space, spaces.MultiDiscrete):
+        parts = open_mask(space) if mask is None else mask
+        if any(np.count_nonzero(part) != 1 for part in parts):
+            return None
+        chosen = np.array([np.argmax(part) for part in parts], space.dtype).reshape(space.shape)
+        return (chosen + space.start).astype(space.dtype)
+    if not isinstance(space, spaces.Discrete) or (int(space.n) if mask is None else np.count_nonzero(mask)) != 1:
+        return None
+    return int(space.start) + (0 if mask is None else int(np.argmax(mask)))
 
 
 # -- freshness ------------------------------------------------------------------------------------

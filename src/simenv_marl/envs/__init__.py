@@ -48,7 +48,7 @@ def view_class(plan: Plan, view: str | None) -> Any:
         ViewError: The plan does not allow it.
     """
     if view is None:
-        view = "single" if len(plan.active) == 1 and plan.active[0].agent is not None else "aec"
+        view = "aec" if plan.one_agent is None else "single"
     if view == "single":
         return single_view(plan)
     found: dict[Any, Any] = {"aec": SimulationAECEnv, "parallel": SimulationParallelEnv, "joint": SimulationJointEnv}
@@ -66,8 +66,8 @@ def generate_env(simulation: Any, points: Any = None, *, view: str | None = None
         points: The active decision points: a dotted name, a decision function, a list of these, or a dict
             from dotted name or function to its definition, which leaves the model undecorated. None: the
             simulation's attribute ``points``, else all decorated points of the one package that has any.
-        view: "aec", "parallel", "single" or "joint". None: single where one point with one agent is active,
-            AEC otherwise.
+        view: "aec", "parallel", "single" or "joint". None: single where one point with one agent is active, or one
+            agent is named with ``agent=``, AEC otherwise.
         **options: As ``aec_env`` takes them.
 
     Returns:
@@ -133,7 +133,7 @@ def single_env(simulation: Any, points: Any = None, **options: Any) -> Simulatio
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
-        **options: As ``aec_env`` takes them.
+        **options: ``agent`` for the name of the one agent, where several decide; else as ``aec_env`` takes them.
 
     Raises:
         ViewError: Not just one agent is active.

@@ -6,7 +6,7 @@ import copy
 import weakref
 from collections.abc import Callable
 from sys import modules
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -26,10 +26,12 @@ class View:
     Attributes:
         metadata: Its name, and the render modes of its simulation.
         render_mode: What ``render`` returns.
+        takes: The options that only this view takes.
     """
 
     metadata: dict[str, Any]
     render_mode: str | None
+    takes: ClassVar[tuple[str, ...]] = ()
     _together: tuple[spaces.Tuple[Any], spaces.Space[Any]] | None = None
 
     _finalizer: Any = None
@@ -54,15 +56,17 @@ class View:
         self.render_mode = plan.options.render_mode
         self._shows = self.render_mode == "human"  # after every reset and step, without being asked to
 
-    @staticmethod
-    def check(plan: Plan) -> None:
+    @classmethod
+    def check(cls, plan: Plan) -> None:
         """Make sure that a plan allows this view.
 
         Raises:
-            ViewError: It does not.
+            UnknownOptionError: An option is given that only another view takes.
+            ViewError: It does not allow the view.
         """
-        if plan.options.flatten:
-            raise UnknownOptionError("flatten is an option of the joint view alone")
+        for option, view in (("flatten", "joint"), ("agent", "single")):
+            if getattr(plan.options, option) and option not in cls.takes:
+                raise UnknownOptionError(f"{option} is an option of the {view} view alone")
 
     @staticmethod
     def metadata_of(plan: Plan) -> dict[str, Any]:

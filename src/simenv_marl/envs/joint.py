@@ -137,6 +137,7 @@ class SimulationJointEnv(OneAgentView):
             ``Discrete`` and one-dimensional ``MultiDiscrete`` spaces come to a ``MultiDiscrete``.
     """
 
+    takes = ("flatten",)
     _agent = "joint"
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
@@ -158,10 +159,6 @@ class SimulationJointEnv(OneAgentView):
             self._session.np_random_seed = None
             self._plan = self._made_of = self._session.plan = plan.declared(roster)
         self.joint = Joint(self._plan.roster, flatten=plan.options.flatten)
-
-    @staticmethod
-    def check(plan: Plan) -> None:
-        """Make sure that a plan allows this view; every plan does."""
 
     def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         return deepcopy((self.joint.observation_space, self.joint.action_space))

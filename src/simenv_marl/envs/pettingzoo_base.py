@@ -52,14 +52,14 @@ class AgentsView(View):
                 self._seed_spaces(agent, seed)
         return episode
 
-    @staticmethod
-    def check(plan: Plan) -> None:
+    @classmethod
+    def check(cls, plan: Plan) -> None:
         """Make sure that a plan allows this view.
 
         Raises:
             ViewError: It does not.
         """
-        View.check(plan)
+        super().check(plan)
         if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
             raise ViewError(
                 'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='

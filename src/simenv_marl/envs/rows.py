@@ -52,7 +52,7 @@ class SubEnvironments:
             SimEnvError: The plan does not allow the view.
         """
         if view is None:
-            view = "single" if len(plan.active) == 1 and plan.active[0].agent is not None else "joint"
+            view = "joint" if plan.one_agent is None else "single"
         if view not in ("single", "joint"):
             raise OptionValueError(f'view must be None, "single" or "joint", not {view!r}')
         self.joint: Joint | None = None
@@ -105,6 +105,8 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
     for episode in episodes:
         if episode.pending is not None:
             agents.append(episode.pending)
+        elif episode.unheard:
+            together = False
         else:
             blame(episodes.index(episode), error := episode.refusal())
             raise error
@@ -172,7 +174,7 @@ class Row:
         """
         self.batch, self._mode, self._offset, self._common = batch, mode, offset, common
         self._stack = stacker(common.single_observation_space, cast=True, other=concatenate)
-        self._agent = common.plan.active[0].agent
+        self._agent = common.plan.one_agent
         self._shows = common.plan.options.render_mode == "human"
         self._observed: list[Any] = [None] * number
         self._views: list[OneAgentView] = []

@@ -17,7 +17,6 @@ from ..core.session import Session
 from ..core.spaces import open_mask
 from ..decision import Definition
 from ..errors import ViewError
-from .base import View
 from .gymnasium_base import OneAgentView
 
 
@@ -28,6 +27,7 @@ class SimulationEnv(OneAgentView):
         observation_space, action_space: The agent's spaces, of this environment alone.
     """
 
+    takes = ("agent",)
     _own: Any = None  # its agent, while there is an episode
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
@@ -42,7 +42,7 @@ class SimulationEnv(OneAgentView):
             SimEnvError: Something else in the plan cannot work.
         """
         super().__init__(plan, session)
-        self._agent = str(plan.active[0].agent)
+        self._agent = str(plan.one_agent)
         if self._session.episode is not None:
             self._own = self._session.episode.agent(self._agent)
 
@@ -50,19 +50,21 @@ class SimulationEnv(OneAgentView):
         definition = self._plan.active[0].definition
         return copy.deepcopy((definition.observation_space, definition.action_space))
 
-    @staticmethod
-    def check(plan: Plan) -> None:
+    @classmethod
+    def check(cls, plan: Plan) -> None:
         """Make sure that a plan allows this view.
 
         Raises:
-            ViewError: It does not.
+            UnknownOptionError: An option is given that only another view takes.
+            ViewError: It does not allow the view.
         """
-        View.check(plan)
-        if len(plan.active) != 1 or plan.active[0].agent is None:
+        super().check(plan)
+        if plan.one_agent is None:
             points = ", ".join(binding.point.name for binding in plan.active)
             raise ViewError(
-                "the single view needs one active decision point, whose agent has a name of its own; active are"
-                f" {points}. Name one in points=, answer the others with policies=, or use aec_env"
+                "the single view needs one active decision point, whose agent has a name of its own, or the name of one"
+                f" agent; active are {points}. Name the agent with agent=, a point in points=, answer the others with"
+                " policies=, or use aec_env"
             )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

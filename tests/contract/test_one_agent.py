@@ -1,0 +1,425 @@
+"""The single view of one named agent among many, and what it asks that agent."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simenv_marl import (
+    RULE,
+    AgentError,
+    EpisodeOverError,
+    InvalidActionError,
+    NoDecisionError,
+    OptionValueError,
+    UnknownOptionError,
+    UnknownPointError,
+    ViewError,
+    aec_env,
+    collect_episodes,
+    generate_env,
+    joint_env,
+    make_step,
+    parallel_env,
+    register_simulation,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
+
+NAMES = ("player_red", "player_blue")
+PLACE = f"{__name__}.Player"
+
+
+class Player:
+    """Moves as far as it likes out of what is offered, and earns as much."""
+
+    def __init__(self, name):
+        self.name, self.coins = name, 0
+
+    def move(self, moves):
+        return moves[-1]
+
+    def bet(self, moves):
+        return moves[0]
+
+
+class Game:
+    """Two players, turn by turn; how many moves are offered depends on the round. Each episode has six rounds."""
+
+    offers = (1, 3, 1, 2, 1, 1)
+
+    def reset(self, seed=None):
+        self.players = [Player(name) for name in NAMES]
+        self.log = []
+
+    def run(self):
+        for offered in self.offers:
+            for player in self.players:
+                move = player.move(list(range(1, offered + 1)))
+                player.coins += move
+                self.log.append((player.name, move))
+
+
+class Forced(Game):
+    """Offers one move only."""
+
+    offers = (1, 1)
+
+
+def watch(player, moves):
+    return [player.coins]
+
+
+def offered(player, moves):
+    return moves
+
+
+def pay(player, moves):
+    return player.coins
+
+
+def name(player, moves):
+    return player.name
+
+
+def definition(**changes):
+    given = {
+        "observation_space": spaces.Box(0, 100, (1,), np.float64),
+        "observation_space_mapping": watch,
+        "action_space": spaces.Discrete(3),
+        "choices": offered,
+        "reward_mapping": pay,
+        "agent": name,
+    }
+    return make_step(**given | changes)
+
+
+MOVE = {f"{PLACE}.move": definition()}
+
+
+def episode(env, choose=lambda info: 0):
+    """Play an episode of a Gymnasium environment; what each step has returned but for the info, and the offers."""
+    observation, info = env.reset(seed=3)
+    steps, offers = [], [int(info["action_mask"].sum())]
+    while True:
+        observation, reward, terminated, truncated, info = env.step(choose(info))
+        steps.append((observation.item(), reward, terminated, truncated))
+        if terminated or truncated:
+            return steps, offers
+        offers.append(int(info["action_mask"].sum()))
+
+
+# -- agent= ---------------------------------------------------------------------------------------
+
+
+def test_one_named_agent_is_asked_and_all_others_are_left_to_their_rule() -> None:
+    env = single_env(Game, MOVE, agent="player_red")
+    steps, offers = episode(env)
+    assert offers == [1, 3, 1, 2, 1, 1]
+    assert [step[0] for step in steps] == [1, 2, 3, 4, 5, 6]
+    assert steps[-1][2:] == (True, False)
+    assert [move for name, move in env.simulation.log if name == "player_blue"] == [1, 3, 1, 2, 1, 1]
+    with pytest.raises(EpisodeOverError):
+        env.step(0)
+
+
+def test_the_others_are_left_to_policies_by_agent_or_by_point() -> None:
+    for policies in ({"player_blue": lambda observation: 0}, {f"{PLACE}.move": lambda observation: 0}):
+        env = single_env(Game, MOVE, agent="player_red", policies=policies) if "player_blue" in policies else None
+        if env is None:  # of a point all of whose agents a policy answers, none is left
+            with pytest.raises(UnknownPointError):
+                single_env(Game, MOVE, agent="player_red", policies=policies)
+            continue
+        episode(env)
+        assert [move for name, move in env.simulation.log if name == "player_blue"] == [1] * 6
+
+
+def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
+    named = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(agent="better")}
+
+    class Casino(Game):
+        def run(self):
+            for player in self.players:
+                self.log.append((player.bet([5, 6]), player.move([1, 2])))
+
+    env = single_env(Casino, named, agent="mover")
+    env.reset(seed=0)
+    while not env.step(0)[2]:
+        pass
+    assert env.simulation.log == [(5, 1), (5, 1)]
+    with pytest.raises(ViewError, match="agent="):
+        single_env(Casino, named)
+    with pytest.raises(AgentError, match="mover, better"):
+        single_env(Casino, named, agent="mvoer")
+
+
+def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
+    named = {
+        f"{PLACE}.move": definition(),
+        f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
+    }
+
+    class Casino(Game):
+        def run(self):
+            for player in self.players:
+                self.log.append((player.bet([5, 6]), player.move([1, 2])))
+
+    with pytest.raises(AgentError, match="possible_agents"):
+        single_env(Casino, named, agent="player_red")
+    roster = {f"{PLACE}.move": NAMES, f"{PLACE}.bet": [f"{name}_bet" for name in NAMES]}
+    env = single_env(Casino, named, agent="player_red_bet", possible_agents=roster)
+    env.reset(seed=0)
+    assert env.step(1)[2]
+    assert env.simulation.log == [(6, 2), (5, 2)]
+
+
+def test_without_a_name_the_error_tells_of_the_option() -> None:
+    with pytest.raises(ViewError, match="agent="):
+        single_env(Game, MOVE)
+
+
+def test_an_agent_that_never_decides_is_an_error_that_lists_who_did() -> None:
+    with pytest.raises(NoDecisionError, match=r"'player_green'.*player_red, player_blue"):
+        single_env(Game, MOVE, agent="player_green").reset()
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
+def test_it_is_an_option_of_the_single_view_alone(make) -> None:
+    with pytest.raises(UnknownOptionError, match="single view"):
+        make(Game, MOVE, agent="player_red")
+
+
+def test_nothing_else_takes_it() -> None:
+    with pytest.raises(UnknownOptionError, match="single view"):
+        simulate(Game, points=MOVE, agent="player_red")
+    for wrong in ("", 3, ("player_red",)):
+        with pytest.raises(OptionValueError, match="agent"):
+            single_env(Game, MOVE, agent=wrong)
+    with pytest.raises(UnknownPointError, match="policies"):
+        single_env(Game, MOVE, agent="player_red", policies={"player_red": RULE})
+
+
+def test_all_that_makes_single_views_takes_it() -> None:
+    alone = episode(single_env(Game, MOVE, agent="player_blue"))
+    made = generate_env(Game, MOVE, agent="player_blue")
+    assert episode(made()) == alone
+    assert episode(generate_env(Game, MOVE, view="single", agent="player_red")(agent="player_blue")) == alone
+    ids = register_simulation(Game, MOVE, name="one-agent", agent="player_blue")
+    assert "one-agent/Move-v0" in ids
+    assert episode(gymnasium.make("one-agent/Move-v0")) == alone
+    env = made()
+    for again in (copy.deepcopy(env), pickle.loads(pickle.dumps(env.unwrapped))):
+        assert episode(again) == alone
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_vector_view_is_of_single_views_of_it(workers) -> None:
+    env = vector_env(Game, MOVE, agent="player_red", num_envs=2, workers=workers, context="fork" if workers else None)
+    env.reset(seed=3)
+    single, _ = episode(single_env(Game, MOVE, agent="player_red"))
+    for observation, reward, terminated, _ in single:
+        observations, rewards, terminations, _, _ = env.step(np.zeros(2, np.int64))
+        assert observations.ravel().tolist() == [observation] * 2
+        assert rewards.tolist() == [reward] * 2
+        assert terminations.tolist() == [terminated] * 2
+    env.close()
+
+
+# -- skip_forced= ---------------------------------------------------------------------------------
+
+
+def test_forced_moves_are_not_asked_for_and_their_rewards_add_up() -> None:
+    steps, _ = episode(single_env(Game, MOVE, agent="player_red"))
+    env = single_env(Game, MOVE, agent="player_red", skip_forced=True)
+    skipped, offers = episode(env)
+    assert offers == [3, 2]
+    rewards = [step[1] for step in steps]
+    assert [step[1] for step in skipped] == [sum(rewards[:3]), sum(rewards[3:])]
+    assert [move for name, move in env.simulation.log if name == "player_red"] == [1] * 6
+
+
+def test_nobody_is_asked_for_a_forced_move_not_even_a_policy() -> None:
+    asked = []
+
+    def policy(observation, info):
+        asked.append(int(info["action_mask"].sum()))
+        return 0
+
+    def batched(observations, infos):
+        asked.extend(int(info["action_mask"].sum()) for info in infos)
+        return np.zeros(len(infos), np.int64)
+
+    simulate(Game, {f"{PLACE}.move": policy}, points=MOVE, skip_forced=True)
+    assert asked == [3, 3, 2, 2]
+    asked.clear()
+    simulate_many(Game, {f"{PLACE}.move": batched}, seeds=[0, 1], points=MOVE, skip_forced=True)
+    assert sorted(asked) == [2, 2, 2, 2, 3, 3, 3, 3]
+
+
+def test_trajectories_have_no_forced_moves_and_all_rewards() -> None:
+    def collected(**options):
+        policies = {f"{PLACE}.move": lambda observations: np.zeros(len(observations), np.int64)}
+        (made,) = collect_episodes(Game, policies, seeds=[0], points=MOVE, **options).values()
+        return made
+
+    every, chosen = collected(), collected(skip_forced=True)
+    assert len(chosen.actions) == 4
+    assert chosen.rewards.sum() == every.rewards.sum()
+
+
+@pytest.mark.parametrize("make", [parallel_env, joint_env])
+def test_in_rounds_forced_moves_use_no_action(make) -> None:
+    env = make(Game, MOVE, possible_agents=list(NAMES), skip_forced=True)
+    env.reset(seed=0)
+    rounds = 0
+    ended = False
+    while not ended:
+        *_, terminations, _, infos = env.step(dict.fromkeys(NAMES, 0))
+        acted = infos["acted"] if make is joint_env else {name: infos[name]["acted"] for name in NAMES}
+        assert all(acted.values())
+        ended = terminations if make is joint_env else all(terminations.values())
+        rounds += 1
+    assert rounds == 2
+    assert [move for _, move in env.unwrapped.simulation.log] == [1] * 12
+
+
+def test_a_space_of_one_action_is_a_forced_move_too() -> None:
+    one = spaces.Discrete(1, start=4)
+    points = {f"{PLACE}.move": definition(action_space=one, choices=None, action_space_mapping=lambda action: action)}
+    env = single_env(Game, points, agent="player_red", skip_forced=True)
+    env.reset(seed=0)
+    assert [move for name, move in env.simulation.log if name == "player_red"] == [4] * 6
+
+
+def test_a_forced_move_of_several_parts() -> None:
+    made = definition(
+        action_space=spaces.MultiDiscrete([2, 3], start=[0, 5]),
+        choices=None,
+        action_space_mapping=lambda action: int(action.sum()),
+        action_mask_mapping=lambda player, moves: ([0, 1], [0, 0, 1] if len(moves) == 1 else [1, 0, 1]),
+    )
+    env = single_env(Game, {f"{PLACE}.move": made}, agent="player_red", skip_forced=True)
+    env.reset(seed=0)
+    assert env.simulation.log[0] == ("player_red", 8)
+    env.step(np.array([1, 5]))
+    assert [move for name, move in env.simulation.log if name == "player_red"][:3] == [8, 6, 8]
+
+
+def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
+    env = single_env(Forced, MOVE, agent="player_red", skip_forced=True)
+    for _ in range(2):
+        observation, _ = env.reset(seed=0)
+        assert observation == [2]
+        assert env.step(0)[:4] == (np.array([2.0]), 2 + 1, True, False)
+        with pytest.raises(EpisodeOverError):
+            env.step(0)
+    aec = aec_env(Forced, MOVE, skip_forced=True)
+    aec.reset(seed=0)
+    told = {}
+    for agent in aec.agent_iter():
+        told[agent] = aec.last()[1:4]
+        aec.step(None)
+    assert told == dict.fromkeys(NAMES, (3.0, True, False))
+    parallel = parallel_env(Forced, MOVE, skip_forced=True, possible_agents=list(NAMES))
+    parallel.reset(seed=0)
+    assert parallel.agents == list(NAMES)
+    assert parallel.step(dict.fromkeys(NAMES, 0))[2] == dict.fromkeys(NAMES, True)
+    vector = vector_env(Forced, MOVE, agent="player_red", skip_forced=True, num_envs=2)
+    vector.reset(seed=0)
+    for ended in (True, False, True):
+        _, rewards, terminations, *_ = vector.step(np.zeros(2, np.int64))
+        assert terminations.tolist() == [ended] * 2
+        assert rewards.tolist() == [3.0 * ended] * 2
+    vector.close()
+
+
+def test_an_episode_without_any_decision_still_is_an_error() -> None:
+    class Nothing(Game):
+        offers = ()
+
+    with pytest.raises(NoDecisionError):
+        single_env(Nothing, MOVE, agent="player_red", skip_forced=True).reset()
+
+
+# -- clip_actions= --------------------------------------------------------------------------------
+
+BOX = spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, np.inf], np.float32))
+
+
+def flown(make, space, action, **options):
+    """What reaches the mapping of an agent called ``pilot``."""
+    taken = []
+
+    def mapping(action):
+        taken.append(action)
+        return 0
+
+    made = definition(action_space=space, choices=None, action_space_mapping=mapping, agent="pilot")
+    env = make(Game, {f"{PLACE}.move": made}, **options)
+    env.reset(seed=0)
+    env.step({"pilot": action} if make in (parallel_env, joint_env) else action)
+    return taken[0]
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+def test_actions_outside_a_box_are_clipped(make) -> None:
+    taken = flown(make, BOX, np.array([-7.5, 1e30]), clip_actions=True)
+    assert taken.dtype == np.float32
+    assert taken.tolist() == [-1.0, np.float32(1e30)]
+    with pytest.raises(InvalidActionError):
+        flown(make, BOX, np.array([-7.5, 1.0]))
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+@pytest.mark.parametrize("wrong", [np.array([np.nan, 0.0]), np.array([5.0]), np.array(["a", "b"]), None, [[1, 2]]])
+def test_what_is_no_action_is_refused_all_the_same(make, wrong) -> None:
+    with pytest.raises(InvalidActionError):
+        flown(make, BOX, wrong, clip_actions=True)
+
+
+def test_numbers_for_a_box_of_one_reach_the_mapping_as_such() -> None:
+    one = spaces.Box(-1, 1, (1,), np.float32)
+    assert flown(single_env, one, 3.5, clip_actions=True) == 1.0
+    assert type(flown(single_env, one, 3.5, clip_actions=True)) is float
+    assert flown(single_env, one, -2, clip_actions=True) == -1
+    whole = spaces.Box(0, 5, (1,), np.int8)
+    assert flown(single_env, whole, np.array([300]), clip_actions=True).tolist() == [5]
+    with pytest.raises(InvalidActionError):
+        flown(single_env, whole, np.array([2.5]), clip_actions=True)
+
+
+def test_boxes_within_other_spaces_are_clipped_and_nothing_else() -> None:
+    space = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 1)]))
+    action = {"gas": np.float32([9, -9]), "gear": (2, np.float32([7]))}
+    taken = flown(single_env, space, action, clip_actions=True)
+    assert taken["gas"].tolist() == [1, 0]
+    assert taken["gear"][1].tolist() == [1]
+    with pytest.raises(InvalidActionError):
+        flown(single_env, space, {**action, "gear": (3, np.float32([7]))}, clip_actions=True)
+
+
+@given(st.lists(st.floats(width=32), min_size=2, max_size=2))
+def test_the_vector_view_clips_as_the_single_view_does(numbers) -> None:
+    action = np.array(numbers, np.float32)
+    vector = definition(
+        action_space=BOX, choices=None, action_space_mapping=lambda action: tuple(action), agent="pilot"
+    )
+    env = vector_env(Game, {f"{PLACE}.move": vector}, num_envs=2, clip_actions=True)
+    env.reset(seed=0)
+    try:
+        env.step(np.stack([action, np.zeros(2, np.float32)]))
+        taken = [sub.simulation.log[0][1] for sub in env.envs]
+    except (InvalidActionError, TypeError) as error:
+        taken = type(error)
+    env.close()
+    if np.isnan(action).any():
+        assert taken is InvalidActionError
+    else:
+        assert taken is TypeError  # the model adds what it was given to a number

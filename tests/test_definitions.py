@@ -262,7 +262,7 @@ def test_sentinels_stay_themselves():
         {"apply": 3},
         {"apply": lambda action: action, "action_space_mapping": lambda action: action},
         {"choices": lambda: [1], "action_space_mapping": lambda action: action},
-        {"choices": lambda: [1], "apply": lambda action: action},
+        {"choices": lambda: [1], "apply": lambda action: action, "action_space_mapping": lambda action: action},
         {"choices": [1, 2]},
         {"choices": lambda: [1], "action_space": spaces.Box(0, 1)},
         {"choices": lambda: [1], "action_space": spaces.Discrete(3, start=1)},
@@ -1029,5 +1029,5 @@ def test_a_definition_that_is_replaced_in_part_is_made_ready_as_a_whole():
         removed_by=["package.module.other"],
     )
     assert other.action_space_mapping(2) == "maybe"
-    assert other.rule_action_mapping("no", "an argument") == 0
+    assert other.rule_action_mapping == {"no": 0}
     assert other.removed_by == {"package.module.other": None}

@@ -8,7 +8,6 @@ rule, however many definitions there are of it.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import KW_ONLY, dataclass
@@ -21,7 +20,7 @@ import numpy as np
 from greenlet import getcurrent
 from gymnasium import spaces
 
-from .errors import DefinitionError, InvalidActionError, PatchError
+from .errors import DefinitionError, PatchError
 from .hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
 from .hooks.places import stays, unbind
 from .hooks.stacks import DIFFERENCES, EVALUATING
@@ -49,7 +48,7 @@ class Definition:
     action_space_mapping: Callable[[Any], Any] | None
     apply: Mapped | None
     choices: Mapped | None
-    rule_action_mapping: Mapped | None
+    rule_action_mapping: Mapped | Mapping[Any, Any] | None
     agent: str | Mapped | None
     action_mask_mapping: Mapped | None
     removed_by: Mapping[str, Mapped | None]
@@ -69,10 +68,6 @@ class Definition:
         answers = answers_of(self)
         if answers is not None:
             object.__setattr__(self, "action_space_mapping", _look_up(answers, self.action_space))
-        rule_action = self.rule_action_mapping
-        if rule_action is not None:
-            made = _look_back(rule_action) if isinstance(rule_action, Mapping) else _of_decision(rule_action)
-            object.__setattr__(self, "rule_action_mapping", made)
         object.__setattr__(self, "removed_by", _removals(self.removed_by))
 
     def __call__(self, function: Any) -> Any:
@@ -136,9 +131,9 @@ def make_step(
             end; returns the reward of the agent's action before.
         apply: Instead of ``action_space_mapping``: called with the action and the call's arguments, in the
             simulation and in place of the rule; what it returns is what the decision function returns.
-        choices: Instead of both: called with the call's arguments, returns the sequence of legal answers.
-            The action is an index into it; ``action_space`` is a ``Discrete`` (from 0) of the largest
-            length, and the mask follows by itself.
+        choices: Called with the call's arguments, returns the sequence of legal answers. The action is an
+            index into it; ``action_space`` is a ``Discrete`` (from 0) of the largest length, and the mask
+            follows by itself. The answer is returned; ``apply`` gets it in place of the action, if given.
         rule_action_mapping: Which action a decision of the rule corresponds to, for those who learn from it: a
             callable of the decision (and of the call's arguments, where it takes more than one), which returns an
             action or None for none; or a dict from decision to action. After a decision that was left to the rule,
@@ -157,6 +152,9 @@ def make_step(
         compute_reward: Called with achieved goals, desired goals and infos, of one step or stacked of many
             (shape ``(n, *goal_space.shape)``); returns the reward of each, for learners that replay episodes
             with other goals.
+
+    All but the spaces and ``compute_reward`` get the simulation, too, as the keyword-only parameter ``_simulation``,
+    if they have one.
 
     Returns:
         The definition, which is a decorator for the function that decides.
@@ -195,10 +193,10 @@ def _check_kinds(definition: Definition) -> None:
 def _check_together(definition: Definition) -> None:
     """Make sure that the parts of a definition go together."""
     given = [name for name in ANSWERS if getattr(definition, name) is not None]
-    if len(given) != 1:
+    if len(given) != 1 and given != ["apply", "choices"]:
         raise DefinitionError(
-            "make_step: give one of action_space_mapping, apply and choices, to say what an action decides;"
-            f" given: {', '.join(given) or 'none'}"
+            "make_step: give one of action_space_mapping, apply and choices (or both apply and choices), to say what an"
+            f" action decides; given: {', '.join(given) or 'none'}"
         )
     space, mask = definition.action_space, definition.action_mask_mapping
     if mask is not None and not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
@@ -260,33 +258,6 @@ def inverse(definition: Definition) -> dict[Any, Any] | None:
     except TypeError:  # decisions that cannot be looked up
         return None
     return actions if len(actions) == len(answers) else None
-
-
-def _look_back(actions: Mapping[Any, Any]) -> Mapped:
-    known = dict(actions)
-
-    def look_back(decision: Any, *args: Any, **kwargs: Any) -> Any:
-        try:
-            return known[decision]
-        except (KeyError, TypeError):
-            raise InvalidActionError(
-                f"the dict rule_action_mapping has no action for the rule's decision {decision!r}; give it one, or a"
-                " callable that returns None where no action corresponds"
-            ) from None
-
-    return look_back
-
-
-def _of_decision(mapping: Callable[..., Any]) -> Mapped:
-    """Let a mapping be called with the decision and the call's arguments, whether it takes these or not."""
-    try:
-        parameters = list(inspect.signature(mapping).parameters.values())
-    except (TypeError, ValueError):
-        parameters = []
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    if any(p.default is p.empty for p in positional[1:]) or any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        return mapping
-    return lambda decision, *args, **kwargs: mapping(decision)
 
 
 # -- decision points ------------------------------------------------------------------------------

@@ -46,6 +46,9 @@ class SimulationInterface(ABC):
       name, a decision function, a list of these, or a dict from these to definitions).
     - ``expected_calls(self, point)``: the argument tuples with which the decision point of that dotted
       name is going to be called, so that agents can be observed before their first decision.
+    - ``close(self)``: lets go of what must stay open until the last observations were made (files, connections,
+      licences). Called once for each ``reset`` that has succeeded: before the next one, when the environment is
+      closed, or when it is gone.
     - ``time(self)``: its clock, from which ``info["time"]`` and ``info["elapsed"]`` come.
     - ``state(self)``: all that a centralised critic may see, as an array.
     - ``render(self, mode)``: a picture of the present state, for a ``mode`` out of ``render_modes``; with
@@ -62,6 +65,16 @@ class SimulationInterface(ABC):
 
         Returns:
             ``TRUNCATED`` where the end is a limit of time; anything else is an end of the task.
+        """
+
+    def end_agent(self, name: str) -> None:  # noqa: B027 - nothing is to be done outside of an environment
+        """Say that an agent's episode ends here: it gets its last reward and observation, and takes no part any more.
+
+        To be called from the model while it runs, for agents that end without a call that ``removed_by=`` could name.
+        For what is no live agent of the environment, and outside of one, nothing comes of it.
+
+        Args:
+            name: The agent, by the name that ``agent=`` gives it.
         """
 
     def stop(self) -> None:  # noqa: B027 - leaving it out is allowed, and then nothing is to be done

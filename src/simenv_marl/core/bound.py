@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from types import FunctionType
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces as gym_spaces
@@ -22,6 +24,46 @@ Policy = Callable[[Any, dict[str, Any]], Any]
 
 class DeferredPolicy:
     """A policy that answers many decisions at once: an episode waits for it as it waits for its user."""
+
+
+MAPPINGS: Final = (
+    "observation_space_mapping", "action_space_mapping", "reward_mapping", "apply", "choices", "rule_action_mapping",
+    "agent", "action_mask_mapping", "achieved_goal_mapping", "desired_goal_mapping",
+)  # fmt: skip
+"""Those parts of a definition, beside ``removed_by``, that get the simulation if they ask for it."""
+
+
+def asks_for_simulation(function: Any) -> bool:
+    """Whether a mapping has a keyword-only parameter ``_simulation``."""
+    if not callable(function):
+        return False
+    if type(function) is FunctionType and not hasattr(function, "__wrapped__"):
+        code = function.__code__
+        return "_simulation" in code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
+    try:
+        parameter = inspect.signature(function).parameters.get("_simulation")
+    except (TypeError, ValueError):
+        return False
+    return parameter is not None and parameter.kind is parameter.KEYWORD_ONLY
+
+
+def given_simulation(definition: Definition, simulation: Any) -> Definition:
+    """The same definition, with the simulation given to those of its mappings that ask for it.
+
+    Args:
+        definition: The definition.
+        simulation: The simulation; None to find out whether any of them asks.
+    """
+
+    def given(function: Any) -> Any:
+        return partial(function, _simulation=simulation) if asks_for_simulation(function) else function
+
+    changes = {name: given(getattr(definition, name)) for name in MAPPINGS}
+    changes = {name: function for name, function in changes.items() if function is not getattr(definition, name)}
+    removals = {name: given(agent) for name, agent in definition.removed_by.items()}
+    if removals != definition.removed_by:
+        changes["removed_by"] = removals
+    return replace(definition, **changes) if changes else definition
 
 
 class BoundPoint:
@@ -48,9 +90,9 @@ class BoundPoint:
     """
 
     __slots__ = (
-        "_inverse", "agent", "cast", "check", "convert", "definition", "deliver", "legal", "masked_parts",
-        "name_agent", "observation_mapping", "one_entity", "point", "policy", "recorded", "reward_mapping", "settle",
-        "tells", "told",
+        "_inverse", "_rule_action", "agent", "cast", "check", "convert", "definition", "deliver", "legal",
+        "masked_parts", "name_agent", "observation_mapping", "one_entity", "point", "policy", "recorded",
+        "reward_mapping", "settle", "tells", "told",
     )  # fmt: skip
 
     def __init__(
@@ -84,6 +126,7 @@ class BoundPoint:
         self.convert: Any = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
         self.tells = definition.rule_action_mapping is not None
+        self._rule_action = _rule_action(definition.rule_action_mapping)
         self._inverse = inverse(definition)
         readable = definition.choices is not None or self._inverse is not None
         self.recorded = self.tells or (recorded and readable)
@@ -176,8 +219,8 @@ class BoundPoint:
             InvalidActionError: The action that corresponds is not in the action space.
         """
         definition = self.definition
-        if definition.rule_action_mapping is not None:
-            action = definition.rule_action_mapping(decision, *args, **kwargs)
+        if self._rule_action is not None:
+            action = self._rule_action(decision, *args, **kwargs)
             legal = None if action is None else self.check(action)
             if legal is ILLEGAL:
                 raise InvalidActionError(
@@ -204,6 +247,43 @@ def _masked_parts(space: gym_spaces.Space[Any]) -> list[str]:
     if isinstance(space, gym_spaces.Dict) and "desired_goal" in space.spaces:
         parts["observation"] = space["observation"]
     return [key for key, part in parts.items() if isinstance(part, gym_spaces.Dict) and MASK in part.spaces]
+
+
+# -- actions of the rule --------------------------------------------------------------------------
+
+
+def _rule_action(mapping: Any) -> Callable[..., Any] | None:
+    """Let ``rule_action_mapping`` be called with the decision and the call's arguments, whatever it is."""
+    if mapping is None:
+        return None
+    return _look_back(mapping) if isinstance(mapping, Mapping) else _of_decision(mapping)
+
+
+def _look_back(actions: Mapping[Any, Any]) -> Callable[..., Any]:
+    known = dict(actions)
+
+    def look_back(decision: Any, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return known[decision]
+        except (KeyError, TypeError):
+            raise InvalidActionError(
+                f"the dict rule_action_mapping has no action for the rule's decision {decision!r}; give it one, or a"
+                " callable that returns None where no action corresponds"
+            ) from None
+
+    return look_back
+
+
+def _of_decision(mapping: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a mapping be called with the decision and the call's arguments, whether it takes these or not."""
+    try:
+        parameters = list(inspect.signature(mapping).parameters.values())
+    except (TypeError, ValueError):
+        parameters = []
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if any(p.default is p.empty for p in positional[1:]) or any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        return mapping
+    return lambda decision, *args, **kwargs: mapping(decision)
 
 
 # -- legal actions --------------------------------------------------------------------------------
@@ -236,7 +316,9 @@ def _chosen(mapping: Callable[..., Any], most: int, name: str, args: Any, kwargs
 
 def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
     """Make what turns a reply into the value of a call, which for a generator function is a generator."""
-    apply = definition.apply if definition.choices is None else _unboxed
+    apply = definition.apply
+    if definition.choices is not None:
+        apply = _unboxed if apply is None else partial(_applied, apply)
     if kind == "function":
         return apply
     wrap = _returning if kind == "generator" else _awaiting
@@ -253,6 +335,11 @@ def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
 def _unboxed(box: list[Any], *args: Any, **kwargs: Any) -> Any:
     """The choice in a box, in which it crosses so that the user's side keeps nothing of it alive."""
     return box.pop()
+
+
+def _applied(apply: Callable[..., Any], box: list[Any], *args: Any, **kwargs: Any) -> Any:
+    """Do with the choice in a box what ``apply`` does."""
+    return apply(box.pop(), *args, **kwargs)
 
 
 def _returning(value: Any) -> Any:

@@ -26,7 +26,8 @@ REFUSALS: Final[Mapping[str, tuple[type[Exception], str]]] = {
     "new": (NotResetError, "there is no episode yet; call reset() first"),
     "resetting": (
         ReentrancyError,
-        "the environment was used from inside its own reset, or while another thread was resetting it",
+        "the environment was used from inside its own reset or its simulation's close, or while another thread was"
+        " resetting or closing it",
     ),
     "moving": (
         ReentrancyError,

@@ -9,6 +9,7 @@ action, or is over.
 | ``Decision`` | an agent decides | it is found or joins; it is settled, and the episode waits |
 | ``Answered`` | an agent decides for which a policy answers | it is observed, and the policy is asked |
 | ``Removed`` | a function of ``removed_by=`` is called | its agents are settled for the last time and leave |
+| ``Ended`` | the simulation calls ``end_agent`` | that agent is settled for the last time and leaves |
 | ``Told`` | a rule has decided | its action is noted |
 | ``Finished`` | ``run`` has returned | all agents end |
 | ``Failed``, ``Refused`` | the simulation has raised; a decision was refused | the error is raised |
@@ -98,12 +99,10 @@ class Removed:
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Give the agents their last rewards and observations while they are whole, and let the call go on."""
-        latest = episode.latest
         for point, name in self._named(episode, args, kwargs):
             agent = episode.agents.get(name)
             if agent is not None and agent.point is point:
                 episode.finish_agent(agent)
-        episode.latest = latest  # after whose decision the model goes on
         return RULE
 
     def _named(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[tuple[BoundPoint, Any]]:
@@ -115,6 +114,24 @@ class Removed:
                 found = point.agent or point.name_agent(args[0])
                 named.append((point, episode.named_before(point, args[0]) if found is None else found))
         return named
+
+
+class Ended:
+    """A call of the simulation's ``end_agent``.
+
+    Attributes:
+        deliver, told: None: the call always goes on, and nothing is told of its result.
+    """
+
+    deliver = told = None
+
+    def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """End the agent's episode, if it is a live agent of the environment."""
+        name = kwargs["name"] if "name" in kwargs else args[1]
+        agent = episode.agents.get(name) if isinstance(name, str) else None
+        if agent is not None:
+            episode.finish_agent(agent)
+        return RULE
 
 
 class Told:

@@ -105,7 +105,9 @@ class Participants:
 
     def finish_agent(self, agent: Agent) -> None:
         """End the episode of one agent, in the midst of the simulation's."""
+        latest = self.latest
         self.conclude(agent)
+        self.latest = latest  # after whose decision the model goes on
         agent.ended = True
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)

@@ -6,18 +6,16 @@ options. It holds no state of any episode, so that one plan serves any number of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
-from sys import modules
 from typing import Any
 
-from ..decision import DecisionPoint, Definition, unwrapped
+from ..decision import DecisionPoint, Definition
 from ..errors import (
     AgentError,
     DefinitionError,
     OptionValueError,
-    SimEnvError,
     UnknownOptionError,
     UnknownPointError,
     warn_user,
@@ -25,17 +23,21 @@ from ..errors import (
 from ..hooks.hook import Hook
 from ..hooks.plugins import Plugins
 from ..hooks.stacks import outside_simulation
-from ..simulation import RULE, positional
+from ..simulation import RULE, SimulationInterface
 from .agent import settling
-from .bound import BoundPoint, DeferredPolicy, Policy
+from .bound import BoundPoint, DeferredPolicy, given_simulation
 from .drivers import Spare
-from .events import Answered, Decision, Removed, Told
+from .events import Answered, Decision, Ended, Removed, Told
 from .options import Options
-from .points import NamedPoint, find_point, find_points, have_instances, locate, owner_class, portable, stand_ins
+from .points import NamedPoint, find_points, have_instances, locate, owner_class, portable, stand_ins
+from .roster import assign, call_the_roll, name_agents, names_agents
 from .variant import Variant
 
 RENDER_MODES = ("ansi", "human", "rgb_array")
 """What a simulation with a method ``render`` is taken to render, unless it has ``render_modes``."""
+
+END_AGENT = f"{SimulationInterface.__module__}.{SimulationInterface.end_agent.__qualname__}"
+"""Where a simulation says that an agent's episode ends."""
 
 RENDER_FPS = 4
 """How many pictures make a second, unless it has ``render_fps``."""
@@ -75,6 +77,7 @@ class Plan:
         unanswered: bool = False,
         rewarded: bool = False,
         render_fps: float = RENDER_FPS,
+        ends_agents: bool = False,
         spare: list[Spare] | None = None,
         variant: Variant | None = None,
     ) -> None:
@@ -86,24 +89,33 @@ class Plan:
             raise OptionValueError(
                 f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
             )
-        self.unanswered, self.rewarded = unanswered, rewarded
-        agents = _name_agents(named)
+        self.unanswered, self.rewarded, self._ends_agents = unanswered, rewarded, ends_agents
+        agents = name_agents(named)
         if options.agent is not None and options.agent not in agents and None not in agents:
             raise AgentError(
                 f"agent={options.agent!r} names no agent; the agents are {', '.join(filter(None, agents))}"
             )
-        by_point, self.policies, extra = _assign(options.policies or {}, named, agents)
-        everything = [*named, *extra]
+        by_point, self.policies, extra = assign(options.policies or {}, named, agents)
+        self._everything, self._by_point = [*named, *extra], by_point
+        self.hooks: list[Hook] = [point.point.hook for point in self._everything]
+        self.plugins = Plugins(options.plugins) if options.plugins else None
+        self._asks = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
+        self._bind_points()
+
+    def _bind_points(self) -> None:
+        """Make the decision points ready to be called, and find out who decides there."""
+        options, unanswered = self.options, self.unanswered
+        agents = name_agents(self._everything)
+        known = agents[: len(self._named)]
         self.points: list[Any] = []
         self.active: list[BoundPoint] = []
-        for point, agent in zip(everything, _name_agents(everything), strict=True):
-            policy = by_point.get(point.point)
-            if options.agent is not None and agent != (options.agent if options.agent in agents else None):
+        for point, agent in zip(self._everything, agents, strict=True):
+            policy = self._by_point.get(point.point)
+            if options.agent is not None and agent != (options.agent if options.agent in known else None):
                 policy = policy or RULE
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
             if policy is not RULE or excepted:  # else its rule decides
                 self._bind(point, agent, policy)
-        self.hooks: list[Hook] = [point.point.hook for point in everything]
         self.events: dict[Any, Any] = {}
         for bound in self.points:
             self.events[bound.point] = bound
@@ -111,21 +123,34 @@ class Plan:
             for other in stand_ins(bound.point):
                 self.events.setdefault(other, bound)
         self._find_removals()
+        if self._ends_agents and self.points:
+            self._cross(locate(END_AGENT)[0], Ended())
         self.decisions = {point.hook: event for point, event in self.events.items()}
-        self.plugins = Plugins(options.plugins) if options.plugins else None
         if not self.active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
         self.roster: dict[str, BoundPoint] = {}
         self.complete = False
-        if rewarded:
+        if self.rewarded:
             self.roster = {point.agent: point for point in self.active if point.agent is not None}
         else:
-            roster, self.complete = _call_the_roll(self.active, options.possible_agents)
+            roster, self.complete = call_the_roll(self.active, options.possible_agents)
             if not unanswered:
                 self.roster = {name: point for name, point in roster.items() if name not in self.policies}
         if options.agent is not None:
             self._single_out(options.agent)
         self.one_agent = self.active[0].agent or options.agent if len(self.active) == 1 else None
+
+    def with_simulation(self, simulation: Any) -> Plan:
+        """The same plan, with a simulation given to those mappings that ask for it."""
+        if not self._asks:
+            return self
+        made = Plan.__new__(Plan)
+        vars(made).update(vars(self))
+        made._everything = [
+            replace(point, definition=given_simulation(point.definition, simulation)) for point in self._everything
+        ]
+        made._bind_points()
+        return made
 
     def _bind(self, named: NamedPoint, agent: str | None, policy: Any) -> None:
         """Bind a decision point that does not run its rule."""
@@ -201,7 +226,7 @@ class Plan:
         for binding in self.points:
             for name, agent in binding.definition.removed_by.items():
                 point, _ = locate(name)
-                removal = self.events.setdefault(point, Removed(point))
+                removal = self._cross(point, Removed(point))
                 if not isinstance(removal, Removed):
                     raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
                 owner, remover = owner_class(binding.point), owner_class(point)
@@ -212,8 +237,12 @@ class Plan:
                         " of the call's arguments that names the agent"
                     )
                 removal.of.append((binding, agent, owner))
-                if point.hook not in self.hooks:
-                    self.hooks.append(point.hook)
+
+    def _cross(self, point: DecisionPoint, event: Any) -> Any:
+        """Have an event cross where a function is called, unless one does already; return the one that does."""
+        if point.hook not in self.hooks:
+            self.hooks.append(point.hook)
+        return self.events.setdefault(point, event)
 
     @classmethod
     def draw_up(
@@ -252,10 +281,11 @@ class Plan:
             spare.append(made)
             model = made.simulation
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
-        named = find_points(points, model, required=not unanswered or _names_agents(checked.policies))
+        named = find_points(points, model, required=not unanswered or names_agents(checked.policies))
         return cls(
             source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded,
             render_fps=getattr(model, "render_fps", RENDER_FPS), spare=spare, variant=variant,
+            ends_agents=issubclass(model if isinstance(model, type) else type(model), SimulationInterface),
         )  # fmt: skip
 
     def __deepcopy__(self, memory: Any) -> Plan:
@@ -320,7 +350,7 @@ class Plan:
     def _like(self, named: list[NamedPoint], options: Options) -> Plan:
         return Plan(
             self.source, named, options, self.render_modes, render_fps=self.render_fps, spare=self._spare,
-            variant=self.variant,
+            variant=self.variant, ends_agents=self._ends_agents,
         )  # fmt: skip
 
 
@@ -328,107 +358,3 @@ def _remade(source: Any, points: Any, options: dict[str, Any], variant: Variant 
     plan = Plan.draw_up(source, points, options, unanswered=unanswered)
     plan.variant = variant
     return plan
-
-
-def _names_agents(policies: Mapping[Any, Any] | None) -> bool:
-    """Whether some policy's key names no point by itself, so that the agents of all points are to be known."""
-    return any(isinstance(key, str) and "." not in key for key in policies or {})
-
-
-def _name_agents(named: list[NamedPoint]) -> list[str | None]:
-    """Name the agent of each point; None where a callable does it."""
-    given = [point.definition.agent for point in named]
-    owners: dict[str, str] = {}
-    for point, agent in zip(named, given, strict=True):
-        if isinstance(agent, str):
-            if agent in owners:
-                raise AgentError(f"{owners[agent]} and {point.point.name} have the same agent {agent!r}")
-            owners[agent] = point.point.name
-    names: list[str | None] = []
-    for point, agent in zip(named, given, strict=True):
-        number = 0
-        while agent is None and (name := f"{point.point.letters}_{number}") in owners:
-            number += 1
-        if agent is None:
-            agent, owners[name] = name, point.point.name
-        names.append(agent if isinstance(agent, str) else None)
-    return names
-
-
-def _call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, BoundPoint], bool]:
-    """Find out which agents are known beforehand, and whether these are all."""
-    named = [binding for binding in active if binding.agent is None]
-    names: dict[BoundPoint, list[Any]] = {}
-    if isinstance(declared, Mapping):
-        for key, value in declared.items():
-            point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
-            if point is None:
-                raise OptionValueError(
-                    f"possible_agents names {key!r}, which is no active decision point whose agents are named by a"
-                    f" callable; those are {[b.point.name for b in named]}"
-                )
-            names[point] = value
-    elif declared is not None:
-        others = [name for name in declared if name not in [b.agent for b in active]]
-        if len(named) > 1 or (others and not named):
-            raise OptionValueError(
-                "possible_agents must be a dict from decision point to names where"
-                f" {len(named)} points name their agents by a callable"
-            )
-        names = dict.fromkeys(named, others)
-    roster: dict[str, BoundPoint] = {}
-    for binding in active:
-        for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
-            if not isinstance(name, str) or name in roster:
-                raise AgentError(f"possible_agents must be names, and each but once, not {name!r}")
-            roster[name] = binding
-    return roster, not named or declared is not None
-
-
-def _assign(
-    policies: Mapping[Any, Any], named: list[NamedPoint], agents: list[str | None]
-) -> tuple[dict[DecisionPoint, Any], dict[str, Any], list[NamedPoint]]:
-    """Find out whom each policy answers for: a point (maybe one that was not named yet) or an agent."""
-    by_point: dict[DecisionPoint, Any] = {}
-    by_agent: dict[str, Any] = {}
-    extra: list[NamedPoint] = []
-    for key, value in policies.items():
-        policy = value if value is RULE else two_arguments(value)
-        if isinstance(key, str) and key in agents:
-            by_agent[key] = policy
-            continue
-        point = next((p for p in named if key == p.point.name or unwrapped(key) is p.point.rule), None)
-        if point is None:
-            try:
-                point = find_point(key)
-            except SimEnvError as error:
-                if policy is RULE and isinstance(error, DefinitionError):
-                    continue  # its rule decides there anyway
-                if isinstance(error, UnknownPointError) and None in agents and not _is_path(key):
-                    by_agent[key] = policy  # an agent that a callable may name
-                    continue
-                names = sorted([a for a in agents if a] + [p.point.name for p in named])
-                raise UnknownPointError(
-                    f"policies names {key!r}, which is neither an agent nor a decision point ({error});"
-                    f" known are {', '.join(names)}"
-                ) from error
-            if not any(point.point is other.point for other in (*named, *extra)):
-                extra.append(point)
-        by_point[point.point] = policy
-    return by_point, by_agent, extra
-
-
-def _is_path(key: Any) -> bool:
-    """Whether a key can only be the dotted name of something in a module, and not the name of an agent."""
-    if not isinstance(key, str):
-        return True
-    first, second = (*key.split("."), "")[:2]
-    return bool(second) and (f"{first}.{second}" in modules or hasattr(modules.get(first), second))
-
-
-def two_arguments(policy: Callable[..., Any]) -> Policy:
-    """Let a policy be called with observation and info, whether it takes the info or not."""
-    parameters = positional(policy)
-    if len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info"):
-        return policy
-    return lambda observation, info: policy(observation)

@@ -58,6 +58,9 @@ class Session:
         self._np_random: np.random.Generator | None = None
         self._closed = False
         self._starting = False
+        self._open = False  # whether the simulation was reset and not closed since
+        self._worn = False  # whether it was given up: what then may still use it is to meet no other episode
+        self._bound: tuple[Any, Any, Plan] | None = None
         self._held: list[Any] = []  # what is set, and is to be put back
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.claim = Claim() if plan.options.driver == "thread" else None
@@ -92,6 +95,7 @@ class Session:
         before = self._driver
         if before is None or not before.usable:
             if before is not None:
+                self._worn = self._worn or before.given_up is not None
                 before.end()  # first, so that an interrupt leaves no stack that is not known here
             make = DRIVERS[self.plan.options.driver]
             # Generators of the simulation's own must be put in place around each step.
@@ -145,11 +149,30 @@ class Session:
         """
         with self.claimed():
             self.end()
+            self._close_simulation()
             try:
                 self._closed, self._starting = False, True
                 return self._begin(seed, options, when, script)
             finally:
                 self._starting = False
+
+    def _close_simulation(self) -> None:
+        """Call the simulation's ``close`` on its stack, once for each reset that has succeeded."""
+        close = getattr(self.simulation, "close", None)
+        if not self._open or close is None:
+            return
+        self._open, self._starting = False, True
+        try:
+            with self.at_work():
+                self._run(close)
+        finally:
+            self._starting = False
+
+    def _plan_of_simulation(self) -> Plan:
+        """The plan, with the simulation given to those mappings that ask for it."""
+        if self._bound is None or self._bound[0] is not self.plan or self._bound[1] is not self.simulation:
+            self._bound = self.plan, self.simulation, self.plan.with_simulation(self.simulation)
+        return self._bound[2]
 
     def _begin(
         self,
@@ -165,8 +188,9 @@ class Session:
         else:
             self._np_random, self.np_random_seed = None, seed  # made when a seed is drawn from it
         self.seed = seed
-        if self._driver is not None and self._driver.given_up is not None:
-            self._make_simulation()  # what was given up may still be using the one before
+        if self._worn or (self._driver is not None and self._driver.given_up is not None):
+            self._make_simulation()
+            self._worn = False
         context = copy_context()
         try:
             with self.at_work():
@@ -176,10 +200,11 @@ class Session:
         except BaseException as error:
             annotate(error, f"simenv_marl: while the simulation was reset; seed {seed}")
             raise
-        driver = self._usable_driver()
+        self._open = True
+        driver, plan = self._usable_driver(), self._plan_of_simulation()
         run = self.simulation.run if self._rng is None else self._rng.around(self.simulation.run)
-        driver.prepare(run, self.plan.decisions, context)
-        episode = Episode(self.plan, self.simulation, driver, seed, when, (self._rng, self.claim), script)
+        driver.prepare(run, plan.decisions, context)
+        episode = Episode(plan, self.simulation, driver, seed, when, (self._rng, self.claim), script)
         try:
             self.episode = episode  # whenever an interrupt comes from now on, its end is seen to
             episode.begin()
@@ -289,17 +314,32 @@ class Session:
         finally:
             if self.episode is None and not self._starting:
                 self._closed = True
-                self._end_stack()
-                self._let_go_of_patches()
+                try:
+                    self._close_simulation()
+                finally:
+                    self._end_stack()
+                    self._let_go_of_patches()
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
         try:
+            left = self.episode is not None and self.episode.running and not self._reachable()
             if self.episode is not None:
                 self.episode.abandon()
+            if not left:  # else it is still to unwind, in another thread
+                self._close_abandoned()
         finally:
             self._end_stack()
             self._let_go_of_patches()
+
+    def _close_abandoned(self) -> None:
+        try:
+            self._close_simulation()
+        except Exception as error:
+            warn_user(f"a simulation that was abandoned raised {error!r} when it was closed", ResourceWarning)
+
+    def _reachable(self) -> bool:
+        return self._driver is not None and self._driver.reachable()
 
     def _hold_patches(self) -> None:
         if self._held:

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..core.agent import Agent
+from ..core.bound import asks_for_simulation
 from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.session import Session
@@ -180,17 +181,22 @@ def _with_goals(definition: Definition) -> Definition:
     assert achieved is not None
     assert desired is not None
 
+    parts = {"observation": observe, "achieved_goal": achieved, "desired_goal": desired}
+
     def observe_with_goals(*args: Any, **kwargs: Any) -> dict[str, Any]:
-        return {
-            "observation": observe(*args, **kwargs),
-            "achieved_goal": achieved(*args, **kwargs),
-            "desired_goal": desired(*args, **kwargs),
-        }
+        return {key: part(*args, **kwargs) for key, part in parts.items()}
+
+    asking = {key for key, part in parts.items() if asks_for_simulation(part)}
+
+    def observe_with_simulation(*args: Any, _simulation: Any, **kwargs: Any) -> dict[str, Any]:
+        given = {"_simulation": _simulation}
+        return {key: part(*args, **kwargs, **given if key in asking else {}) for key, part in parts.items()}
 
     space = spaces.Dict(
         {"observation": definition.observation_space, "achieved_goal": goal_space, "desired_goal": goal_space}
     )
-    return replace(definition, observation_space=space, observation_space_mapping=observe_with_goals)
+    mapping = observe_with_simulation if asking else observe_with_goals
+    return replace(definition, observation_space=space, observation_space_mapping=mapping)
 
 
 def single_view(plan: Plan) -> type[SimulationEnv]:

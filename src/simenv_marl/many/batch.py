@@ -16,9 +16,11 @@ from typing import Any, Final, Protocol
 
 from ..core.bound import BoundPoint, DeferredPolicy
 from ..core.episode import Episode, When
-from ..core.plan import Plan, two_arguments
+from ..core.plan import Plan
+from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.stacking import rows, stacker
+from ..decision import DecisionPoint
 from ..errors import InvalidActionError, annotate
 from ..hooks.stacks import outside_simulation
 from ..simulation import RULE, positional
@@ -78,13 +80,13 @@ class PolicyKey(DeferredPolicy):
     def __init__(self, place: int, asked: BatchPolicy) -> None:
         self.place = place
         self.asked = asked
-        self._groups: dict[BoundPoint, Group] = {}
+        self._groups: dict[DecisionPoint, Group] = {}
 
     def group(self, point: BoundPoint) -> Group:
         """The group of its decisions at a point."""
-        group = self._groups.get(point)
+        group = self._groups.get(point.point)
         if group is None:
-            group = self._groups[point] = self.asked.group(point)
+            group = self._groups[point.point] = self.asked.group(point)
         return group
 
     def __call__(self, observation: Any, info: Any) -> Any:
@@ -328,13 +330,14 @@ class _Batches:
 
     def _end(self, place: int) -> None:
         session = self._sessions[place]
-        session.close()  # it may have been truncated
-        del self._sessions[place]
+        session.end()  # it may have been truncated
         try:
             self._finish(place, session.simulation)
+            session.close()
         except BaseException as error:
             annotate(error, f"simenv_marl: after the simulation's end; seed {self._seeds[place]}")
             raise
+        del self._sessions[place]
 
     def _unwind(self, error: BaseException) -> None:
         """Unwind what is suspended, after an error in one of them."""

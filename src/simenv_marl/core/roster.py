@@ -1,0 +1,117 @@
+"""Which agents decide at which points, as far as that is known beforehand, and which policies answer for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from sys import modules
+from typing import Any
+
+from ..decision import DecisionPoint, unwrapped
+from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError
+from ..simulation import RULE, positional
+from .bound import BoundPoint, Policy
+from .points import NamedPoint, find_point
+
+
+def names_agents(policies: Mapping[Any, Any] | None) -> bool:
+    """Whether some policy's key names no point by itself, so that the agents of all points are to be known."""
+    return any(isinstance(key, str) and "." not in key for key in policies or {})
+
+
+def name_agents(named: list[NamedPoint]) -> list[str | None]:
+    """Name the agent of each point; None where a callable does it."""
+    given = [point.definition.agent for point in named]
+    owners: dict[str, str] = {}
+    for point, agent in zip(named, given, strict=True):
+        if isinstance(agent, str):
+            if agent in owners:
+                raise AgentError(f"{owners[agent]} and {point.point.name} have the same agent {agent!r}")
+            owners[agent] = point.point.name
+    names: list[str | None] = []
+    for point, agent in zip(named, given, strict=True):
+        number = 0
+        while agent is None and (name := f"{point.point.letters}_{number}") in owners:
+            number += 1
+        if agent is None:
+            agent, owners[name] = name, point.point.name
+        names.append(agent if isinstance(agent, str) else None)
+    return names
+
+
+def call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, BoundPoint], bool]:
+    """Find out which agents are known beforehand, and whether these are all."""
+    named = [binding for binding in active if binding.agent is None]
+    names: dict[BoundPoint, list[Any]] = {}
+    if isinstance(declared, Mapping):
+        for key, value in declared.items():
+            point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
+            if point is None:
+                raise OptionValueError(
+                    f"possible_agents names {key!r}, which is no active decision point whose agents are named by a"
+                    f" callable; those are {[b.point.name for b in named]}"
+                )
+            names[point] = value
+    elif declared is not None:
+        others = [name for name in declared if name not in [b.agent for b in active]]
+        if len(named) > 1 or (others and not named):
+            raise OptionValueError(
+                "possible_agents must be a dict from decision point to names where"
+                f" {len(named)} points name their agents by a callable"
+            )
+        names = dict.fromkeys(named, others)
+    roster: dict[str, BoundPoint] = {}
+    for binding in active:
+        for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
+            if not isinstance(name, str) or name in roster:
+                raise AgentError(f"possible_agents must be names, and each but once, not {name!r}")
+            roster[name] = binding
+    return roster, not named or declared is not None
+
+
+def assign(
+    policies: Mapping[Any, Any], named: list[NamedPoint], agents: list[str | None]
+) -> tuple[dict[DecisionPoint, Any], dict[str, Any], list[NamedPoint]]:
+    """Find out whom each policy answers for: a point (maybe one that was not named yet) or an agent."""
+    by_point: dict[DecisionPoint, Any] = {}
+    by_agent: dict[str, Any] = {}
+    extra: list[NamedPoint] = []
+    for key, value in policies.items():
+        policy = value if value is RULE else two_arguments(value)
+        if isinstance(key, str) and key in agents:
+            by_agent[key] = policy
+            continue
+        point = next((p for p in named if key == p.point.name or unwrapped(key) is p.point.rule), None)
+        if point is None:
+            try:
+                point = find_point(key)
+            except SimEnvError as error:
+                if policy is RULE and isinstance(error, DefinitionError):
+                    continue  # its rule decides there anyway
+                if isinstance(error, UnknownPointError) and None in agents and not _is_path(key):
+                    by_agent[key] = policy  # an agent that a callable may name
+                    continue
+                names = sorted([a for a in agents if a] + [p.point.name for p in named])
+                raise UnknownPointError(
+                    f"policies names {key!r}, which is neither an agent nor a decision point ({error});"
+                    f" known are {', '.join(names)}"
+                ) from error
+            if not any(point.point is other.point for other in (*named, *extra)):
+                extra.append(point)
+        by_point[point.point] = policy
+    return by_point, by_agent, extra
+
+
+def _is_path(key: Any) -> bool:
+    """Whether a key can only be the dotted name of something in a module, and not the name of an agent."""
+    if not isinstance(key, str):
+        return True
+    first, second = (*key.split("."), "")[:2]
+    return bool(second) and (f"{first}.{second}" in modules or hasattr(modules.get(first), second))
+
+
+def two_arguments(policy: Callable[..., Any]) -> Policy:
+    """Let a policy be called with observation and info, whether it takes the info or not."""
+    parameters = positional(policy)
+    if len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info"):
+        return policy
+    return lambda observation, info: policy(observation)

@@ -1,0 +1,261 @@
+"""The simulation's ``close``: once for each reset that has succeeded, after the last observations."""
+
+import gc
+import sqlite3
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+
+from simenv_marl import (
+    ReentrancyError,
+    aec_env,
+    branch,
+    collect_episodes,
+    joint_env,
+    make_step,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
+
+BOOK = f"{__name__}.Shop.book"
+LOG = []
+
+
+class Shop:
+    """Keeps its books in a database, which the last observation reads."""
+
+    fails = False
+
+    def reset(self, seed=None):
+        if seed == 13:
+            raise ValueError("no shop today")
+        LOG.append(("reset", seed))
+        self.seed = seed
+        self.books = sqlite3.connect(":memory:")
+        self.books.execute("create table sold (number integer)")
+
+    def run(self):
+        try:
+            for _ in range(2):
+                self.books.execute("insert into sold values (?)", (self.book(),))
+        finally:
+            LOG.append(("unwound", self.seed))
+
+    def book(self):
+        return 1
+
+    def sold(self):
+        if self.books is None:
+            raise AssertionError("observed after it was closed")
+        return self.books.execute("select sum(number) from sold").fetchone()[0] or 0
+
+    def state(self):
+        return np.array([self.sold()])
+
+    def close(self):
+        self.books.close()
+        self.books = None
+        LOG.append(("close", self.seed))
+        if self.fails:
+            raise ConnectionError("the books cannot be closed")
+
+
+class Broken(Shop):
+    fails = True
+
+
+@pytest.fixture(autouse=True)
+def _log():
+    LOG.clear()
+
+
+@pytest.fixture
+def books(_driver, request):
+    """The decision point. With the driver of threads, mappings cannot use what belongs to the simulation's thread."""
+    apart = "thread" in request.node.name
+
+    def sold(shop):
+        assert shop.books is not None
+        return 0 if apart else shop.sold()
+
+    return {
+        BOOK: make_step(
+            observation_space=spaces.Box(0, 100, (1,), np.float64),
+            observation_space_mapping=lambda shop: [sold(shop)],
+            action_space=spaces.Discrete(9),
+            action_space_mapping=lambda action: action,
+            reward_mapping=sold,
+            agent="clerk",
+        )
+    }
+
+
+def of(what):
+    return [seed for kind, seed in LOG if kind == what]
+
+
+def test_it_comes_before_the_next_reset_and_when_the_environment_is_closed(books) -> None:
+    env = single_env(Shop, books)
+    env.reset(seed=1)
+    env.step(3)
+    *_, terminated, _, _ = env.step(4)
+    assert terminated
+    assert of("close") == []
+    env.reset(seed=2)
+    assert LOG == [("reset", 1), ("unwound", 1), ("close", 1), ("reset", 2)]
+    env.close()
+    assert LOG[4:] == [("unwound", 2), ("close", 2)]
+    env.close()
+    env.reset(seed=3)
+    env.close()
+    assert of("close") == [1, 2, 3]
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env, single_env])
+def test_an_environment_that_is_gone_closes_its_simulation(books, make) -> None:
+    env = make(Shop, books)
+    env.reset(seed=1)
+    del env
+    gc.collect()
+    assert LOG == [("reset", 1), ("unwound", 1), ("close", 1)]
+
+
+def test_a_reset_that_fails_has_nothing_to_close(books) -> None:
+    env = single_env(Shop, books)
+    with pytest.raises(ValueError, match="no shop"):
+        env.reset(seed=13)
+    env.close()
+    assert LOG == []
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="no shop"):
+        env.reset(seed=13)
+    env.close()
+    assert of("close") == [1]
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_vector_environments_close_each_before_it_begins_anew(books, mode) -> None:
+    env = vector_env(Shop, books, num_envs=2, autoreset_mode=mode)
+    env.reset(seed=1)
+    for _ in range(2):
+        env.step(np.ones(2, np.int64))
+    if mode == AutoresetMode.NEXT_STEP:
+        assert of("close") == []
+        env.step(np.ones(2, np.int64))
+    elif mode == AutoresetMode.DISABLED:
+        env.reset(options={"reset_mask": np.ones(2, np.bool_)})
+    assert of("close") == [1, 2]
+    env.close()
+    assert len(of("close")) == len(of("reset")) == 4
+
+
+def test_runners_close_what_they_have_run_after_it_was_collected(books) -> None:
+    def collect(shop):
+        assert shop.books is not None
+        LOG.append(("collect", shop.seed))
+
+    policies = {BOOK: lambda observations: np.ones(len(observations), np.int64)}
+    simulate_many(Shop, policies, seeds=[1, 2, 3], points=books, collect=collect, batch_size=2)
+    assert sorted(of("close")) == sorted(of("collect")) == [1, 2, 3]
+    LOG.clear()
+    collect_episodes(Shop, policies, seeds=[1, 2], points=books, collect=collect)
+    assert of("close") == of("collect") == [1, 2]
+    LOG.clear()
+    simulate(Shop, {BOOK: lambda observation: 2}, points=books, seed=4)
+    assert LOG == [("reset", 4), ("unwound", 4), ("close", 4)]
+
+
+def test_an_error_in_collect_closes_all_the_same(books) -> None:
+    def collect(shop):
+        raise LookupError("nothing to keep")
+
+    with pytest.raises(LookupError):
+        simulate_many(Shop, None, seeds=[1, 2], points=books, collect=collect)
+    assert of("close") == of("reset")
+
+
+def test_its_error_is_raised_by_the_next_reset_or_by_close(books) -> None:
+    env = single_env(Broken, books)
+    env.reset(seed=1)
+    with pytest.raises(ConnectionError):
+        env.reset(seed=2)
+    assert of("reset") == [1]
+    env.reset(seed=3)
+    with pytest.raises(ConnectionError):
+        env.close()
+    env.close()
+    assert of("close") == [1, 3]
+    assert Broken.book is Broken.__dict__.get("book", Shop.book)
+
+
+def test_its_error_is_a_warning_where_nobody_can_catch_it(books) -> None:
+    envs = [single_env(Broken, books)]
+    envs[0].reset(seed=1)
+    with pytest.warns(ResourceWarning, match="books cannot be closed"):
+        envs.clear()
+
+
+def test_the_state_comes_before_it(books) -> None:
+    env = aec_env(Shop, books, driver="greenlet")
+    env.reset(seed=1)
+    env.step(3)
+    env.step(4)
+    assert env.state().tolist() == [7]
+    env.close()
+    assert of("close") == [1]
+
+
+def test_what_it_uses_belongs_to_the_stack_on_which_it_was_made(books) -> None:
+    # sqlite refuses to close a connection in a thread that has not opened it.
+    env = single_env(Shop, books)
+    env.reset(seed=1)
+    env.step(3)
+    env.close()
+    assert of("close") == [1]
+
+
+def test_branches_end_without_it(books) -> None:
+    env = single_env(Shop, books, driver="greenlet")
+    env.reset(seed=1)
+    results = branch(env, lambda twin, number: len(of("close")), 2, method="fork")
+    assert results == [0, 0]
+    assert of("close") == []
+    env.close()
+
+
+@pytest.mark.parametrize("use", ["step", "reset", "close"])
+def test_the_environment_cannot_be_used_from_inside(books, use) -> None:
+    caught = []
+
+    class Meddling(Shop):
+        def close(self):
+            try:
+                getattr(env, use)(*((1,) if use == "step" else ()))
+            except Exception as error:
+                caught.append(type(error))
+            super().close()
+
+    env = single_env(Meddling, books)
+    env.reset(seed=1)
+    env.close()
+    assert of("close") == [1]
+    assert len(caught) == 1
+    if use != "step":
+        assert issubclass(caught[0], ReentrancyError)
+
+
+def test_simulations_that_have_none_need_none(books) -> None:
+    class Plain(Shop):
+        close = None
+
+    env = single_env(Plain, books)
+    env.reset(seed=1)
+    env.close()
+    assert of("close") == []
+    assert isinstance(env, gymnasium.Env)

@@ -1,0 +1,271 @@
+"""What mappings are given: the simulation, where they ask for it; a chosen answer, where there are choices."""
+
+import gc
+import pickle
+import weakref
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    SimulationInterface,
+    aec_env,
+    collect_episodes,
+    difference,
+    joint_env,
+    make_step,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
+
+DEAL = f"{__name__}.Dealer.deal"
+LEAVE = f"{__name__}.Dealer.leave"
+
+
+class Dealer:
+    """Has no way to what it belongs to."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def deal(self, offers):
+        return ("rule", offers[0])
+
+    def leave(self):
+        """Deal no more."""
+
+
+class Market(SimulationInterface):
+    """Two dealers, who deal once a day."""
+
+    days = 3
+
+    def __init__(self, name="market"):
+        self.name = name
+
+    def reset(self, seed=None):
+        self.seed, self.day, self.dealers, self.log = seed, 0, [Dealer(0), Dealer(1)], []
+
+    def run(self):
+        for day in range(self.days):
+            self.day = day
+            for dealer in list(self.dealers):
+                self.log.append(dealer.deal(["low", "high"]))
+        self.dealers.pop().leave()
+
+    def expected_calls(self, point):
+        return [(dealer, ["low", "high"]) for dealer in self.dealers]
+
+
+def watch(dealer, offers, *, _simulation):
+    return [_simulation.day, _simulation.seed]
+
+
+def pay(dealer, offers, *, _simulation):
+    return len(_simulation.log)
+
+
+def offer(dealer, offers, *, _simulation):
+    return offers if _simulation.day else offers[:1]
+
+
+def take(offered, dealer, offers, *, _simulation):
+    return (_simulation.name, offered)
+
+
+def name(dealer, offers=(), *, _simulation):
+    return f"{_simulation.name}_{dealer.number}"
+
+
+def gone(dealer, *, _simulation):
+    return name(dealer, _simulation=_simulation)
+
+
+def points(**changes):
+    given = {
+        "observation_space": spaces.Box(0, 1e6, (2,), np.float64),
+        "observation_space_mapping": watch,
+        "action_space": spaces.Discrete(2),
+        "choices": offer,
+        "apply": take,
+        "reward_mapping": pay,
+        "agent": name,
+        "removed_by": {LEAVE: gone},
+    }
+    return {DEAL: make_step(**given | changes)}
+
+
+def played(env, seed=5):
+    """What an AEC environment tells when the last choice is taken, and what the model got."""
+    told = []
+    env.reset(seed=seed)
+    for agent in env.agent_iter():
+        observation, reward, terminated, truncated, info = env.last()
+        told.append((agent, observation.tolist(), reward, terminated))
+        env.step(None if terminated or truncated else int(info["action_mask"].sum()) - 1)
+    return told, env.unwrapped.simulation.log
+
+
+FIRST_DAY = [("market_0", [0, 5], 0.0, False), ("market_1", [0, 5], 0.0, False)]
+
+
+def test_each_kind_of_mapping_gets_the_simulation() -> None:
+    told, log = played(aec_env(Market, points()))
+    assert told[:3] == [*FIRST_DAY, ("market_0", [1, 5], 2.0, False)]
+    assert told[-2:] == [("market_1", [2, 5], 6.0, True), ("market_0", [2, 5], 6.0, True)]
+    assert log == [("market", "low")] * 2 + [("market", "high")] * 4
+
+
+def test_each_environment_gets_its_own() -> None:
+    envs = [aec_env(Market(title), points()) for title in ("here", "there")]
+    for env in envs:
+        env.reset(seed=1)
+    assert [env.agent_selection for env in envs] == ["here_0", "there_0"]
+    for env in envs:
+        env.step(0)
+    assert [env.unwrapped.simulation.log for env in envs] == [[("here", "low")], [("there", "low")]]
+
+
+def test_the_action_space_mapping_gets_it_and_so_do_masks_and_actions_of_the_rule() -> None:
+    changes = {
+        "choices": None,
+        "apply": None,
+        "action_space_mapping": lambda action, *, _simulation: (_simulation.name, int(action)),
+        "action_mask_mapping": lambda dealer, offers, *, _simulation: [1, min(_simulation.day, 1)],
+        "rule_action_mapping": lambda decision, *, _simulation: _simulation.day and 1,
+    }
+    env = aec_env(Market, points(**changes))
+    env.reset(seed=1)
+    assert env.last()[-1]["action_mask"].tolist() == [1, 0]
+    env.step(0)
+    env.step(RULE)
+    env.step(RULE)
+    env.step(1)
+    assert env.unwrapped.simulation.log == [("market", 0), ("rule", "low"), ("rule", "low"), ("market", 1)]
+    assert env.last()[-1]["rule_action"] == 1
+
+
+def test_a_difference_gets_it() -> None:
+    def sold(dealer, offers, *, _simulation):
+        return len(_simulation.log)
+
+    told, _ = played(aec_env(Market, points(reward_mapping=difference(sold))))
+    assert [reward for agent, _, reward, _ in told if agent == "market_0"] == [0, 2, 2, 2]
+
+
+def test_goals_get_it() -> None:
+    def reached(dealer, offers, *, _simulation):
+        return [_simulation.day]
+
+    env = single_env(
+        Market,
+        points(
+            goal_space=spaces.Box(0, 9, (1,), np.float64),
+            achieved_goal_mapping=reached,
+            desired_goal_mapping=lambda dealer, offers: [2],
+            compute_reward=lambda achieved, desired, info: 0.0,
+        ),
+        agent="market_0",
+    )
+    env.reset(seed=4)
+    observation = env.step(0)[0]
+    assert {key: value.tolist() for key, value in observation.items()} == {
+        "observation": [1, 4], "achieved_goal": [1], "desired_goal": [2],
+    }  # fmt: skip
+
+
+def test_every_view_and_runner_has_it() -> None:
+    roster = {"possible_agents": ["market_0", "market_1"]}
+    parallel = parallel_env(Market, points(), **roster)
+    assert parallel.reset(seed=2)[0]["market_1"].tolist() == [0, 2]
+    assert parallel.step({"market_0": 0, "market_1": 0})[1] == {"market_0": 2.0, "market_1": 2.0}
+    assert joint_env(Market, points()).reset(seed=2)[0]["market_1"].tolist() == [0, 2]
+    vector = vector_env(Market, points(), agent="market_1", num_envs=2)
+    assert vector.reset(seed=2)[0].tolist() == [[0, 2], [0, 3]]
+    assert vector.step(np.zeros(2, np.int64))[0].tolist() == [[1, 2], [1, 3]]
+    vector.close()
+    first = {DEAL: lambda observation: 0}
+    assert simulate(Market, first, points=points(), seed=1).log == [("market", "low")] * 6
+    batched = {DEAL: lambda observations: np.zeros(len(observations), np.int64)}
+    days = simulate_many(Market, batched, seeds=range(3), points=points(), collect=lambda market: market.log)
+    assert days == [[("market", "low")] * 6] * 3
+    made = collect_episodes(Market, batched, seeds=range(3), points=points())[DEAL]
+    assert made.names == ("market_0", "market_1")
+    assert made.observations[:, 1].tolist() == [0] * 6 + [1] * 6 + [2] * 6
+
+
+def test_copies_have_their_own() -> None:
+    env = aec_env(Market, points())
+    env.reset()
+    env.close()
+    again = pickle.loads(pickle.dumps(env))
+    assert played(again) == played(env)
+
+
+@pytest.mark.parametrize("episodes", [0, 1, 2])
+def test_nothing_is_kept_alive(episodes) -> None:
+    env = aec_env(Market, points())
+    for _ in range(episodes):
+        env.reset(seed=1)
+    simulation = weakref.ref(env.unwrapped.simulation)
+    env.close()
+    del env
+    gc.collect()
+    assert simulation() is None
+
+
+def test_a_parameter_that_may_be_passed_by_position_is_none_of_it() -> None:
+    env = aec_env(
+        Market, points(reward_mapping=lambda dealer, offers, _simulation=None: float(_simulation is not None))
+    )
+    told, _ = played(env)
+    assert {reward for _, _, reward, _ in told} == {0.0}
+
+
+# -- choices with apply ---------------------------------------------------------------------------
+
+
+class Desk(Dealer):
+    """Books what it deals, and returns nothing."""
+
+    def __init__(self, number):
+        super().__init__(number)
+        self.booked = []
+
+    def deal(self, offers):
+        self.booked.append(offers[-1])
+
+
+class Office(Market):
+    def run(self):
+        desk = Desk(0)
+        for _ in range(2):
+            assert desk.deal([{"price": 1}, {"price": 2}]) is None
+        self.log = desk.booked
+
+
+def test_apply_gets_the_chosen_answer_in_place_of_the_action() -> None:
+    made = make_step(
+        observation_space=spaces.Discrete(2),
+        observation_space_mapping=lambda desk, offers: 0,
+        action_space=spaces.Discrete(4),
+        choices=lambda desk, offers: offers,
+        apply=lambda offered, desk, offers: desk.booked.append(offered),
+        reward_mapping=lambda desk, offers: 0.0,
+        agent="desk",
+    )
+    named = {f"{__name__}.Desk.deal": made}
+    env = single_env(Office, named)
+    _, info = env.reset()
+    assert info["action_mask"].tolist() == [1, 1, 0, 0]
+    env.step(0)
+    assert env.step(RULE)[2]
+    assert env.simulation.log == [{"price": 1}, {"price": 2}]
+    assert simulate(Office, {"desk": lambda observation: 1}, points=named).log == [{"price": 2}] * 2
+    assert isinstance(env, gymnasium.Env)

@@ -522,6 +522,7 @@ def test_answers_of_policies_are_replayed_as_they_were_given():
 # -- what a fork would share ----------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 @settings(max_examples=40)
 @given(st.integers(0, 2**31), st.integers(0, 11))
 def test_files_and_global_generators_go_on_exactly(seed, taken):

@@ -1,6 +1,7 @@
 """The joint view: one agent that takes all decisions."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -344,8 +345,18 @@ def test_a_roster_that_is_not_known_is_refused():
         def run(self):
             pass
 
+    for make in (joint_env, partial(vector_env, num_envs=2)):
+        with pytest.raises(ViewError, match=r"possible_agents=.*expected_calls.*agent="):
+            make(Nobody, beings())
+        with pytest.raises(ViewError, match="known when the environment is made"):
+            make(Pack, beings())
+
+    class Announced(Nobody):
+        def expected_calls(self, point):
+            return []
+
     with pytest.raises(NoDecisionError, match="without a decision"):
-        joint_env(Nobody, beings())
+        joint_env(Announced, beings())
 
 
 def test_one_simulation_alone_is_used():

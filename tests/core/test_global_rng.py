@@ -148,6 +148,7 @@ def test_an_episode_without_a_seed_is_that_of_the_seed_that_it_drew():
     assert env.provenance()["options"] == {"global_rng": True}
 
 
+@pytest.mark.filterwarnings("ignore:.* draws from the global generator")
 def test_without_it_generators_are_everybodys():
     random.seed(5)
     env = aec_env(Casino, POINTS)

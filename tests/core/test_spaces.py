@@ -7,17 +7,8 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import MaskError, ObservationError
-from simenv_marl.core.spaces import (
-    ILLEGAL,
-    action_check,
-    blank,
-    duplicate,
-    mask_allows,
-    mask_cast,
-    observation_cast,
-    open_mask,
-    same,
-)
+from simenv_marl.core.actions import ILLEGAL, action_check, mask_allows, mask_cast, open_mask
+from simenv_marl.core.spaces import blank, duplicate, observation_cast, same
 
 BOX = spaces.Box(-1.0, 3.0, (2,), np.float32)
 BYTES = spaces.Box(0, 255, (2,), np.uint8)

@@ -574,8 +574,8 @@ def test_observations_beyond_their_bounds():
 
 def test_observations_that_are_no_number():
     changes = {"observation_space_mapping": lambda walk: [float("nan"), 0.0]}
-    found = only_error(checked(Walk, changes), "outside their space")
-    assert "[0] was nan" in found.evidence
+    found = only_error(checked(Walk, changes), "does not fit its space")
+    assert "nan" in found.evidence
     assert not [title for title in titles(checked(Walk, changes)) if "too large" in title]
 
 

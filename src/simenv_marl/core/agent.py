@@ -14,8 +14,9 @@ from greenlet import getcurrent, greenlet
 from ..errors import MaskError, RewardError
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
+from .actions import MASK
 from .bound import BoundPoint, DeferredPolicy
-from .spaces import MASK, duplicate
+from .spaces import duplicate
 
 _NOTHING: Final[dict[str, Any]] = {}
 """The keyword arguments of calls that have none. It is only ever unpacked."""
@@ -220,7 +221,7 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
                 reward_mapping(*args, **kwargs)
                 agent.decided, agent.settle_again = True, again
             if observe:
-                agent.present = True
+                first, agent.present = not agent.present, True
                 if restricted:
                     agent.restrict(args, kwargs, last=last)
                 agent.info = {} if quiet and agent.clock is None else agent.inform()
@@ -228,6 +229,8 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
                     agent.observation = point.observe(args, kwargs, agent.mask)
                 else:
                     agent.observation = cast(observation_mapping(*args, **kwargs))
+                if first and point.finite is not None:
+                    point.finite(agent.observation)
         finally:
             if here is not None:
                 _evaluated(here, before)

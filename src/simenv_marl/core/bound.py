@@ -14,9 +14,9 @@ from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
 from ..errors import InvalidActionError, MaskError, warn_user
-from . import spaces
+from . import actions, spaces
+from .actions import ILLEGAL, MASK
 from .points import NamedPoint
-from .spaces import ILLEGAL, MASK
 
 Policy = Callable[[Any, dict[str, Any]], Any]
 """A policy as the episode calls it: of the observation and the info, returns the action."""
@@ -77,6 +77,7 @@ class BoundPoint:
         policy: The policy that answers all its decisions; None: its agents' own policies, or the environment's user.
         reward_mapping, observation_mapping: The mappings.
         cast: Casts observations to their space.
+        finite: Makes sure that an observation is finite where its space is bounded; None where it is not.
         check: Checks an action against its space; returns it as its mapping is to receive it, or ``ILLEGAL``.
         convert: Turns a checked action into the reply to the simulation.
         legal: Returns the mask of a call, and the choices if it has any; None where all actions are always legal.
@@ -90,7 +91,7 @@ class BoundPoint:
     """
 
     __slots__ = (
-        "_inverse", "_rule_action", "agent", "cast", "check", "convert", "definition", "deliver", "legal",
+        "_inverse", "_rule_action", "agent", "cast", "check", "convert", "definition", "deliver", "finite", "legal",
         "masked_parts", "name_agent", "observation_mapping", "one_entity", "point", "policy", "recorded",
         "reward_mapping", "settle", "tells", "told",
     )  # fmt: skip
@@ -122,7 +123,8 @@ class BoundPoint:
         self.reward_mapping: Any = definition.reward_mapping
         self.observation_mapping: Any = definition.observation_space_mapping
         self.cast = spaces.observation_cast(definition.observation_space)
-        self.check = (spaces.clipping_check if clips else spaces.action_check)(definition.action_space)
+        self.finite = spaces.finite_check(definition.observation_space)
+        self.check = (actions.clipping_check if clips else actions.action_check)(definition.action_space)
         self.convert: Any = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
         self.tells = definition.rule_action_mapping is not None
@@ -174,11 +176,11 @@ class BoundPoint:
 
     def open_mask(self) -> Any:
         """Make the mask that allows all actions."""
-        return spaces.open_mask(self.definition.action_space)
+        return actions.open_mask(self.definition.action_space)
 
     def allows(self, mask: Any, action: Any) -> bool:
         """Whether a mask allows an action that is in the space."""
-        return spaces.mask_allows(self.definition.action_space, mask, action)
+        return actions.mask_allows(self.definition.action_space, mask, action)
 
     def checked(self, action: Any, agent: str, mask: Any) -> Any:
         """Check an action.
@@ -292,7 +294,7 @@ def _of_decision(mapping: Callable[..., Any]) -> Callable[..., Any]:
 def _legal(definition: Definition, name: str) -> Callable[[Any, Any], tuple[Any, Any]] | None:
     space: Any = definition.action_space
     if definition.action_mask_mapping is not None:
-        return partial(_masked, definition.action_mask_mapping, spaces.mask_cast(space))
+        return partial(_masked, definition.action_mask_mapping, actions.mask_cast(space))
     if definition.choices is not None:
         return partial(_chosen, definition.choices, int(space.n), name)
     return None

@@ -9,18 +9,24 @@ from typing import Any, Final
 from ..errors import (
     ClosedError,
     EpisodeOverError,
+    InvalidActionError,
     NotResetError,
     ReentrancyError,
+    UnknownAgentError,
     annotate,
     clear_frames,
     warn_user,
 )
+from ..simulation import RULE
 from .agent import Agent
 from .contexts import Claim, at_work
-from .participants import Participants
+from .participants import Participants, listed
 from .plan import Plan
 from .rng import GlobalRandom
 from .switch import BaseDriver
+
+MANY_ROUNDS: Final = 100
+"""After so many rounds without an action for the pending agent its user is warned."""
 
 REFUSALS: Final[Mapping[str, tuple[type[Exception], str]]] = {
     "new": (NotResetError, "there is no episode yet; call reset() first"),
@@ -96,12 +102,69 @@ class Ending(Participants):
         for agent in self.agents.values():
             self.conclude(agent)
         self.over, self.truncated, self.terminated = True, truncated, not truncated
+        if self._plan.wanted:
+            self._look_for_absent()
+
+    def _look_for_absent(self) -> None:
+        """Warn of agents that the environment's options name, and which have not appeared; of each once."""
+        wanted = self._plan.wanted
+        present = [name for name, agent in self.agents.items() if agent.decided or agent.observation is not None]
+        present += [*self.answered, *self.ended]
+        absent = wanted.difference(present)
+        if absent:
+            wanted -= absent
+            warn_user(
+                f"policies= or possible_agents= name agents that did not appear in the episode:"
+                f" {listed(sorted(absent))}; these did: {listed(present)}"
+            )
 
     def refusal(self) -> Exception:
         """The error that says why no action can be taken now."""
         if self.unwinding:
             return refusal("moving")
         return refusal("over" if self.over else "moving" if self.begun else "resetting")
+
+    def without_decision(self) -> str:
+        """What there is to say of an episode that has ended without a decision of its user's."""
+        points = ", ".join(point.point.name for point in self._plan.active)
+        ended = f"{type(self._simulation).__name__}.run() came to its end without a decision of"
+        if self.answered:
+            wanted = f"{self._plan.one_agent!r} at {points}" if self._plan.one_agent else points
+            return f"{ended} {wanted}; these have decided: {listed(self.answered)}"
+        return (
+            f"{ended} {points}; does the simulation call the decision functions as attributes of their class or module?"
+        )
+
+    def warn_of_standstill(self) -> None:
+        """Warn that many rounds had no action for the agent whose decision is pending."""
+        assert self.pending is not None
+        warn_user(
+            f"the last {MANY_ROUNDS} rounds had no action for {self.pending.name!r}, whose decision is pending, and so"
+            ' the simulation stands still; infos tell which agent is "deciding"'
+        )
+
+    def check(self, actions: Mapping[str, Any]) -> dict[str, Any]:
+        """Check the actions of a round as far as they can be checked before anything moves.
+
+        Returns:
+            The actions, as mappings take them.
+
+        Raises:
+            UnknownAgentError, InvalidActionError, EpisodeOverError, ReentrancyError: As ``play`` raises them.
+        """
+        pending, agents, checked = self.pending, self.agents, {}
+        if pending is None:
+            raise self.refusal()
+        if type(actions) is not dict and not isinstance(actions, Mapping):
+            raise InvalidActionError(f"a round takes a dict of actions by agent, not {actions!r}")
+        for name, action in actions.items():
+            agent = agents.get(name)
+            if agent is None:
+                raise UnknownAgentError(f"there is an action for {name!r}, which is no live agent: {self.names()}")
+            if action is not RULE:
+                action = agent.point.checked(action, name, agent.mask if agent is pending else None)
+            checked[name] = action
+        return checked
 
     def fail(self, error: BaseException) -> None:
         """End the episode for an error, which gets a note that says where it came from."""

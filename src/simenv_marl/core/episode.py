@@ -35,21 +35,19 @@ from typing import Any, Final
 from greenlet import getcurrent
 
 from ..errors import (
-    InvalidActionError,
     NoDecisionError,
-    UnknownAgentError,
 )
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE, Sentinel
+from .actions import ILLEGAL, only_choice
 from .agent import Agent
 from .bound import BoundPoint
 from .contexts import Claim
-from .ending import Ending
+from .ending import MANY_ROUNDS, Ending
 from .events import WAIT
-from .participants import listed
 from .plan import Plan
 from .rng import GlobalRandom
-from .spaces import ILLEGAL, duplicate, only_choice
+from .spaces import duplicate
 from .switch import BaseDriver
 
 LONGEST_TAPE: Final = 200_000
@@ -83,10 +81,11 @@ class Episode(Ending):
         script: The answers of another episode's tape that are yet to be given again; None where there were none.
         last_time: The time at the latest step of a joint view.
         skips: Whether decisions with one legal action are answered with it.
+        stalled: How many rounds have had no action for the pending agent since the simulation has moved.
         unheard: Whether the episode has ended so before its user was asked, who learns of it at the first step.
     """
 
-    __slots__ = ("_left", "decide", "last_time", "limit", "script", "skips", "tape", "unheard", "when")
+    __slots__ = ("_left", "decide", "last_time", "limit", "script", "skips", "stalled", "tape", "unheard", "when")
 
     def __init__(
         self,
@@ -112,7 +111,7 @@ class Episode(Ending):
         super().__init__(plan, simulation, driver, seed, around)
         self.when = when
         self.limit = plan.options.max_steps or -1  # never reached
-        self.skips, self.unheard = plan.options.skip_forced, False
+        self.skips, self.unheard, self.stalled = plan.options.skip_forced, False, 0
         self.decide: Callable[..., Any] | None = None
         if when is When.RETURN:
             self.decide = Episode._decide_in_round
@@ -145,18 +144,7 @@ class Episode(Ending):
             self.unheard = self.skips and any(agent.decided for agent in (*self.agents.values(), *self.just_ended))
             if self.unheard:
                 return
-            raise NoDecisionError(self._without_decision())
-
-    def _without_decision(self) -> str:
-        """What there is to say of an episode that has ended without a decision of its user's."""
-        points = ", ".join(point.point.name for point in self._plan.active)
-        ended = f"{type(self._simulation).__name__}.run() came to its end without a decision of"
-        if self.answered:
-            wanted = f"{self._plan.one_agent!r} at {points}" if self._plan.one_agent else points
-            return f"{ended} {wanted}; these have decided: {listed(self.answered)}"
-        return (
-            f"{ended} {points}; does the simulation call the decision functions as attributes of their class or module?"
-        )
+            raise NoDecisionError(self.without_decision())
 
     # -- answers ----------------------------------------------------------------------------------
 
@@ -301,35 +289,16 @@ class Episode(Ending):
                 agent.acted = False
             self.just_ended = []
             self._left = left
-            self.go_on(self._answer_in_round(pending))
+            reply = self._answer_in_round(pending)
+            self.stalled = self.stalled + 1 if reply is WAIT else 0
+            self.go_on(reply)
             if not self.over:
                 self._return(truncate=bool(actions) and self.turns == self.limit)
         except BaseException as error:
             self.fail(error)
             raise
-
-    def check(self, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Check the actions of a round as far as they can be checked before anything moves.
-
-        Returns:
-            The actions, as mappings take them.
-
-        Raises:
-            UnknownAgentError, InvalidActionError, EpisodeOverError, ReentrancyError: As ``play`` raises them.
-        """
-        pending, agents, checked = self.pending, self.agents, {}
-        if pending is None:
-            raise self.refusal()
-        if type(actions) is not dict and not isinstance(actions, Mapping):
-            raise InvalidActionError(f"a round takes a dict of actions by agent, not {actions!r}")
-        for name, action in actions.items():
-            agent = agents.get(name)
-            if agent is None:
-                raise UnknownAgentError(f"there is an action for {name!r}, which is no live agent: {self.names()}")
-            if action is not RULE:
-                action = agent.point.checked(action, name, agent.mask if agent is pending else None)
-            checked[name] = action
-        return checked
+        if self.stalled == MANY_ROUNDS:
+            self.warn_of_standstill()
 
     def dispatch(self, point: BoundPoint, name: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """See to a decision of an agent that was not met at this point as one of the user's.

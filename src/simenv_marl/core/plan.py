@@ -30,7 +30,7 @@ from .drivers import Spare
 from .events import Answered, Decision, Ended, Removed, Told
 from .options import Options
 from .points import NamedPoint, find_points, have_instances, locate, owner_class, portable, stand_ins
-from .roster import assign, call_the_roll, name_agents, names_agents
+from .roster import assign, call_the_roll, declared_agents, name_agents, names_agents
 from .variant import Variant
 
 RENDER_MODES = ("ansi", "human", "rgb_array")
@@ -57,6 +57,8 @@ class Plan:
         events: By decision point, what crosses from the simulation when it is called.
         decisions: The same by the point's hook, for drivers.
         policies: By name: the policies of agents that are no agents of the environment.
+        wanted: The agents that ``policies`` and ``possible_agents`` name. Those that do not appear in an episode are
+            warned of, once, and taken out.
         one_agent: The name of the one agent that the environment's user answers for; None where there may be more.
         roster: By name: the points of the agents that are known beforehand, in the order of the points.
         complete: Whether no others may join.
@@ -99,6 +101,7 @@ class Plan:
         self._everything, self._by_point = [*named, *extra], by_point
         self.hooks: list[Hook] = [point.point.hook for point in self._everything]
         self.plugins = Plugins(options.plugins) if options.plugins else None
+        self.wanted = {*self.policies, *declared_agents(options.possible_agents)}
         self._asks = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
         self._bind_points()
 
@@ -321,7 +324,9 @@ class Plan:
         for agent, binding in roster.items():
             if binding.agent is None:
                 names[binding.point.name].append(agent)
-        return self.amended({"possible_agents": names})
+        plan = self.amended({"possible_agents": names})
+        plan.wanted = self.wanted  # what was found out was named by no user
+        return plan
 
     @property
     def stale(self) -> bool:

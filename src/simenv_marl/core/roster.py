@@ -38,6 +38,13 @@ def name_agents(named: list[NamedPoint]) -> list[str | None]:
     return names
 
 
+def declared_agents(declared: Any) -> list[str]:
+    """The names in ``possible_agents``."""
+    if isinstance(declared, Mapping):
+        return [name for names in declared.values() for name in names]
+    return declared or []
+
+
 def call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, BoundPoint], bool]:
     """Find out which agents are known beforehand, and whether these are all."""
     named = [binding for binding in active if binding.agent is None]

@@ -20,6 +20,7 @@ from gymnasium.utils import seeding
 from ..errors import BranchError, OptionValueError, annotate, warn_user
 from ..simulation import make_simulation, resetter
 from .contexts import Claim, at_work
+from .draws import WatchedDriver, is_watched, watched
 from .drivers import DRIVERS, run_job
 from .ending import refusal
 from .episode import LONGEST_TAPE, LOST, Episode, When
@@ -191,12 +192,16 @@ class Session:
         if self._worn or (self._driver is not None and self._driver.given_up is not None):
             self._make_simulation()
             self._worn = False
-        context = copy_context()
+        context, watches = copy_context(), self._rng is None and is_watched(self.simulation)
         try:
             with self.at_work():
                 if self._rng is not None:
                     self._rng.begin(seed)
-                self._run(partial(self._reset, seed, options), context)
+                reset = partial(self._run, partial(self._reset, seed, options), context)
+                if watches:
+                    watched(self.simulation, reset)
+                else:
+                    reset()
         except BaseException as error:
             annotate(error, f"simenv_marl: while the simulation was reset; seed {seed}")
             raise
@@ -204,7 +209,8 @@ class Session:
         driver, plan = self._usable_driver(), self._plan_of_simulation()
         run = self.simulation.run if self._rng is None else self._rng.around(self.simulation.run)
         driver.prepare(run, plan.decisions, context)
-        episode = Episode(plan, self.simulation, driver, seed, when, (self._rng, self.claim), script)
+        seen: Any = WatchedDriver(driver, self) if watches else driver
+        episode = Episode(plan, self.simulation, seen, seed, when, (self._rng, self.claim), script)
         try:
             self.episode = episode  # whenever an interrupt comes from now on, its end is seen to
             episode.begin()

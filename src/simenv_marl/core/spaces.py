@@ -1,4 +1,4 @@
-"""What goes through a space: observations are cast to it, actions and masks are checked against it.
+"""What is observed: cast to its space, copied, compared, and made up where nothing is known yet.
 
 Everything that can be known of a space is found out once, when an environment is made; what runs at
 each decision are closures over it.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import sys
 from collections.abc import Callable, Mapping
-from functools import partial
 from sys import getrefcount
 from typing import Any, Final
 
@@ -17,23 +16,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..errors import MaskError, ObservationError
+from ..errors import ObservationError
 from ..simulation import Sentinel
-
-ILLEGAL: Final = Sentinel("ILLEGAL")
-"""What an action check answers for an action outside its space."""
 
 Cast = Callable[[Any], Any]
 """Takes an observation, returns it cast to its space's dtype and not shared."""
-
-Check = Callable[[Any], Any]
-"""Takes an action, returns it as its mapping is to receive it, or ``ILLEGAL``."""
-
-MASK: Final = "action_mask"
-"""Where PettingZoo and Gymnasium look for the legal actions, in infos and in observations."""
-
-_SMALL = 16  # elements up to which comparing python floats beats four numpy calls
-
 
 # -- observations ---------------------------------------------------------------------------------
 
@@ -143,6 +130,37 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
     return cast
 
 
+def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
+    """Make the function that makes sure that an observation is finite where its space is bounded.
+
+    Args:
+        space: The observation space.
+
+    Returns:
+        A function that raises ``ObservationError`` for NaN and for infinities; None where the space has no such bounds.
+    """
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parts: Any = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        checks = [(key, check) for key, part in parts if (check := finite_check(part)) is not None]
+
+        def check_parts(observation: Any) -> None:
+            for key, check in checks:
+                check(observation[key])
+
+        return check_parts if checks else None
+    if not isinstance(space, spaces.Box) or space.dtype.kind != "f":
+        return None
+    bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    if not bounded.any():
+        return None
+
+    def check_numbers(observation: NDArray[Any]) -> None:
+        if not np.isfinite(observation[bounded]).all():
+            raise ObservationError(f"the observation {observation!r} is not finite, where its space {space} is bounded")
+
+    return check_numbers
+
+
 _UNCHANGING: Final = (np.generic, int, float, str, Sentinel)
 
 
@@ -196,203 +214,6 @@ def blank(space: spaces.Space[Any]) -> Any:
     sampled = copy.deepcopy(space)
     sampled.seed(0)
     return sampled.sample()
-
-
-# -- actions --------------------------------------------------------------------------------------
-
-
-def action_check(space: spaces.Space[Any]) -> Check:
-    """Make the function that checks actions against a space.
-
-    Integers for a ``Discrete`` come out as python integers, a scalar for a one-element ``Box`` as it went in,
-    and all else as copies, for a ``Box`` in its dtype.
-
-    Args:
-        space: The action space, of any kind.
-
-    Returns:
-        A function that answers ``ILLEGAL`` for what is not in the space.
-    """
-    if isinstance(space, spaces.Discrete):
-        return _discrete_check(space)
-    if isinstance(space, spaces.Box):
-        return _box_check(space)
-
-    def check(action: Any) -> Any:
-        try:
-            return duplicate(action) if space.contains(action) else ILLEGAL
-        except Exception:  # a space may choke on what is none of its elements
-            return ILLEGAL
-
-    return check
-
-
-def _discrete_check(space: spaces.Discrete) -> Check:
-    low, high = int(space.start), int(space.start + space.n)
-
-    def check(action: Any) -> Any:
-        if type(action) is not int:
-            if isinstance(action, np.ndarray) and action.shape == ():
-                action = action[()]
-            if not isinstance(action, (int, np.integer, np.bool_)):
-                return ILLEGAL
-            action = int(action)
-        return action if low <= action < high else ILLEGAL
-
-    return check
-
-
-def _box_check(space: spaces.Box) -> Check:
-    shape, dtype = space.shape, space.dtype
-    lows, highs = space.low.ravel().tolist(), space.high.ravel().tolist()
-    scalar, small = len(lows) == 1, len(lows) <= _SMALL
-    kinds = "iu" if dtype.kind in "iu" else "iuf"
-
-    ndarray, first_low, first_high = np.ndarray, lows[0] if scalar else 0.0, highs[0] if scalar else -1.0
-
-    def legal(array: NDArray[Any]) -> bool:
-        if not small:
-            return bool(((array >= space.low) & (array <= space.high)).all())
-        return all(low <= value <= high for low, value, high in zip(lows, array.ravel().tolist(), highs, strict=True))
-
-    def check(action: Any) -> Any:
-        if type(action) is ndarray and action.dtype is dtype and action.shape == shape:
-            if scalar:
-                return action.copy() if first_low <= action.item() <= first_high else ILLEGAL
-            return action.copy() if legal(action) else ILLEGAL
-        if type(action) is float and kinds == "iuf" and first_low <= action <= first_high:
-            return action
-        try:
-            array = np.asarray(action)
-        except (ValueError, TypeError):
-            return ILLEGAL
-        if array.dtype.kind not in kinds or (array.shape != shape and not (scalar and array.shape == ())):
-            return ILLEGAL
-        if kinds == "iu":  # compared before the cast, which may wrap integers around
-            cast = array.astype(dtype, copy=True) if legal(array) else None
-        else:  # compared after the cast, so that a bound is legal in every precision
-            with np.errstate(over="ignore"):
-                cast = array.astype(dtype, copy=True)
-            cast = cast if legal(cast) else None
-        if cast is None:
-            return ILLEGAL
-        return cast if array.shape == shape else action
-
-    return check
-
-
-def clipping_check(space: spaces.Space[Any]) -> Check:
-    """Make the function that checks actions against a space, once those of its ``Box`` spaces are clipped.
-
-    Args:
-        space: The action space, of any kind.
-
-    Returns:
-        A function that answers ``ILLEGAL`` for what is not in the space but for lying outside a ``Box``.
-    """
-    check, clip = action_check(space), partial(_clipped, space)
-
-    def check_clipped(action: Any) -> Any:
-        legal = check(action)
-        return check(clip(action)) if legal is ILLEGAL else legal
-
-    return check_clipped
-
-
-def _clipped(space: spaces.Space[Any], action: Any) -> Any:
-    """An action with its numbers clipped into the ``Box`` spaces of a space; what does not fit them, as it is."""
-    if isinstance(space, spaces.Dict) and isinstance(action, Mapping):
-        return {key: _clipped(space[key], part) if key in space.spaces else part for key, part in action.items()}
-    if isinstance(space, spaces.Tuple) and isinstance(action, (tuple, list)) and len(action) == len(space):
-        return tuple(_clipped(part, item) for part, item in zip(space.spaces, action, strict=True))
-    if not isinstance(space, spaces.Box):
-        return action
-    try:
-        array = np.asarray(action)
-    except (ValueError, TypeError):
-        return action
-    if array.dtype.kind not in "iuf" or (
-        array.shape != space.shape and not (array.shape == () and space.low.size == 1)
-    ):
-        return action
-    clipped = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape))
-    return type(action)(clipped) if type(action) in (int, float) else clipped
-
-
-# -- masks ----------------------------------------------------------------------------------------
-
-
-def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
-    """Make the function that casts the legal actions to a mask of an action space.
-
-    Args:
-        space: A ``Discrete`` (mask of shape ``(n,)``) or ``MultiDiscrete`` (a tuple of masks).
-
-    Returns:
-        A function that gives the mask as new np.int8 arrays of 0 and 1, and raises ``MaskError`` for a
-        mask of another shape, with other values or with no legal action.
-    """
-    if isinstance(space, spaces.MultiDiscrete):
-        parts = [_mask_of(int(number), space) for number in space.nvec.ravel()]
-
-        def cast(value: Any) -> Any:
-            if not isinstance(value, (tuple, list)) or len(value) != len(parts):
-                raise MaskError(f"the mask {value!r} has not the {len(parts)} parts of {space}")
-            return tuple(part(item) for part, item in zip(parts, value, strict=True))
-
-        return cast
-    assert isinstance(space, spaces.Discrete)
-    return _mask_of(int(space.n), space)
-
-
-def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[np.int8]]:
-    def cast(value: Any) -> NDArray[np.int8]:
-        mask = np.asarray(value)
-        if mask.shape != (number,):
-            raise MaskError(f"the mask {value!r} has shape {mask.shape} and not ({number},), as {space} asks")
-        legal = mask.astype(bool)
-        if not (legal == mask).all():
-            raise MaskError(f"the mask {value!r} has values other than 0 and 1")
-        if not legal.any():
-            raise MaskError(f"the mask {value!r} leaves no legal action of {space}")
-        return legal.astype(np.int8)
-
-    return cast
-
-
-def open_mask(space: spaces.Space[Any]) -> Any:
-    """Make the mask of an action space that allows everything."""
-    if isinstance(space, spaces.MultiDiscrete):
-        return tuple(np.ones(int(number), np.int8) for number in space.nvec.ravel())
-    assert isinstance(space, spaces.Discrete)
-    return np.ones(int(space.n), np.int8)
-
-
-def mask_allows(space: spaces.Space[Any], mask: Any, action: Any) -> bool:
-    """Whether a mask of ``mask_cast`` allows an action that is in the space."""
-    if isinstance(space, spaces.MultiDiscrete):
-        choices = (action - space.start).ravel()
-        return all(part[choice] for part, choice in zip(mask, choices, strict=True))
-    assert isinstance(space, spaces.Discrete)
-    return bool(mask[action - int(space.start)])
-
-
-def only_choice(space: spaces.Space[Any], mask: Any) -> Any:
-    """The one legal action of a space; None where there are several.
-
-    Args:
-        space: The action space.
-        mask: What ``mask_cast`` has made; None: all of the space is legal.
-    """
-    if isinstance(space, spaces.MultiDiscrete):
-        parts = open_mask(space) if mask is None else mask
-        if any(np.count_nonzero(part) != 1 for part in parts):
-            return None
-        chosen = np.array([np.argmax(part) for part in parts], space.dtype).reshape(space.shape)
-        return (chosen + space.start).astype(space.dtype)
-    if not isinstance(space, spaces.Discrete) or (int(space.n) if mask is None else np.count_nonzero(mask)) != 1:
-        return None
-    return int(space.start) + (0 if mask is None else int(np.argmax(mask)))
 
 
 # -- freshness ------------------------------------------------------------------------------------

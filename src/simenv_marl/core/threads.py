@@ -22,6 +22,9 @@ SECONDS_TO_UNWIND: Final = 5.0
 _A_WHILE: Final = 1.0
 """For how many seconds the user waits before it looks around: a Ctrl-C just before a wait does not wake from it."""
 
+SIMULATION: Final = "simulation"
+"""The name of a simulation's thread."""
+
 _NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
 _JOB: Final = Sentinel("JOB")
@@ -121,7 +124,7 @@ class ThreadDriver(BaseDriver):
     def _start(self) -> None:
         self._resumed.acquire()
         self._arrived.acquire()
-        self._thread = thread = Thread(target=self._serve, name="simulation", daemon=True)
+        self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
         try:
             thread.start()
         except Exception:  # there are too many threads

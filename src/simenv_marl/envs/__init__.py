@@ -152,7 +152,7 @@ def joint_env(simulation: Any, points: Any = None, **options: Any) -> Simulation
         **options: ``flatten=True`` for one vector in place of dicts; else as ``aec_env`` takes them.
 
     Raises:
-        ViewError: No agent is known beforehand, or the spaces cannot be flattened.
+        ViewError: Not all agents are known beforehand, or the spaces cannot be flattened.
         SimEnvError: Something else in it cannot work; the leaf says what.
     """
     return SimulationJointEnv(Plan.draw_up(simulation, points, options))

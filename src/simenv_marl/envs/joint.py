@@ -148,11 +148,19 @@ class SimulationJointEnv(OneAgentView):
             session: The simulation that it reads; None: one of its own.
 
         Raises:
-            ViewError: No agent is known beforehand, or their spaces cannot be flattened.
+            ViewError: Not all agents are known beforehand, or their spaces cannot be flattened.
             SimEnvError: Something else in the plan cannot work.
         """
         super().__init__(plan, session)
         if not plan.complete:
+            if not hasattr(self._session.simulation, "expected_calls"):
+                self._session.close()
+                points = ", ".join(point.point.name for point in plan.active if point.agent is None)
+                raise ViewError(
+                    f"all agents must be known when the environment is made, and a callable names those of {points};"
+                    " declare them with possible_agents=, let the simulation announce them (expected_calls), or name"
+                    " the one agent of a single view with agent="
+                )
             with_seed = self._session.start(0, None, When.RETURN)
             roster = {name: agent.point for name, agent in with_seed.agents.items()}
             self._session.close()

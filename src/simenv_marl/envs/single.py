@@ -10,12 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from ..core.actions import open_mask
 from ..core.agent import Agent
 from ..core.bound import asks_for_simulation
 from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.session import Session
-from ..core.spaces import open_mask
 from ..decision import Definition
 from ..errors import ViewError
 from .gymnasium_base import OneAgentView

@@ -9,10 +9,10 @@ from typing import Any
 
 from greenlet import getcurrent
 
+from ..core.actions import MASK
 from ..core.contexts import at_work
 from ..core.plan import Plan
 from ..core.rng import GlobalRandom
-from ..core.spaces import MASK
 from ..core.switch import SimulationExit
 from ..decision import DecisionPoint, Definition
 from ..envs import VIEWS, view_class

@@ -1,0 +1,106 @@
+"""Finding out whether a simulation draws from the global generators, which all else in the process shares.
+
+During the first decisions of each kind of simulation, how much the generators have used up is compared before and
+after the simulation was at work. From then on nothing of this is in the way.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from ctypes import c_char
+from threading import current_thread
+from threading import enumerate as enumerate_threads
+from typing import Any, Final
+from weakref import WeakKeyDictionary, ref
+
+import numpy as np
+
+from ..errors import warn_user
+from .switch import BaseDriver, Event
+from .threads import SIMULATION
+
+DECISIONS: Final = 10_000
+"""During so many decisions a kind of simulation is watched."""
+
+_left: Final[WeakKeyDictionary[type, int]] = WeakKeyDictionary()
+"""By class of simulations: during how many more."""
+
+_TWISTER: Final = 624 * 4
+"""Bytes of the state of NumPy's generator, before the number that tells how much of it is used up."""
+
+_python: Final[Any] = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
+_numpy: Final[Any] = np.random.mtrand._rand
+
+
+class _Used:
+    """How much the generators of Python and of NumPy have used up; nothing of a generator of another make."""
+
+    def __init__(self) -> None:
+        self._python = (c_char * 4).from_address(id(_python) + object.__basicsize__)
+        self._generator: Any = None
+        self._numpy: Any = None
+
+    def __call__(self) -> tuple[bytes, bytes]:
+        generator = _numpy._bit_generator
+        if generator is not self._generator:
+            self._numpy = (c_char * 4)()
+            if type(generator) is np.random.MT19937:
+                self._numpy = (c_char * 4).from_address(generator.ctypes.state_address + _TWISTER)
+            self._generator = generator
+        return self._python.raw, self._numpy.raw
+
+
+_used: Final = _Used()
+
+
+def is_watched(simulation: Any) -> bool:
+    """Whether simulations of its kind are still watched."""
+    return _left.get(type(simulation), DECISIONS) > 0
+
+
+def watched(simulation: Any, work: Callable[[], Any]) -> Any:
+    """Let a simulation work; warn if the global generators have moved meanwhile. Returns what the work returns."""
+    before = _used()
+    result = work()
+    kind, moved = type(simulation), [one != other for one, other in zip(before, _used(), strict=True)]
+    drawn = any(moved) and _alone()
+    _left[kind] = 0 if drawn else _left.get(kind, DECISIONS) - 1
+    if drawn:
+        names = " and ".join(name for name, own in zip(("random", "numpy.random"), moved, strict=True) if own)
+        warn_user(
+            f"{kind.__name__} draws from the global generator of {names}, which all else in the process shares: its"
+            " environments influence each other, and the same seed gives other episodes. Make them with global_rng=True"
+        )
+    return result
+
+
+def _alone() -> bool:
+    """Whether no other thread can have drawn while a simulation was at work: all others are suspended simulations."""
+    return all(thread is current_thread() or thread.name == SIMULATION for thread in enumerate_threads())
+
+
+class WatchedDriver:
+    """Stands for a driver in an episode as long as the simulation is watched."""
+
+    def __init__(self, driver: BaseDriver, session: Any) -> None:
+        """Watch the simulation of a session.
+
+        Args:
+            driver: Its driver.
+            session: The session, whose episode gets the driver itself as soon as there is nothing left to find out.
+        """
+        self._driver, self._session = driver, ref(session)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._driver, name)
+
+    def resume(self, reply: Any) -> Event:
+        """Let the simulation go on with a reply; return the event that comes from it next."""
+        session: Any = self._session()
+        if session is not None and is_watched(session.simulation):
+            event: Event = watched(session.simulation, lambda: self._driver.resume(reply))
+            return event
+        if session is not None:
+            session.episode.driver = self._driver
+        return self._driver.resume(reply)  # type: ignore[no-any-return]

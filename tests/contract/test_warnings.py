@@ -1,0 +1,339 @@
+"""What a user is warned of at run time: shared generators, agents that never come, rounds that stand still."""
+
+import random
+import threading
+import warnings
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    ObservationError,
+    UnknownPointError,
+    aec_env,
+    joint_env,
+    make_step,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
+from simenv_marl.core import draws
+from tests.worlds.models import calling, decision, define, script
+
+DRAWS = "draws from the global generator"
+ABSENT = "did not appear in the episode"
+
+
+@pytest.fixture
+def heard():
+    """The warnings of a test, as texts."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield lambda part: [str(warning.message) for warning in caught if part in str(warning.message)]
+
+
+# -- global generators ----------------------------------------------------------------------------
+
+decide = decision(agent="chooser")
+
+
+def gambler(draw, *, in_reset=False):
+    """A class of simulations that draw from what the process shares, once in each day."""
+
+    class Gambler:
+        def reset(self):
+            self.drawn = [draw()] if in_reset else []
+
+        def run(self):
+            for day in range(4):
+                decide()
+                if day == 2 and not in_reset:
+                    self.drawn.append(draw())
+
+    return Gambler
+
+
+def play(env, draw=lambda: None):
+    env.reset(seed=1)
+    for _ in range(4):
+        draw()
+        env.step(1)
+
+
+@pytest.mark.parametrize(
+    ("draw", "name"),
+    [(random.random, "random"), (np.random.random, "numpy.random"), (lambda: random.shuffle([1, 2, 3]), "random")],
+)
+@pytest.mark.parametrize("in_reset", [False, True])
+def test_a_simulation_that_draws_is_warned_of_once(heard, draw, name, in_reset) -> None:
+    kind = gambler(draw, in_reset=in_reset)
+    for make in (single_env, aec_env):
+        for _ in range(2):
+            play(make(kind, decide))
+    (message,) = heard(DRAWS)
+    assert f"of {name}," in message
+    assert "global_rng=True" in message
+    assert "Gambler" in message
+
+
+def test_both_generators_are_named(heard) -> None:
+    play(single_env(gambler(lambda: (random.random(), np.random.random())), decide))
+    assert "random and numpy.random" in heard(DRAWS)[0]
+
+
+@pytest.mark.parametrize("run", [
+    lambda kind: simulate(kind, {decide: lambda observation: 1}),
+    lambda kind: simulate_many(kind, {decide: lambda observations: np.ones(len(observations), np.int64)}, seeds=[1, 2]),
+    lambda kind: _vector(kind),
+])  # fmt: skip
+def test_all_runners_notice(heard, run) -> None:
+    run(gambler(random.random))
+    assert len(heard(DRAWS)) == 1
+
+
+def _vector(kind):
+    env = vector_env(kind, decide, num_envs=3)
+    env.reset(seed=1)
+    for _ in range(3):
+        env.step(np.ones(3, np.int64))
+    env.close()
+
+
+def test_what_its_user_draws_is_none_of_the_simulations(heard) -> None:
+    def draw():
+        return random.random() + np.random.random()
+
+    user = decision(
+        agent=lambda: [draw(), "user"][1],
+        reward_mapping=lambda: draw(),
+        observation_space_mapping=lambda: [draw(), draw()],
+        action_space_mapping=lambda action: [draw(), action][1],
+    )
+    env = aec_env(calling(*[user] * 4), user)
+    play(env, draw)
+    simulate(calling(user, user), {user: lambda observation: [draw(), 1][1]})
+    assert heard(DRAWS) == []
+
+
+def test_generators_of_its_own_are_none_of_the_process(heard) -> None:
+    own = random.Random(3)
+    play(single_env(gambler(own.random), decide))
+    play(single_env(gambler(np.random.default_rng(3).random), decide))
+    play(single_env(gambler(random.random), decide, global_rng=True))
+    assert heard(DRAWS) == []
+
+
+def test_what_other_threads_draw_is_not_laid_at_its_door(heard) -> None:
+    over, draws_going_on = threading.Event(), threading.Event()
+
+    def draw():
+        while not over.wait(1e-4):
+            random.random()
+            draws_going_on.set()
+
+    other = threading.Thread(target=draw)
+    other.start()
+    assert draws_going_on.wait(10)
+    kind = gambler(lambda: [random.random() for _ in range(2000)])
+    play(single_env(kind, decide))
+    over.set()
+    other.join()
+    assert heard(DRAWS) == []
+
+
+def test_it_costs_nothing_once_enough_was_seen(monkeypatch) -> None:
+    monkeypatch.setattr(draws, "DECISIONS", 5)
+    seen = []
+    monkeypatch.setattr(
+        draws, "watched", lambda simulation, work, inner=draws.watched: (seen.append(1), inner(simulation, work))[1]
+    )
+    kind = gambler(lambda: 0)
+    for _ in range(3):
+        env = single_env(kind, decide)
+        play(env)
+    assert len(seen) == 4  # all but the reset, which was the first of five
+    assert type(env.unwrapped._session._driver).__name__ != "WatchedDriver"
+
+
+# -- agents that never come -----------------------------------------------------------------------
+
+
+class Ant:
+    """Takes a step."""
+
+    def __init__(self, name):
+        self.name = name
+
+    def step(self):
+        return 0
+
+
+class Hill:
+    names = ("ant_0", "ant_1")
+
+    def reset(self):
+        self.ants = [Ant(name) for name in self.names]
+
+    def run(self):
+        for _ in range(2):
+            for ant in self.ants:
+                ant.step()
+
+
+STEP = f"{__name__}.Ant.step"
+HILL = {
+    STEP: make_step(
+        observation_space=spaces.Box(0, 1, (1,), np.float64),
+        observation_space_mapping=lambda ant: [0],
+        action_space=spaces.Discrete(3),
+        action_space_mapping=lambda action: action,
+        reward_mapping=lambda ant: 0.0,
+        agent=lambda ant: ant.name,
+    )
+}
+
+
+def through(env):
+    """Play an AEC environment to its end, twice."""
+    for _ in range(2):
+        env.reset(seed=1)
+        for _ in env.agent_iter():
+            env.step(None if any(env.last()[2:4]) else RULE)
+
+
+def test_a_slip_in_policies_is_told_at_the_end_of_the_episode_and_once(heard) -> None:
+    through(aec_env(Hill, HILL, policies={"ant_O": lambda observation: 1}))
+    (message,) = heard(ABSENT)
+    assert "ant_O" in message
+    assert "ant_0, ant_1" in message
+
+
+def test_an_agent_of_the_roster_that_never_comes_is_told_of(heard) -> None:
+    through(aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1", "ant_2"]))
+    (message,) = heard(ABSENT)
+    assert "ant_2" in message.partition(";")[0]
+    assert "ant_1" not in message.partition(";")[0]
+
+
+def test_of_a_roster_in_rounds_and_of_joint_views_too(heard) -> None:
+    roster = {"possible_agents": ["ant_0", "ant_1", "ant_2"]}
+    for env in (parallel_env(Hill, HILL, **roster), joint_env(Hill, HILL, **roster)):
+        env.reset(seed=1)
+        for _ in range(2):
+            env.step(RULE)
+    assert len(heard(ABSENT)) == 2
+
+
+def test_runners_tell_of_it_once_for_all_simulations(heard) -> None:
+    policies = {"ant_7": lambda observations: np.zeros(len(observations), np.int64)}
+    simulate_many(Hill, policies, seeds=range(5), points=HILL)
+    assert len(heard(ABSENT)) == 1
+    simulate(Hill, {"ant_8": lambda observation: 0}, points=HILL)
+    assert len(heard(ABSENT)) == 2
+
+
+def test_those_that_come_and_episodes_that_are_broken_off_are_not_told_of(heard) -> None:
+    env = aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1"], policies={"ant_1": lambda observation: 0})
+    through(env)
+    env = aec_env(Hill, HILL, possible_agents=["ant_0", "ant_1", "ant_9"])
+    env.reset()
+    env.close()
+    assert heard(ABSENT) == []
+
+
+def test_what_leads_into_a_module_and_not_to_a_function_is_refused() -> None:
+    for slip in (f"{__name__}.Ant.setp", f"{__name__}.Nat.step"):
+        with pytest.raises(UnknownPointError, match="neither an agent nor a decision point"):
+            aec_env(Hill, HILL, policies={slip: lambda observation: 0})
+
+
+def test_a_dot_makes_no_path(heard) -> None:
+    class Dotted(Hill):
+        names = ("nest.1", "random.2")
+
+    env = aec_env(Dotted, HILL, policies={"nest.1": lambda observation: 0})
+    through(env)
+    assert heard(ABSENT) == []
+
+
+# -- rounds that stand still ----------------------------------------------------------------------
+
+
+def test_rounds_without_an_action_for_the_pending_agent_are_told_of(heard) -> None:
+    env = parallel_env(Hill, HILL, possible_agents=["ant_0", "ant_1"])
+    env.reset(seed=1)
+    for number in range(150):
+        env.step({"ant_1": 1} if number % 2 else {})
+        assert len(heard("stands still")) == (number >= 99)
+    assert "'ant_0'" in heard("stands still")[0]
+    env.step({"ant_0": 1, "ant_1": 1})
+    assert env.agents == ["ant_0", "ant_1"]
+    env.step({"ant_0": 1, "ant_1": 1})
+    assert env.agents == []
+
+
+def test_turns_are_no_standstill(heard) -> None:
+    def main(simulation):
+        for _ in range(400):
+            one()
+            two()
+
+    one, two = decision(agent="one"), decision(agent="two")
+    env = parallel_env(script(main), [one, two])
+    env.reset(seed=1)
+    for number in range(600):
+        # Two rounds of three leave the pending agent out.
+        env.step({("one", "two")[number // 3 % 2]: 1} if number % 3 == 0 else {})
+    assert heard("stands still") == []
+
+
+# -- observations that are no numbers -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("make", [aec_env, single_env, parallel_env, joint_env])
+def test_what_is_not_finite_in_a_bounded_space_is_refused_at_the_reset(make, wrong) -> None:
+    blind = define(agent="blind", observation_space_mapping=lambda: [1.0, wrong])(lambda: 0)
+    env = make(calling(blind, blind), blind)
+    with pytest.raises(ObservationError, match="not finite"):
+        env.reset()
+    with pytest.raises(ObservationError, match="not finite"):
+        env.reset()
+
+
+@pytest.mark.parametrize(
+    ("space", "seen"),
+    [
+        (spaces.Box(-np.inf, np.inf, (2,), np.float64), [np.nan, np.inf]),
+        (spaces.Box(np.array([0, -np.inf]), np.array([1, 1]), dtype=np.float64), [1.0, -np.inf]),
+        (spaces.Dict(a=spaces.Box(-np.inf, np.inf, (1,))), {"a": [np.inf]}),
+    ],
+)
+def test_where_a_space_has_no_bounds_it_may_be_anything(space, seen) -> None:
+    free = define(agent="free", observation_space=space, observation_space_mapping=lambda: seen)(lambda: 0)
+    env = single_env(calling(free, free), free)
+    env.reset()
+    env.step(1)
+
+
+@pytest.mark.parametrize(
+    ("space", "seen"),
+    [
+        (spaces.Box(np.array([0, -np.inf]), np.array([1, 1]), dtype=np.float64), [np.nan, 0]),
+        (spaces.Dict(a=spaces.Discrete(2), b=spaces.Tuple([spaces.Box(0, 1, (1,))])), {"a": 1, "b": ([np.nan],)}),
+    ],
+)
+def test_the_parts_of_a_space_are_looked_at_one_by_one(space, seen) -> None:
+    blind = define(agent="blind", observation_space=space, observation_space_mapping=lambda: seen)(lambda: 0)
+    with pytest.raises(ObservationError, match="not finite"):
+        single_env(calling(blind), blind).reset()
+
+
+def test_batched_policies_do_not_see_it_either() -> None:
+    blind = define(agent="blind", observation_space_mapping=lambda: [np.nan, 0.0])(lambda: 0)
+    with pytest.raises(ObservationError, match="not finite"):
+        simulate_many(calling(blind), {"blind": lambda observations: [0]}, seeds=[0], points=blind)

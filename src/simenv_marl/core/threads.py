@@ -14,6 +14,7 @@ from ..hooks.hook import Hook
 from ..hooks.stacks import Taker
 from ..simulation import RULE, Sentinel
 from .events import FAILED
+from .loops import hush
 from .switch import STUCK, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 SECONDS_TO_UNWIND: Final = 5.0
@@ -101,6 +102,7 @@ class ThreadDriver(BaseDriver):
             if reply is RULE:
                 return rule(*args, **kwargs)
             if reply is _EXIT:
+                hush()
                 raise SimulationExit
             return reply if deliver is None else deliver(reply, *args, **kwargs)
 

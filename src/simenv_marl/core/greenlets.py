@@ -189,7 +189,7 @@ class GreenletDriver(BaseDriver):
     def forked(self) -> None:
         """The process was forked, and this is the child, in which only one thread is left."""
         if self._thread != get_ident():
-            self._forget_stack()
+            self._stay_behind()
 
 
 _given_up: list[GreenletDriver] = []

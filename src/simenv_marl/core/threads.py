@@ -215,12 +215,12 @@ class ThreadDriver(BaseDriver):
     def forked(self) -> None:
         """The process was forked, and this is the child: in the simulation's own thread, or without it."""
         if self._ident == get_ident():
-            self._refuse_all(
+            self._go_astray(
                 "a process that the simulation has forked, while the environment's user is in another thread and has"
                 ' stayed behind in the parent (with driver="greenlet" it comes along)'
             )
         else:
-            self._forget_stack()
+            self._stay_behind()
 
 
 def _wake(lock: Any) -> None:

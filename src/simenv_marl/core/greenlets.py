@@ -125,6 +125,8 @@ class GreenletDriver(BaseDriver):
     ) -> None:
         """Have the next ``resume`` begin to run something on the stack."""
         self.enter()
+        if "gevent" in modules:
+            _share_hub(modules["gevent"].get_hub())
         self._prepare(job, decisions, None)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
         self._body.gr_context = copy_context() if context is None else context
@@ -190,6 +192,15 @@ class GreenletDriver(BaseDriver):
         """The process was forked, and this is the child, in which only one thread is left."""
         if self._thread != get_ident():
             self._stay_behind()
+
+
+def _share_hub(hub: Any) -> None:
+    """Have gevent's hub belong to the thread that it serves, and not to a simulation that was the first to use it."""
+    root = getcurrent()
+    while root.parent is not None:
+        root = root.parent
+    if hub.parent is not root:
+        hub.parent = root
 
 
 _given_up: list[GreenletDriver] = []

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-import signal
 import sys
+from importlib import import_module
+from signal import SIGINT, default_int_handler
 from sys import modules
 from threading import get_ident, main_thread
 from typing import Any, Final
 
 from .switch import is_exit
+
+_signal: Final[Any] = import_module("_signal")
+"""What ``signal`` wraps to make enums of handlers, which takes longer than all that is done here."""
 
 LOOPS: Final = "asyncio.events"
 """What knows the event loop that runs in a thread, whichever stack it runs on. Where it was not imported, none runs."""
@@ -80,8 +84,8 @@ class Sides:
     def enter(self) -> None:
         """The simulation goes on, in the surroundings in which it was."""
         interrupt, self._interrupt = self._interrupt, None
-        if interrupt is not None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, interrupt)
+        if interrupt is not None and _signal.getsignal(SIGINT) is default_int_handler:
+            _signal.signal(SIGINT, interrupt)
         users, own = _surroundings(), self._own
         self._own = None
         if own is not None or users[0] is not None:
@@ -97,11 +101,11 @@ def _take_interrupt(loop: Any) -> Any:
     """
     if loop is None or get_ident() != main_thread().ident:
         return None
-    handler = signal.getsignal(signal.SIGINT)
+    handler = _signal.getsignal(SIGINT)
     runner = getattr(getattr(handler, "func", None), "__self__", None)
     if not isinstance(runner, modules["asyncio.runners"].Runner) or runner.get_loop() is not loop:
         return None
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    _signal.signal(SIGINT, default_int_handler)
     return handler
 
 

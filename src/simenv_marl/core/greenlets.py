@@ -7,7 +7,7 @@ from contextlib import suppress
 from contextvars import Context, copy_context
 from sys import modules
 from threading import get_ident, local
-from typing import Any, Final
+from typing import Any
 from weakref import ref
 
 from greenlet import GreenletExit, getcurrent, greenlet
@@ -16,11 +16,8 @@ from ..errors import WrongThreadError
 from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Taker
 from ..simulation import RULE
+from .loops import LOOPS, Sides, hush
 from .switch import BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
-
-LOOPS: Final = "asyncio.events"
-"""What knows the event loop that runs in a thread, whichever stack it runs on: a simulation's and its user's are to be
-kept apart. Where it was not imported, no loop runs."""
 
 
 class _Home:
@@ -42,7 +39,7 @@ class GreenletDriver(BaseDriver):
     """Runs a simulation on a greenlet of the thread in which the first job is started."""
 
     __slots__ = (
-        "_asker", "_body", "_direct", "_get_loop", "_here", "_home", "_switch_out", "_thread", "_users_loop", "resume",
+        "_asker", "_body", "_direct", "_here", "_home", "_sides", "_switch_out", "_thread", "resume",
     )  # fmt: skip
 
     def __init__(self, *, plugins: Any = None, before: BaseDriver | None = None, direct: bool = True) -> None:
@@ -57,8 +54,7 @@ class GreenletDriver(BaseDriver):
         self._direct = direct
         self._thread = get_ident()
         self._home = ref(_home())
-        self._get_loop: Any = None  # found where asyncio has been imported
-        self._users_loop: Any = None
+        self._sides = Sides()
         self._body: Any = greenlet(self._serve)
         self._asker: greenlet | None = None  # the greenlet of the model's own that waits for an answer
         self._here: Any = None
@@ -71,11 +67,12 @@ class GreenletDriver(BaseDriver):
         with suppress(GreenletExit):
             self._begin()
             while not self._ended:
-                self._go_in(None)
+                self._sides.begin()
                 try:
                     event = self._work()
                 finally:
-                    self._go_out()
+                    if not self._ended:  # else it unwinds without having been asked to
+                        self._sides.leave()
                 if self._ended:
                     return  # it was let go of, and has unwound by itself
                 self._body.gr_context = None
@@ -83,33 +80,33 @@ class GreenletDriver(BaseDriver):
                 self._switch_out(*event)
 
     def _decider(self, hook: Hook, event: Crossing, away: bool = False) -> Taker:
-        rule, deliver, driver = self._rule_of(hook, event, away), event.deliver, self
+        rule, deliver, driver, sides = self._rule_of(hook, event, away), event.deliver, self, self._sides
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             if away:
                 driver._ask_from(getcurrent())
             switch_out = driver._switch_out
-            get_loop = driver._get_loop
-            loop = None
-            if get_loop is None:
-                if LOOPS in modules:
-                    get_loop = driver._get_loop = modules[LOOPS]._get_running_loop
-                    loop = driver._leave_loop()
-            else:
-                loop = get_loop()
-                if loop is not None or driver._users_loop is not None:
-                    driver._leave_loop()
+            find_loop = sides.find
+            own = None
             try:
+                if find_loop is None:
+                    if LOOPS in modules:
+                        own = sides.look()
+                        find_loop = sides.find
+                elif find_loop() is not None or sides.users is not None:
+                    own = sides.leave()
                 reply = switch_out(event, args, kwargs)
             except BaseException:
-                if away and not driver._ended:
-                    driver._ask_from(None)
-                driver._go_in(loop)
+                if not driver._ended:  # else it unwinds without having been asked to
+                    if away:
+                        driver._ask_from(None)
+                    sides.enter()
+                    hush()
                 raise
             if away:
                 driver._ask_from(None)
-            if get_loop is not None and (loop is not None or get_loop() is not None):
-                driver._enter_loop(loop)
+            if find_loop is not None and (own is not None or find_loop() is not None):
+                sides.enter()
             if reply is RULE:
                 return rule(*args, **kwargs) if kwargs else rule(*args)
             return reply if deliver is None else deliver(reply, *args, **kwargs)
@@ -121,30 +118,6 @@ class GreenletDriver(BaseDriver):
         self._asker = asker
         self.resume = (self._body if asker is None else asker).switch
 
-    def _go_in(self, loop: Any) -> None:
-        """The simulation goes on, in the event loop in which it was."""
-        if not self._ended and LOOPS in modules:  # else it unwinds without having been asked to
-            self._enter_loop(loop)
-
-    def _go_out(self) -> None:
-        """The simulation's user goes on, in the event loop in which that was."""
-        if not self._ended and LOOPS in modules:
-            self._leave_loop()
-
-    def _leave_loop(self) -> Any:
-        events = modules[LOOPS]
-        loop = events._get_running_loop()
-        if loop is not None or self._users_loop is not None:
-            events._set_running_loop(self._users_loop)
-            self._users_loop = None
-        return loop
-
-    def _enter_loop(self, loop: Any) -> None:
-        events = modules[LOOPS]
-        self._users_loop = events._get_running_loop()
-        if loop is not None or self._users_loop is not None:
-            events._set_running_loop(loop)
-
     # -- on its user's ----------------------------------------------------------------------------
 
     def prepare(
@@ -152,6 +125,8 @@ class GreenletDriver(BaseDriver):
     ) -> None:
         """Have the next ``resume`` begin to run something on the stack."""
         self.enter()
+        if "gevent" in modules:
+            _share_hub(modules["gevent"].get_hub())
         self._prepare(job, decisions, None)
         # A new greenlet has an empty context; a model expects the one that its user has set up.
         self._body.gr_context = copy_context() if context is None else context
@@ -216,7 +191,16 @@ class GreenletDriver(BaseDriver):
     def forked(self) -> None:
         """The process was forked, and this is the child, in which only one thread is left."""
         if self._thread != get_ident():
-            self._forget_stack()
+            self._stay_behind()
+
+
+def _share_hub(hub: Any) -> None:
+    """Have gevent's hub belong to the thread that it serves, and not to a simulation that was the first to use it."""
+    root = getcurrent()
+    while root.parent is not None:
+        root = root.parent
+    if hub.parent is not root:
+        hub.parent = root
 
 
 _given_up: list[GreenletDriver] = []

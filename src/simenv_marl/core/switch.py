@@ -22,9 +22,9 @@ from greenlet import getcurrent, greenlet
 
 from ..errors import WrongThreadError, annotate
 from ..hooks.hook import Hook
-from ..hooks.stacks import STACKS, Taker
+from ..hooks.stacks import STACKS, Taker, stack_of
 from ..simulation import Sentinel
-from .children import Children, unwatch, watch
+from .children import Children, ChildThread, unwatch, watch
 from .events import FAILED, FINISHED, REFUSED
 
 
@@ -89,8 +89,8 @@ class BaseDriver:
     """
 
     __slots__ = (
-        "__weakref__", "_children", "_context", "_ended", "_events", "_idle", "_job", "_refused", "caller", "given_up",
-        "plugins", "stack",
+        "__weakref__", "_astray", "_children", "_context", "_ended", "_events", "_idle", "_job", "_refused", "caller",
+        "given_up", "plugins", "stack",
     )  # fmt: skip
 
     resume: Any
@@ -111,6 +111,7 @@ class BaseDriver:
         self._context: Context | None = None
         self._events: Mapping[Hook, Crossing] = NO_DECISIONS
         self._refused: WrongThreadError | None = None
+        self._astray: str | None = None  # where the stack has been taken without its user, by a fork
         self._children: Children | None = None
         if before is not None and before._children is not None:
             self._children = before._children
@@ -289,8 +290,13 @@ class BaseDriver:
 
     def taker(self, hook: Hook, here: greenlet) -> Taker | None:
         """Who decides a call in a greenlet of the simulation's; None: the rule."""
+        return self._taker(hook, away=True)
+
+    def _taker(self, hook: Hook, away: bool = False) -> Taker | None:
         event = self._events.get(hook)
-        return None if event is None else self._decider(hook, event, away=True)
+        if event is None:
+            return None
+        return self._decider(hook, event, away) if self._astray is None else self.refusal_of(hook, self._astray)
 
     def hide(self) -> None:
         """Take no part in calls on the stack until ``show``."""
@@ -303,8 +309,7 @@ class BaseDriver:
         stack = self.stack
         if stack is not None:
             for hook in self._hooks():
-                event = self._events.get(hook)
-                hook.enter(stack, None if event is None else self._decider(hook, event), self.plugins)
+                hook.enter(stack, self._taker(hook), self.plugins)
 
     def _hooks(self) -> list[Hook]:
         return [*self._events, *(() if self.plugins is None else self.plugins.hooks)]
@@ -330,18 +335,26 @@ class BaseDriver:
             f"{hook.name} was called in {where}, where no user can be asked. Call it where run() runs, and have others"
             " wait for the answer"
         )
-        if self._refused is None:
+        if self._refused is None and self._astray is None:
             self._refused = error
             self._events = dict.fromkeys(self._events, REFUSED)
             self.show()
         return error
 
-    def _refuse_all(self, where: str) -> None:
-        """Refuse all decisions on the stack itself, for the model alone to be told."""
-        for hook in self._events:
-            refuse = self.refusal_of(hook, where)
-            if self.stack is not None:
-                hook.enter(self.stack, refuse, self.plugins)
+    def _go_astray(self, where: str) -> None:
+        """Refuse all decisions of the simulation, for the model alone to be told."""
+        self._astray = where
+        self.show()
+
+    def _stay_behind(self) -> None:
+        """Take no part in this forked process; a thread of the simulation's that has forked it is refused as before."""
+        events = self._events
+        self._forget_stack()
+        here = getcurrent()
+        thread = stack_of(here)
+        if isinstance(thread, ChildThread) and thread.children is self._children:
+            self.stack, self._events, thread.children.driver = here, events, self
+            self._go_astray("a process that a thread of the simulation has forked")
 
     def refusal(self) -> WrongThreadError:
         """The error that tells the user of a decision that was refused."""
@@ -356,7 +369,7 @@ class BaseDriver:
 
     def forked_worker(self) -> None:
         """The simulation has begun a worker of ``multiprocessing`` by a fork, and this is the worker."""
-        self._refuse_all("a process that the simulation has forked as a worker")
+        self._go_astray("a process that the simulation has forked as a worker")
 
 
 def _telling(rule: Any, told: Any) -> Any:

@@ -14,6 +14,7 @@ from ..hooks.hook import Hook
 from ..hooks.stacks import Taker
 from ..simulation import RULE, Sentinel
 from .events import FAILED
+from .loops import hush
 from .switch import STUCK, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 SECONDS_TO_UNWIND: Final = 5.0
@@ -104,6 +105,7 @@ class ThreadDriver(BaseDriver):
             if reply is RULE:
                 return rule(*args, **kwargs)
             if reply is _EXIT:
+                hush()
                 raise SimulationExit
             return reply if deliver is None else deliver(reply, *args, **kwargs)
 
@@ -216,12 +218,12 @@ class ThreadDriver(BaseDriver):
     def forked(self) -> None:
         """The process was forked, and this is the child: in the simulation's own thread, or without it."""
         if self._ident == get_ident():
-            self._refuse_all(
+            self._go_astray(
                 "a process that the simulation has forked, while the environment's user is in another thread and has"
                 ' stayed behind in the parent (with driver="greenlet" it comes along)'
             )
         else:
-            self._forget_stack()
+            self._stay_behind()
 
 
 def _wake(lock: Any) -> None:

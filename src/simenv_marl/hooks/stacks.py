@@ -105,10 +105,19 @@ def spawner_of(here: greenlet) -> Any:
     spawned: Any = here
     for _ in range(100):
         spawner = getattr(spawned, "spawning_greenlet", None)
-        spawned = spawner() if callable(spawner) else spawner  # a weak reference
-        stack = None if spawned is None else stack_of(spawned)
-        if spawned is None or stack is not None:
+        spawner = spawner() if callable(spawner) else spawner  # a weak reference
+        if spawner is None:
+            break
+        stack = stack_of(spawner)
+        if stack is not None:
             return stack
+        spawned = spawner
+    # A greenlet that has spawned another one may be gone, but all that one stack has led to share a dict.
+    tree = getattr(spawned, "spawn_tree_locals", None)
+    if tree is not None:
+        for stack in list(STACKS):
+            if getattr(stack, "spawn_tree_locals", None) is tree:
+                return stack_of(stack)
     return None
 
 

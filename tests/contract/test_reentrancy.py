@@ -1,0 +1,185 @@
+"""An environment that is used from inside itself says so, in every view, whatever is asked or runs just then."""
+
+import signal
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from simenv_marl import (
+    RULE,
+    ReentrancyError,
+    aec_env,
+    handlers,
+    joint_env,
+    parallel_env,
+    single_env,
+    vector_env,
+)
+from tests.worlds.models import decision, script
+
+VIEWS = {
+    "aec": (aec_env, 1),
+    "parallel": (parallel_env, {"ant_0": 1}),
+    "single": (single_env, 1),
+    "joint": (joint_env, {"ant_0": 1}),
+    "vector": (lambda *args, **options: vector_env(*args, num_envs=2, **options), np.array([1, 1])),
+    "vector of joint": (
+        lambda *args, **options: vector_env(*args, num_envs=2, **options),
+        {"ant_0": np.array([1, 1])},
+    ),
+}
+PLACES = [
+    *["action_space_mapping", "observation_space_mapping", "reward_mapping", "action_mask_mapping", "choices", "apply"],
+    *["agent", "rule", "policy", "before", "instead", "after", "plugin", "time", "expected_calls"],
+]
+
+
+@pytest.fixture(autouse=True)
+def _never_a_hang():
+    if not hasattr(signal, "alarm"):
+        yield
+        return
+
+    def give_up(*_):
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(30)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+class World:
+    """An environment that is used from one place inside itself, once it is armed for that."""
+
+    def __init__(self, view, place, method):
+        make, self.action = VIEWS[view]
+        self.place, self.method = place, method
+        self.armed, self.catch, self.raised = False, True, []
+        self.made = []
+        self.undo = ExitStack()
+
+        def ant_rule():
+            return 0
+
+        def bee_rule():
+            return self.at("rule", 0)
+
+        named = view == "vector of joint" or place == "agent"
+        ant = decision(
+            ant_rule, **{"agent": (lambda: self.at("agent", "ant_0")) if named else "ant_0"} | self.changes()
+        )
+        bee = decision(bee_rule, agent="bee_0")
+
+        def main(simulation):
+            for _ in range(3):
+                simulation.log.append(ant())
+                bee()
+
+        def simulation():
+            made = script(main)()
+            if place == "time":
+                made.time = lambda: self.at("time", 0.0)
+            if place == "expected_calls":
+                made.expected_calls = lambda point: self.at("expected_calls", [()] if "ant_rule" in point else [])
+            self.made.append(made)
+            return made
+
+        policies = {"bee_0": (lambda *_: self.at("policy", 1)) if place == "policy" else RULE}
+        options = {"policies": policies, "possible_agents": ["ant_0"] if named else None}
+        if place == "plugin":
+            options["plugins"] = [(self.handle, bee, "before")]
+        elif place in ("before", "instead", "after"):
+            self.undo.enter_context(handlers((self.handle, bee, place)))
+        try:
+            self.env = make(simulation, [ant, bee], **options)
+            self.undo.callback(self.env.close)
+        except BaseException:
+            self.undo.close()
+            raise
+
+    def changes(self):
+        values = {
+            "action_space_mapping": lambda action: self.at("action_space_mapping", action),
+            "observation_space_mapping": lambda: self.at("observation_space_mapping", [0, 0]),
+            "reward_mapping": lambda: self.at("reward_mapping", 1.0),
+            "action_mask_mapping": lambda: self.at("action_mask_mapping", [1] * 10),
+            "choices": lambda: self.at("choices", list(range(10))),
+            "apply": lambda action: self.at("apply", action),
+        }
+        return {name: value for name, value in values.items() if name == self.place}
+
+    def handle(self):
+        self.at(self.place, None)
+
+    def at(self, place, value):
+        """Come by a place, at which a value is asked for."""
+        if self.armed and place == self.place:
+            self.armed = False
+            try:
+                self.step() if self.method == "step" else getattr(self.env, self.method)()
+            except ReentrancyError as error:
+                self.raised.append("was used from" in str(error))
+                if not self.catch:
+                    raise
+            else:
+                self.raised.append("nothing")
+        return value
+
+    def step(self):
+        self.env.step(self.action)
+
+    def play(self):
+        for _ in range(3):
+            self.step()
+
+    @property
+    def logs(self):
+        """What those simulations have done that the environment has used."""
+        return [made.log for made in self.made if getattr(made, "log", None)]
+
+
+def possible(view, place):
+    """Single views know no agents that are named by a callable, and only joint ones ask for what is expected."""
+    if place == "agent":
+        return view not in ("single", "vector")
+    return place != "expected_calls" or view in ("parallel", "joint", "vector of joint")
+
+
+EVERYWHERE = pytest.mark.parametrize(
+    ("view", "place"), [(view, place) for view in VIEWS for place in PLACES if possible(view, place)]
+)
+METHODS = pytest.mark.parametrize("method", ["step", "reset", "close"])
+
+
+@EVERYWHERE
+@METHODS
+def test_an_environment_that_is_used_from_inside_itself_says_so_and_goes_on(view, place, method):
+    world = World(view, place, method)
+    with world.undo:
+        for _ in range(2):
+            world.env.reset(seed=1)
+            world.armed = True
+            world.play()
+            assert not world.armed
+            assert all(log == [1, 1, 1] for log in world.logs)
+        assert world.raised == [True, True]
+
+
+@EVERYWHERE
+@METHODS
+def test_where_that_is_not_caught_it_ends_the_step_and_the_next_reset_works(view, place, method):
+    world = World(view, place, method)
+    world.catch = False
+    with world.undo:
+        for _ in range(2):
+            world.env.reset(seed=1)
+            world.armed = True
+            with pytest.raises(ReentrancyError, match="was used from"):
+                world.play()
+        assert world.raised == [True, True]
+        world.env.reset(seed=1)
+        world.play()
+        assert all(log == [1, 1, 1] for log in world.logs)

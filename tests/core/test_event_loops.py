@@ -1,0 +1,422 @@
+"""What event loops set for a whole thread is the model's while it runs, and its user's between the steps."""
+
+import asyncio
+import gc
+import logging
+import signal
+import sys
+from functools import partial
+
+import pytest
+
+from simenv_marl import SimulationInterface, single_env
+from tests.conftest import DRIVERS
+from tests.worlds.models import decision, script
+
+DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
+
+
+def around():
+    """What event loops set for a whole thread."""
+    return asyncio._get_running_loop(), sys.get_asyncgen_hooks(), sys.get_coroutine_origin_tracking_depth()
+
+
+@pytest.fixture(autouse=True)
+def _nothing_stays_behind():
+    before, interrupt = around(), signal.getsignal(signal.SIGINT)
+    yield
+    stayed, handler = around(), signal.getsignal(signal.SIGINT)
+    asyncio._set_running_loop(before[0])  # a failed test is no reason for others to fail
+    sys.set_asyncgen_hooks(*before[1])
+    sys.set_coroutine_origin_tracking_depth(before[2])
+    signal.signal(signal.SIGINT, interrupt)
+    assert stayed == before
+    assert handler is interrupt
+
+
+@pytest.fixture
+def loud(caplog):
+    """Whatever asyncio logs, be it only when something is collected."""
+    with caplog.at_level(logging.DEBUG, logger="asyncio"):
+        yield caplog
+
+
+def told(caplog):
+    gc.collect()
+    return [record.getMessage().partition("\n")[0] for record in caplog.records if record.levelno > logging.DEBUG]
+
+
+# -- what is set for the thread -------------------------------------------------------------------
+
+
+def tracking(decide, first=False):
+    """A model that notes what is set around it, before and after each of its decisions."""
+
+    async def work(simulation):
+        simulation.log.append(around())
+        for _ in range(3):
+            decide()
+            simulation.log.append(around())
+
+    def main(simulation):
+        if first:
+            decide()
+        simulation.log.append(around())
+        asyncio.run(work(simulation), debug=True)
+        simulation.log.append(around())
+        decide()
+
+    return script(main)
+
+
+def check_tracked(env, outside):
+    """The model's surroundings were its loop's throughout, and before and after it none."""
+    before, *within, after = env.simulation.log
+    assert before == after == outside
+    assert len({str(seen) for seen in within}) == 1
+    loop, hooks, depth = within[0]
+    assert loop is not None
+    assert hooks.firstiter.__self__ is hooks.finalizer.__self__ is loop
+    assert depth > 0
+
+
+NOTHING = (None, (None, None), 0)
+
+
+@DRIVERS
+@pytest.mark.parametrize("first", [False, True], ids=["from the first decision on", "later"])
+def test_hooks_and_tracking_are_the_users_between_steps_and_the_models_again_afterwards(driver, first):
+    decide = decision()
+    env = single_env(tracking(decide, first), decide, driver=driver)
+    for _ in range(2):
+        env.reset()
+        seen = [around()]
+        while not env.step(1)[2]:
+            seen.append(around())
+        assert {*seen, around()} == {NOTHING}
+        check_tracked(env, NOTHING)
+    env.reset()
+    env.close()
+
+
+@DRIVERS
+@pytest.mark.parametrize("first", [False, True], ids=["from the first decision on", "later"])
+def test_hooks_and_tracking_of_a_user_without_a_loop_stay_what_they_are(driver, first):
+    def hook(generator):
+        """What takes note of asynchronous generators."""
+
+    decide = decision()
+    env = single_env(tracking(decide, first), decide, driver=driver)
+    sys.set_asyncgen_hooks(hook, hook)
+    sys.set_coroutine_origin_tracking_depth(3)
+    try:
+        mine = around()
+        env.reset()
+        seen = [around()]
+        while not env.step(1)[2]:
+            seen.append(around())
+        assert {*seen, around()} == {mine}
+        check_tracked(env, mine if driver == "greenlet" else NOTHING)
+    finally:
+        sys.set_asyncgen_hooks(None, None)
+        sys.set_coroutine_origin_tracking_depth(0)
+
+
+@DRIVERS
+@pytest.mark.parametrize("first", [False, True], ids=["from the first decision on", "later"])
+@pytest.mark.parametrize("inside", [0, 1, 2, 5])
+def test_hooks_and_tracking_of_a_user_with_a_loop_are_those_of_that_loop(driver, first, inside):
+    """The episode begins inside a loop of the user's, or outside, and goes on in the other."""
+
+    async def act(move):
+        mine = around()
+        assert mine[1].firstiter.__self__ is mine[0]
+        ended = move()
+        assert around() == mine
+        return ended
+
+    def move():
+        return env.step(1)[2]
+
+    decide = decision()
+    env = single_env(tracking(decide, first), decide, driver=driver)
+    moves = [env.reset, *[move] * (4 + first)]
+    for number, moved in enumerate(moves):
+        ended = asyncio.run(act(moved)) if (number < inside) == (inside % 2 == 0) else moved()
+        assert around() == NOTHING
+    assert ended
+    check_tracked(env, NOTHING)
+    env.close()
+
+
+def test_a_generator_of_the_users_is_not_the_models_to_end():
+    closed = []
+
+    async def numbers():
+        try:
+            yield 1
+        finally:
+            closed.append("closed")
+
+    async def work():
+        decide()
+
+    decide = decision()
+    env = single_env(script(lambda simulation: asyncio.run(work())), decide)
+    env.reset()
+    generator = numbers()
+    with pytest.raises(StopIteration):
+        generator.__anext__().send(None)
+    env.step(1)
+    assert not closed
+    with pytest.raises(StopIteration):
+        generator.aclose().send(None)
+
+
+# -- Ctrl-C ---------------------------------------------------------------------------------------
+
+
+def deciding(decide, interrupted=False):
+    async def work(simulation):
+        try:
+            for _ in range(3):
+                simulation.log.append(decide())
+                if interrupted:
+                    signal.raise_signal(signal.SIGINT)
+                    await asyncio.sleep(0)
+        except asyncio.CancelledError:
+            simulation.log.append("cancelled")
+            raise
+
+    def main(simulation):
+        simulation.log.append(decide())
+        asyncio.run(work(simulation))
+
+    return script(main)
+
+
+@DRIVERS
+def test_an_interrupt_between_steps_is_the_users(driver):
+    decide = decision()
+    env = single_env(deciding(decide), decide, driver=driver)
+    env.reset()
+    for number in range(4):
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        ended = env.step(number)[2]
+    assert ended
+    assert env.simulation.log == [0, 1, 2, 3]
+
+
+@DRIVERS
+def test_a_handler_of_the_users_own_stays_in_force(driver):
+    caught = []
+
+    def handler(number, frame):
+        caught.append(number)
+
+    decide = decision()
+    env = single_env(deciding(decide), decide, driver=driver)
+    env.reset()
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        for number in range(4):
+            assert signal.getsignal(signal.SIGINT) is handler
+            signal.raise_signal(signal.SIGINT)
+            assert env.step(number)[2] is (number == 3)
+        assert len(caught) == 4
+        signal.signal(signal.SIGINT, before)
+        env.reset()
+        env.step(1)
+        signal.signal(signal.SIGINT, handler)  # while the model has a loop, which has one of its own
+        env.step(2)
+        assert signal.getsignal(signal.SIGINT) is handler
+        env.step(3)
+        assert env.step(4)[2]
+        assert signal.getsignal(signal.SIGINT) is handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_while_the_model_computes_is_its_loops():
+    decide = decision()
+    env = single_env(deciding(decide, interrupted=True), decide)
+    env.reset()
+    env.step(1)
+    with pytest.raises(KeyboardInterrupt):
+        env.step(2)
+    assert env.simulation.log == [1, 2, "cancelled"]
+
+
+@DRIVERS
+def test_an_interrupt_of_a_loop_of_the_users_ends_that_and_not_the_model(driver):
+    async def use():
+        env.step(1)
+        signal.raise_signal(signal.SIGINT)
+        env.step(2)
+        await asyncio.sleep(0)
+
+    decide = decision()
+    env = single_env(deciding(decide), decide, driver=driver)
+    env.reset()
+    env.step(0)
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(use())
+    assert env.step(3)[2]
+    assert env.simulation.log == [0, 1, 2, 3]
+
+
+# -- unwinding ------------------------------------------------------------------------------------
+
+
+async def grouped(clerk):
+    async with asyncio.TaskGroup() as group:
+        for _ in range(3):
+            group.create_task(clerk())
+
+
+async def nested(clerk):
+    async with asyncio.TaskGroup() as group:
+        group.create_task(grouped(clerk))
+        group.create_task(clerk())
+
+
+async def gathered(clerk):
+    await asyncio.gather(*[clerk() for _ in range(3)])
+
+
+async def in_time(clerk):
+    await asyncio.wait_for(clerk(), 100)
+
+
+async def waited(clerk):
+    await asyncio.wait([asyncio.create_task(clerk()) for _ in range(3)])
+
+
+async def shielded(clerk):
+    await asyncio.shield(asyncio.create_task(clerk()))
+
+
+async def handled(clerk):
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: loop.default_exception_handler(context))
+    await grouped(clerk)
+
+
+WAYS = pytest.mark.parametrize("way", [grouped, nested, gathered, in_time, waited, shielded, handled])
+
+
+@DRIVERS
+@WAYS
+@pytest.mark.parametrize("steps", [0, 1])
+@pytest.mark.parametrize("how", ["close", "reset", "collected"])
+def test_nothing_is_told_of_tasks_that_are_unwound(driver, way, steps, how, loud):
+    async def clerk():
+        await asyncio.sleep(0)
+        for _ in range(2):
+            decide()
+            await asyncio.sleep(0)
+
+    decide = decision()
+    env = single_env(script(lambda simulation: asyncio.run(way(clerk))), decide, driver=driver)
+    env.reset()
+    for _ in range(steps):
+        env.step(1)
+    if how != "collected":
+        getattr(env, how)()
+        env.close()
+    del env
+    assert told(loud) == []
+
+
+@DRIVERS
+def test_errors_of_tasks_are_told_all_the_same_while_others_are_unwound(driver, loud):
+    async def fail():
+        raise ValueError
+
+    async def clerk():
+        keep = asyncio.create_task(fail())
+        await asyncio.sleep(0)
+        try:
+            decide()
+        finally:
+            del keep
+
+    decide = decision()
+    env = single_env(script(lambda simulation: asyncio.run(grouped(clerk))), decide, driver=driver)
+    env.reset()
+    env.close()
+    assert told(loud) == ["Task exception was never retrieved"]
+    assert isinstance(loud.records[-1].exc_info[1], ValueError)
+
+
+@DRIVERS
+def test_a_loop_that_lives_for_many_episodes_is_changed_once(driver, loud):
+    class Model(SimulationInterface):
+        def __init__(self):
+            self.loop = asyncio.new_event_loop()
+            self.told = []
+            self.loop.set_exception_handler(lambda loop, context: self.told.append(context["message"]))
+            self.handlers = set()
+
+        def reset(self, seed=None):
+            self.handlers.add(self.loop.get_exception_handler())
+
+        def run(self):
+            self.loop.run_until_complete(self.clerk())
+
+        async def clerk(self):
+            await asyncio.sleep(0)
+            decide()
+
+    decide = decision()
+    env = single_env(Model, decide, driver=driver)
+    for _ in range(10):
+        env.reset()
+        assert around() == NOTHING
+    env.close()
+    model = env.simulation
+    gc.collect()
+    assert model.told == []
+    assert len(model.handlers) == 2
+    model.loop.call_exception_handler({"message": "something else"})
+    assert model.told == ["something else"]
+    model.loop.close()
+
+
+# -- trio -----------------------------------------------------------------------------------------
+
+
+def of_trio(decide):
+    trio = pytest.importorskip("trio")
+
+    async def work(simulation):
+        for _ in range(2):
+            await trio.lowlevel.checkpoint()
+            simulation.log.append(decide())
+
+    return script(lambda simulation: trio.run(partial(work, simulation)))
+
+
+def test_models_of_trio_run_side_by_side_in_threads_of_their_own():
+    decide = decision()
+    envs = [single_env(of_trio(decide), decide, driver="thread") for _ in range(3)]
+    for env in envs:
+        env.reset()
+    assert [[env.step(number)[2] for env in envs] for number in range(2)] == [[False] * 3, [True] * 3]
+    assert [env.simulation.log for env in envs] == [[0, 1]] * 3
+    for env in envs:
+        env.reset()
+        env.close()
+
+
+def test_one_model_of_trio_runs_on_a_greenlet_and_a_second_one_is_refused_by_trio():
+    decide = decision()
+    env, other = (single_env(of_trio(decide), decide) for _ in range(2))
+    for _ in range(2):
+        env.reset()
+        with pytest.raises(RuntimeError, match="run"):
+            other.reset()
+        assert [env.step(number)[2] for number in range(2)] == [False, True]
+        assert env.simulation.log == [0, 1]
+    other.reset()
+    other.close()

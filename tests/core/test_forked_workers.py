@@ -1,0 +1,212 @@
+"""Processes that a simulation forks have no user to ask: what they decide is refused, and the environment goes on."""
+
+import subprocess
+import sys
+from textwrap import dedent
+
+import pytest
+
+from tests.conftest import DRIVERS
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the platform does not fork")
+
+DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
+
+LIMIT = 60
+"""Seconds after which a test is given up; its processes have ended themselves by then."""
+
+PREAMBLE = """
+    import multiprocessing, os, signal, sys, threading, warnings
+    from concurrent.futures import ProcessPoolExecutor
+
+    import greenlet
+
+    from simenv_marl import WrongThreadError, single_env
+    from tests.worlds.models import Script, decision, script
+
+    signal.alarm(30)  # so that none waits for ever
+    os.register_at_fork(after_in_child=lambda: signal.alarm(30))
+    warnings.simplefilter("ignore", DeprecationWarning)  # of forks where there are threads
+    context = multiprocessing.get_context("fork")
+    decide, other = decision(), decision(lambda: "not active")
+
+    def ask(*_):
+        try:
+            return "decided", decide(), other()
+        except WrongThreadError as error:
+            return "refused", "forked" in str(error), other()
+
+    def tell(queue):
+        for _ in range(2):  # the second time as the first
+            queue.put(ask())
+
+    class Process:
+        def __init__(self):
+            self.queue = context.SimpleQueue()
+            self.process = context.Process(target=tell, args=(self.queue,))
+        def ask(self):
+            self.process.start()
+            told = {self.queue.get() for _ in range(2)}
+            self.process.join()
+            assert self.process.exitcode == 0
+            return told
+
+    class Pool:
+        options = {}
+        def __init__(self):
+            self.pool = context.Pool(1, **self.options)
+        def ask(self):
+            told = {self.pool.apply_async(ask).get(20) for _ in range(3)}
+            self.pool.close()
+            self.pool.join()
+            return told
+
+    class Changing(Pool):
+        options = {"maxtasksperchild": 1}  # all but the first are forked in a thread of the pool
+
+    class Executor:
+        def __init__(self):
+            self.pool = ProcessPoolExecutor(1, mp_context=context)
+        def ask(self):
+            told = {self.pool.submit(ask).result(20) for _ in range(3)}
+            self.pool.shutdown()
+            return told
+
+    class Fork:
+        def __init__(self):
+            self.reader, self.writer = os.pipe()
+        def ask(self):
+            child = os.fork()
+            if child == 0:
+                status = 1
+                try:
+                    told = {ask(), ask()}
+                    os.write(self.writer, repr(told).encode())
+                    status = 0
+                finally:
+                    os._exit(status)
+            assert os.waitpid(child, 0)[1] == 0
+            return eval(os.read(self.reader, 10_000))
+
+    def in_a_thread(function):
+        told = []
+        thread = threading.Thread(target=lambda: told.append(function()))
+        thread.start()
+        thread.join(20)
+        return told[0]
+
+    def in_a_greenlet(function):
+        return greenlet.greenlet(function).switch()
+
+    def directly(function):
+        return function()
+
+    def play(main, make=Script):
+        env = single_env(lambda: make(main), decide, driver=driver)
+        env.reset()
+        first = env.step(1)[2]
+        assert (first, env.step(2)[2]) == (False, True)
+        assert env.simulation.log[::2] == [1, 2]
+        env.close()
+        return env.simulation.log[1]
+
+    user = os.getpid()
+"""
+
+
+def run(code, driver):
+    """Run code in a process of its own, which no worker leaves as a second one."""
+    source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + "\nprint('end', os.getpid() == user)\n"
+    result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False, timeout=LIMIT)
+    assert (result.returncode, result.stderr) == (0, ""), result.stdout + result.stderr
+    return result.stdout
+
+
+KINDS = pytest.mark.parametrize("kind", ["Process", "Pool", "Changing", "Executor"])
+
+
+@DRIVERS
+@KINDS
+def test_workers_that_a_model_forks_are_refused_as_often_as_they_decide(kind, driver):
+    said = run(
+        f"""
+        for way in (directly, in_a_thread, in_a_greenlet):
+            def main(simulation):
+                simulation.log.append(decide())
+                simulation.log.append(way(lambda: {kind}().ask()))
+                simulation.log.append(decide())
+            for _ in range(2):
+                assert play(main) == {{("refused", True, "not active")}}, way
+        """,
+        driver,
+    )
+    assert said == "end True\n"
+
+
+@DRIVERS
+@KINDS
+def test_workers_that_were_forked_before_the_model_runs_have_the_rule(kind, driver):
+    said = run(
+        f"""
+        class Model(Script):
+            def reset(self, seed=None, options=None):
+                super().reset(seed, options)
+                self.workers = {kind}()
+                if {kind} is Process:
+                    self.workers.process.start()
+                    self.workers.process.start = lambda: None
+                elif {kind} is Executor:
+                    self.workers.pool.submit(int).result(20)
+        def main(simulation):
+            simulation.log.append(decide())
+            simulation.log.append(simulation.workers.ask())
+            simulation.log.append(decide())
+        told = play(main, Model)
+        assert ("decided", "rule", "not active") in told
+        assert told <= {{("decided", "rule", "not active"), ("refused", True, "not active")}}
+        """,
+        driver,
+    )
+    assert said == "end True\n"
+
+
+@pytest.mark.parametrize(
+    ("way", "driver"),
+    [("directly", "thread"), ("in_a_thread", "thread"), ("in_a_thread", "greenlet"), ("in_a_greenlet", "thread")],
+)
+def test_a_plain_fork_without_the_user_is_refused_as_well(way, driver):
+    said = run(
+        f"""
+        def main(simulation):
+            simulation.log.append(decide())
+            simulation.log.append({way}(Fork().ask))
+            simulation.log.append(decide())
+        assert play(main) == {{("refused", True, "not active")}}
+        """,
+        driver,
+    )
+    assert said == "end True\n"
+
+
+@DRIVERS
+def test_a_forked_worker_uses_environments_of_its_own(driver):
+    said = run(
+        """
+        def play_own(queue):
+            env = single_env(script(lambda simulation: simulation.log.append(decide())), decide, driver=driver)
+            env.reset()
+            queue.put((env.step(7)[2], env.simulation.log, ask()[0]))
+            env.close()
+        def main(simulation):
+            simulation.log.append(decide())
+            queue = context.SimpleQueue()
+            worker = context.Process(target=play_own, args=(queue,))
+            worker.start()
+            simulation.log.append(queue.get())
+            worker.join()
+            simulation.log.append(decide())
+        assert play(main) == (True, [7], "refused")
+        """,
+        driver,
+    )
+    assert said == "end True\n"

@@ -1,0 +1,190 @@
+"""Models that wait in gevent's hub, which serves all greenlets of a thread: their own, and those of their user."""
+
+import subprocess
+import sys
+from textwrap import dedent
+
+import pytest
+
+from tests.conftest import DRIVERS
+
+pytest.importorskip("gevent")
+
+DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
+
+LIMIT = 60
+"""Seconds after which a test is given up; its process has ended itself by then."""
+
+PREAMBLE = """
+    import gc, signal, sys
+    import gevent
+    from gevent.pool import Group
+    from simenv_marl import WrongThreadError, single_env
+    from tests.worlds.models import decision, script
+
+    if hasattr(signal, "alarm"):
+        signal.alarm(30)  # so that none waits for ever
+
+    decide, other = decision(), decision(lambda: "not active")
+    told = []
+
+    def ask():
+        try:
+            told.append(decide())
+        except WrongThreadError as error:
+            told.append("hub of others" in str(error) and "refused")
+        told.append(other())
+
+    def waiting(simulation):
+        for _ in range(3):
+            gevent.sleep(0.01)
+            simulation.log.append(decide())
+            gevent.sleep(0.01)
+"""
+
+
+def run(code, driver="greenlet"):
+    """Run code in a process of its own, whose hub nothing else has used."""
+    source = f"driver = {driver!r}\n" + dedent(PREAMBLE) + dedent(code) + "\nprint('end')\n"
+    result = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=False, timeout=LIMIT)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "end\n", ""), result.stdout + result.stderr
+
+
+@DRIVERS
+@pytest.mark.parametrize("first", ["user", "model"])
+@pytest.mark.parametrize("where", ["main", "spawned"])
+def test_a_decision_of_the_users_while_the_model_waits_in_a_hub_runs_the_rule(where, first, driver):
+    """Whichever of the two has used the hub first, and wherever the user steps."""
+    run(
+        f"""
+        if {first!r} == "user":
+            gevent.sleep(0)
+        def use():
+            for _ in range(2):
+                told.clear()
+                env.reset()
+                asking = [gevent.spawn(ask) for _ in range(2)]
+                assert not env.step(1)[2]
+                asking += [gevent.spawn_later(0.005, ask), gevent.spawn(lambda: gevent.spawn(ask).join())]
+                assert not env.step(2)[2]
+                gevent.joinall(asking, timeout=10, raise_error=True)
+                assert told.count("rule") == told.count("not active") == 4 == len(told) / 2
+                assert env.step(3)[2]
+                assert env.simulation.log == [1, 2, 3]
+        env = single_env(script(waiting), decide, driver=driver)
+        if {where!r} == "main":
+            use()
+        else:
+            gevent.spawn(use).get(timeout=20)
+        env.close()
+        gevent.spawn(ask).join(timeout=10)
+        assert told[-2:] == ["rule", "not active"]
+        """,
+        driver,
+    )
+
+
+@DRIVERS
+def test_models_wait_side_by_side_in_greenlets_of_their_users(driver):
+    run(
+        """
+        def use(number):
+            env = single_env(script(waiting), decide, driver=driver)
+            for _ in range(2):
+                env.reset()
+                ends = [env.step(number + step)[2] for step in range(3)]
+                assert ends == [False, False, True]
+                assert env.simulation.log == [number, number + 1, number + 2]
+            env.close()
+            return number
+        users = [gevent.spawn(use, number) for number in range(3)]
+        gevent.joinall(users, timeout=20, raise_error=True)
+        assert [user.value for user in users] == [0, 1, 2]
+        """,
+        driver,
+    )
+
+
+@pytest.mark.parametrize("first", ["user", "model"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "gevent.spawn(ask).join()",
+        "gevent.spawn(lambda: gevent.spawn(ask).join()).join()",
+        "gevent.spawn(lambda: gevent.spawn_later(0.01, ask)).join(); gc.collect(); gevent.sleep(0.05)",
+        "gevent.spawn_raw(ask); gevent.sleep(0.02)",
+        "Group().spawn(ask).join()",
+    ],
+    ids=["spawned", "in turn", "by one that is gone", "raw", "in a group"],
+)
+def test_what_a_model_spawns_on_the_hub_is_refused(how, first):
+    run(
+        f"""
+        if {first!r} == "user":
+            gevent.sleep(0)
+        def main(simulation):
+            decide()
+            {how}
+            decide()
+        env = single_env(script(main), decide)
+        for _ in range(2):
+            told.clear()
+            env.reset()
+            try:
+                env.step(1)
+            except WrongThreadError as error:
+                assert "hub of others" in str(error)
+            else:
+                raise AssertionError(told)
+            assert told == ["refused", "not active"]
+        env.close()
+        gevent.spawn(ask).join(timeout=10)
+        assert told == ["refused", "not active", "rule", "not active"]
+        """
+    )
+
+
+def test_what_a_model_spawns_on_a_hub_of_its_own_decides():
+    run(
+        """
+        def main(simulation):
+            simulation.log.append(decide())
+            group = Group()
+            for _ in range(2):
+                group.spawn(ask)
+            group.join()
+            simulation.log.append(decide())
+        env = single_env(script(main), decide, driver="thread")
+        for _ in range(2):
+            told.clear()
+            env.reset()
+            assert [env.step(number)[2] for number in range(4)] == [False, False, False, True]
+            assert (env.simulation.log, told) == ([0, 3], [1, "not active", 2, "not active"])
+        env.reset()
+        env.step(1)
+        env.close()
+        """
+    )
+
+
+@pytest.mark.parametrize("how", ["close", "reset"])
+def test_a_model_that_waits_in_the_hub_unwinds(how):
+    run(
+        f"""
+        unwound = []
+        def main(simulation):
+            try:
+                waiting(simulation)
+            finally:
+                gevent.sleep(0.01)
+                unwound.append(len(simulation.log))
+        env = single_env(script(main), decide)
+        env.reset()
+        env.step(1)
+        env.{how}()
+        assert unwound == [1]
+        env.close()
+        gevent.spawn(ask).join(timeout=10)
+        assert told == ["rule", "not active"]
+        """
+    )

@@ -1,4 +1,4 @@
-"""Gymnasium's own vector environments over single views, in one process and in others, tell what ``vector_env`` tells."""
+"""Gymnasium's own vector environments over single views tell what ``vector_env`` tells, in whatever processes."""
 
 from __future__ import annotations
 

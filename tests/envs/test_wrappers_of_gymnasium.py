@@ -13,7 +13,7 @@ import pytest
 from gymnasium import wrappers
 from gymnasium.vector import SyncVectorEnv
 
-from tests.worlds.counters import same
+from tests.worlds.counters import alike
 from tests.worlds.dials import DialEnv, dial_env, dial_envs
 
 
@@ -123,17 +123,6 @@ def wrap(tmp_path, monkeypatch):
         return told
 
     return story
-
-
-def alike(one: Any, other: Any) -> bool:
-    """The same, but for how long it has taken; tensors are compared as arrays."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(alike(one[key], other[key]) for key in one if key != "t")
-    if isinstance(one, (list, tuple)):
-        return len(one) == len(other) and all(map(alike, one, other))
-    if type(one).__module__ == "torch":
-        one, other = one.numpy(), other.numpy()
-    return same(one, other)
 
 
 @pytest.mark.parametrize(("name", "case"), ALONE.items(), ids=ALONE)

@@ -1,4 +1,4 @@
-"""All that ``pettingzoo.test`` has, on both examples and on a colony in which agents are born and die."""
+"""All that ``pettingzoo.test`` has, and PettingZoo's wrappers, on both examples and where agents are born and die."""
 
 import sys
 from functools import partial
@@ -11,9 +11,12 @@ from examples.greenhouse_coop.env import WATERING, GreenhouseSim
 from examples.wolf_sheep.env import Meadow, sheep_points
 from gymnasium import spaces
 from pettingzoo import test as kit
+from pettingzoo.utils import wrappers
+from pettingzoo.utils.conversions import aec_to_parallel
 
-from simenv_marl import aec_env, make_step, parallel_env
+from simenv_marl import RULE, aec_env, make_step, parallel_env
 from tests.worlds.many_worlds import ROSTER, Announcing, Creature, Design, colony_points
+from tests.worlds.models import play
 
 SHEEP = 12
 POINT = f"{Creature.__module__}.{Creature.act.__qualname__}"
@@ -33,8 +36,8 @@ class Greenhouse(Painted, GreenhouseSim):
 
 
 class Pasture(Painted, Meadow):
-    def __init__(self, ticks=10, wolves=2):
-        super().__init__(ticks, width=6, height=6, initial_sheep=SHEEP, initial_wolves=wolves)
+    def __init__(self, ticks=10, **changes):
+        super().__init__(ticks, **{"width": 6, "height": 6, "initial_sheep": SHEEP, "initial_wolves": 2} | changes)
 
 
 class Colony(Painted, Announcing):
@@ -129,7 +132,8 @@ def test_numbers_of_rounds(name):
 
     def env(view, max_cycles):
         if simulation is Pasture:
-            return view(partial(Pasture, max_cycles, wolves=1), points, **options)
+            fed = partial(Pasture, max_cycles, initial_wolves=1, sheep_gain_from_food=1000.0)
+            return view(fed, points, **options)
         return view(simulation, points, max_steps=max_cycles * (2 if view is aec_env else 1), **options)
 
     kit.max_cycles_test(SimpleNamespace(env=partial(env, aec_env), parallel_env=partial(env, parallel_env)))
@@ -155,3 +159,49 @@ def test_observations_that_are_pictures(tmp_path, monkeypatch, capsys):
     kit.test_save_obs(env)
     assert [path.name for path in tmp_path.glob("saved_observations/*/*")] == ["waterer_0.png"]
     assert "did not save" not in capsys.readouterr().out
+
+
+# -- its wrappers: those that look at actions are in test_conformance.py, those for films in test_wrappers.py ---
+
+
+class Wrapped(wrappers.BaseParallelWrapper):
+    """A wrapper that changes nothing."""
+
+
+def test_wrapped(world):
+    for wrapper in (wrappers.BaseWrapper, wrappers.OrderEnforcingWrapper):
+        kit.api_test(wrapper(maker(world, aec_env)()), num_cycles=30)
+    kit.parallel_api_test(Wrapped(maker(world, parallel_env)()), num_cycles=30)
+
+
+def length_in_rounds(env, seed):
+    env.reset(seed=seed)
+    rounds = 0
+    while env.agents:
+        env.step(dict.fromkeys(env.agents, RULE))
+        rounds += 1
+    return rounds
+
+
+def length_in_turns(env, seed):
+    return len(play(env, seed=seed))
+
+
+@pytest.mark.parametrize(
+    ("view", "wrapper", "length"),
+    [
+        (parallel_env, wrappers.MultiEpisodeParallelEnv, length_in_rounds),
+        (aec_env, wrappers.MultiEpisodeEnv, length_in_turns),
+    ],
+    ids=["rounds", "turns"],
+)
+def test_many_episodes_as_one(world, view, wrapper, length):
+    make = maker(world, view)
+    episodes = [length(make(), seed) for seed in (1, 2, 3)]
+    assert length(wrapper(make(), num_episodes=3), 1) == sum(episodes)
+
+
+def test_rounds_are_not_made_of_turns():
+    """PettingZoo's conversion needs turns in one order, of moves that wait for each other: see ``parallel_env``."""
+    with pytest.raises(AssertionError, match="is_parallelizable"):
+        aec_to_parallel(aec_env(Greenhouse))

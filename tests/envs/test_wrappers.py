@@ -1,5 +1,7 @@
 """All wrappers of Gymnasium: around our views they tell what they tell around environments written by hand.
 
+And those of PettingZoo that make films.
+
 Some need packages that are installed beside SuperSuit alone: ``make test-wrappers``.
 """
 
@@ -12,9 +14,11 @@ import numpy as np
 import pytest
 from gymnasium import wrappers
 from gymnasium.vector import SyncVectorEnv
+from pettingzoo.utils.wrappers import RecordVideo, RecordVideoParallel
 
+from simenv_marl import aec_env, parallel_env
 from tests.worlds.counters import alike
-from tests.worlds.dials import DialEnv, dial_env, dial_envs
+from tests.worlds.dials import DialEnv, DialSim, dial_env, dial_envs, points
 
 
 class Case(NamedTuple):
@@ -144,3 +148,17 @@ def test_around_many(name, case, wrap):
         for make in (dial_envs, by_hand)
     )
     assert alike(one, other)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_films_by_pettingzoo(parallel, tmp_path):
+    pytest.importorskip("moviepy")
+    view, wrapper = (parallel_env, RecordVideoParallel) if parallel else (aec_env, RecordVideo)
+    env = wrapper(view(DialSim, points("numbers"), render_mode="rgb_array"), str(tmp_path / "films"))
+    env.reset(seed=1)
+    while env.agents:
+        over = not parallel and any(env.last()[2:4])
+        action = None if over else np.ones(2, np.float32)
+        env.step({"hand_0": action} if parallel else action)
+    env.close()
+    assert [path.suffix for path in (tmp_path / "films").iterdir()] == [".mp4"]

@@ -2,7 +2,7 @@
 
 And those of PettingZoo that make films.
 
-Some need packages that are installed beside SuperSuit alone: ``make test-wrappers``.
+Some need packages that only ``make test-wrappers`` installs.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from simenv_marl import TRUNCATED, aec_env, parallel_env
 from tests.worlds.counters import alike
 from tests.worlds.dials import ACTIONS, SEEN, Dial, DialEnv, dial_env, points, turned_by
 
+from . import page
 from .returns import parallel_return
 from .worlds import FORAGERS, HerdSim
 
@@ -200,6 +201,11 @@ def test_the_dead_go_on_as_black_death_has_it():
     assert black == [(paid, rounds + 1) for paid, rounds in plain]
 
 
+def test_turns_are_no_rounds():
+    with pytest.raises(AssertionError, match="is_parallelizable"):
+        suit["black_death_v3"](aec_env(HerdSim, possible_agents=FORAGERS))
+
+
 # -- many at once -----------------------------------------------------------------------------------
 
 
@@ -288,3 +294,9 @@ def test_many_single_views_for_stable_baselines3():
     assert alike(*([each.reset(), *(each.step(np.full((2, 2), 0.5)) for _ in range(9))] for each in (ours, theirs)))
     for each in (ours, theirs):
         each.close()
+
+
+def test_the_page(monkeypatch):
+    (names,) = page.steps("SuperSuit", monkeypatch)
+    assert names["observations"].shape == (4, 6)
+    assert names["rewards"].shape == (4,)

@@ -178,16 +178,16 @@ def test_around_one(name):
 # -- births and deaths ------------------------------------------------------------------------------
 
 
-def herds(env, everybody):
+def herds(env, all_there):
     """A few episodes, in which all go out every day: what they were paid, and in how many rounds."""
     told = []
     for seed in range(4):
         env.reset(seed=seed)
         paid, rounds = dict.fromkeys(FORAGERS, 0.0), 0
         while env.agents:
-            assert list(env.agents) == FORAGERS or not everybody
+            assert list(env.agents) == FORAGERS or not all_there
             observations, rewards, *_ = env.step(dict.fromkeys(env.agents, 1))
-            assert observations.keys() == set(FORAGERS) or not everybody
+            assert observations.keys() == set(FORAGERS) or not all_there
             paid = {agent: paid[agent] + rewards.get(agent, 0.0) for agent in FORAGERS}
             rounds += 1
         told.append((paid, rounds))
@@ -195,8 +195,8 @@ def herds(env, everybody):
 
 
 def test_the_dead_go_on_as_black_death_has_it():
-    plain = herds(parallel_env(HerdSim, possible_agents=FORAGERS), everybody=False)
-    black = herds(suit["black_death_v3"](parallel_env(HerdSim, possible_agents=FORAGERS)), everybody=True)
+    plain = herds(parallel_env(HerdSim, possible_agents=FORAGERS), all_there=False)
+    black = herds(suit["black_death_v3"](parallel_env(HerdSim, possible_agents=FORAGERS)), all_there=True)
     # It notices the end a step later: by an environment that has nothing more to tell.
     assert black == [(paid, rounds + 1) for paid, rounds in plain]
 

@@ -24,7 +24,7 @@ from tests.worlds.dials import DialEnv, DialSim, dial_env, dial_envs, points
 class Case(NamedTuple):
     """How a wrapper is made: its arguments, what it wants to be seen, and the packages that it needs."""
 
-    arguments: dict[str, Any] = {}  # noqa: RUF012 - nobody changes it
+    arguments: dict[str, Any] = {}  # noqa: RUF012 - it is never changed
     seen: str = "numbers"
     needs: tuple[str, ...] = ()
     render_mode: str | None = None

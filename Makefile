@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-clients test-rllib test-oldest test-clusters coverage mutants soak lint docs benchmark clean
+.PHONY: demo test test-clients test-rllib test-wrappers test-oldest test-clusters coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -24,12 +24,17 @@ soak: .venv/.test
 
 # Real learners. RLlib pins an older Gymnasium than the others want, and has an environment of its own.
 test-clients: .venv-clients/.clients
-	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest tests/clients --ignore tests/clients/test_rllib.py
+	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest tests/clients \
+	    --ignore tests/clients/test_rllib.py --ignore tests/clients/test_supersuit.py
 
 test-rllib: .venv-rllib/.rllib
 	OMP_NUM_THREADS=1 RAY_USAGE_STATS_ENABLED=0 .venv-rllib/bin/python -m pytest tests/clients/test_rllib.py tests/clients/test_experiment.py
 
-.venv-clients/.clients .venv-rllib/.rllib: pyproject.toml
+# SuperSuit, and what wrappers of Gymnasium and PettingZoo want that make films, windows and tensors.
+test-wrappers: .venv-wrappers/.wrappers
+	OMP_NUM_THREADS=1 .venv-wrappers/bin/python -m pytest tests/clients/test_supersuit.py tests/envs/test_wrappers.py
+
+.venv-clients/.clients .venv-rllib/.rllib .venv-wrappers/.wrappers: pyproject.toml
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
 	touch $@

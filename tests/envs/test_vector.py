@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import vector as wrappers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -615,33 +614,6 @@ def test_one_that_is_dropped_unwinds_all():
 
 
 # -- beside Gymnasium ---------------------------------------------------------------------------------
-
-
-def test_the_wrappers_of_gymnasium_do_what_they_do_to_its_own():
-    make = {
-        "statistics": wrappers.RecordEpisodeStatistics,
-        "normal": lambda envs: wrappers.NormalizeReward(wrappers.NormalizeObservation(envs)),
-        "list": wrappers.DictInfoToList,
-        "changed": lambda envs: wrappers.ClipReward(envs, 0.0, 0.5),
-        "flat": lambda envs: wrappers.TransformReward(wrappers.FlattenObservation(envs), np.negative),
-    }
-    for wrap in make.values():
-        ours = wrap(vector_env(Timed, {POINT: definition()}, num_envs=3))
-        theirs = wrap(SyncVectorEnv([lambda: single_env(Timed, {POINT: definition()})] * 3))
-        told = ours.reset(seed=0), theirs.reset(seed=0)
-        for _ in range(20):
-            for one, other in zip(*told, strict=True):
-                assert alike(one, other)
-            told = ours.step(np.array([1, 2, 3])), theirs.step(np.array([1, 2, 3]))
-        ours.close()
-        theirs.close()
-
-
-def alike(one: Any, other: Any) -> bool:
-    """The same, but for how long it has taken."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(alike(one[key], other[key]) for key in one if key != "t")
-    return same(one, other)
 
 
 def test_gymnasium_makes_it_of_registered_ids():

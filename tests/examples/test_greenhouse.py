@@ -383,9 +383,11 @@ def test_pettingzoo_accepts_it(make):
     assert vars(Greenhouse)["update_air_exchange"] is UNDECORATED[0]
 
 
-@pytest.mark.parametrize("name", ["Watering", "Ventilation"])
-def test_gymnasium_accepts_it(name):
-    environment = gymnasium.make(f"greenhouse_coop/{name}-v0")
+@pytest.mark.parametrize(
+    ("name", "options"), [("Watering", {}), ("Ventilation", {}), ("Joint", {}), ("Joint", {"flatten": True})]
+)
+def test_gymnasium_accepts_it(name, options):
+    environment = gymnasium.make(f"greenhouse_coop/{name}-v0", **options)
     check_env(environment.unwrapped)
     environment.close()
 

@@ -6,9 +6,10 @@ How it is trained is tested where learners are installed, in ``tests/clients``.
 import numpy as np
 import pytest
 from examples.wolf_sheep.env import DIRECTIONS, MOVE, Meadow, cells, go, look, numbers, sheep_points
+from gymnasium.utils.env_checker import check_env
 from mesa.examples.advanced.wolf_sheep.agents import GrassPatch, Sheep, Wolf
 
-from simenv_marl import RULE, aec_env, collect_episodes, simulate_many
+from simenv_marl import RULE, aec_env, collect_episodes, joint_env, simulate_many
 from tests.worlds.models import play
 
 SMALL = {"width": 8, "height": 8, "initial_sheep": 20, "initial_wolves": 5}
@@ -70,6 +71,12 @@ def test_ticks_one_by_one_are_those_that_the_model_runs_at_once():
     meadow.reset(3)
     meadow._runner.run_for(meadow.ticks)
     assert picture(meadow) == plain(3)
+
+
+@pytest.mark.filterwarnings("ignore:.*maximum value is infinity")  # of their energy
+def test_gymnasium_accepts_a_herd_as_one_agent():
+    herd = [f"sheep_{number}" for number in range(1, 21)]
+    check_env(joint_env(Pasture, possible_agents=herd, undeclared="rule"), skip_render_check=True)
 
 
 # -- what a sheep sees ----------------------------------------------------------------------------

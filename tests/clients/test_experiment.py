@@ -149,7 +149,7 @@ def test_runs_that_are_there_are_not_done_again(library, made, capsys):
 
 def test_the_same_seed_comes_to_the_same_in_whatever_process(library, made, tmp_path):
     question = QUESTIONS[library][0]
-    carry_out_elsewhere(library, tmp_path, hashes="0", questions=[question])
+    carry_out_elsewhere(library, tmp_path, hashes="2", questions=[question])
     name = f"{library}-{question}-3"
     assert found(tmp_path, name) == found(made, name)
     assert found(made, f"{library}-{question}-4")["final"] != found(made, name)["final"]

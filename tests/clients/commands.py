@@ -1,4 +1,4 @@
-"""The commands that the Makefile calls, each in a process of its own: what one has saved another one has to load."""
+"""Commands, each in a process of its own: what one of them has saved another one has to load."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def run(module: str, *arguments: object, **environment: str) -> str:
-    """Run a module of the examples from its command line.
+def python(*arguments: object, **environment: str) -> str:
+    """Let another Python run something.
 
     Args:
-        module: Its name below ``examples``.
-        *arguments: What follows on the command line.
+        *arguments: Of its command line.
         **environment: Variables of its process, beside those of this one.
 
     Returns:
         What it has printed.
     """
     done = subprocess.run(
-        [sys.executable, "-m", f"examples.{module}", *map(str, arguments)],
+        [sys.executable, *map(str, arguments)],
         cwd=ROOT,
         env={**os.environ, **environment},
         capture_output=True,
@@ -32,3 +31,8 @@ def run(module: str, *arguments: object, **environment: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def example(name: str, *arguments: object, **environment: str) -> str:
+    """Run a module of the examples as the Makefile does; otherwise like ``python``."""
+    return python("-m", f"examples.{name}", *arguments, **environment)

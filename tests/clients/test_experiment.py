@@ -51,7 +51,7 @@ def carry_out_elsewhere(library, out, *, hashes, **options):
         hashes: Determines the order.
         **options: Of the command line.
     """
-    commands.run(f"greenhouse_coop.experiment.{library}", *line(out, **options), PYTHONHASHSEED=hashes)
+    commands.example(f"greenhouse_coop.experiment.{library}", *line(out, **options), PYTHONHASHSEED=hashes)
 
 
 def policy(out, library, question):
@@ -192,7 +192,9 @@ def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library
 
 def test_it_is_told_beside_what_the_rules_do(library, made):
     policies = [policy(made, library, question) for question in QUESTIONS[library]]
-    told = commands.run("greenhouse_coop.experiment.back_in_the_model", *policies, "--greenhouses", 2, COLUMNS="160")
+    told = commands.example(
+        "greenhouse_coop.experiment.back_in_the_model", *policies, "--greenhouses", 2, COLUMNS="160"
+    )
     assert told.count("the rules") == 2
     for path in policies:
         assert told.count(path.stem) == 2

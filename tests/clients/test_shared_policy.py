@@ -124,18 +124,18 @@ def test_by_hand_one_stays_away_from_wolves():
 def test_from_training_to_the_pictures(tmp_path):
     curves, path = tmp_path / "shared-policy-training.csv", tmp_path / "shared-policy.json"
     options = "--seeds", 2, "--decisions", 1, "--ticks", 5
-    commands.run("wolf_sheep.train", *options, "--out", tmp_path, "--curves", curves)
+    commands.example("wolf_sheep.train", *options, "--out", tmp_path, "--curves", curves)
     with curves.open(newline="") as file:
         course = list(csv.DictReader(file))
     assert {(row["sight"], row["seed"]) for row in course} == {(s, n) for s in "12" for n in "01"}
-    commands.run("wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
+    commands.example("wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
     compared = json.loads(path.read_text())
     assert list(compared["results"]) == list(picture.STYLES)
     rule = compared["results"]["the model's rule"]
     assert rule["numbers"]["sheep"]["50"][0] == 100
     assert len(rule["numbers"]["wolves"]["25"]) == TICKS + 1
     assert len(compared["results"]["trained, one step of sight"]["survived"]) == 2
-    told = commands.run("wolf_sheep.picture", "--figures", tmp_path)
+    told = commands.example("wolf_sheep.picture", "--figures", tmp_path)
     assert (tmp_path / "shared-policy.png").stat().st_size > 10_000
     assert (tmp_path / "shared-policy-training.png").stat().st_size > 10_000
     assert told.count("\n") == 2 + len(picture.STYLES)

@@ -19,6 +19,8 @@ from examples.greenhouse_coop.train import VENTILATOR, WATERER, play
 
 from simenv_marl import simulate
 
+from . import commands
+
 pytestmark = pytest.mark.filterwarnings("default")  # learners warn of much that is theirs
 
 NEEDS = {"sb3": "stable_baselines3", "torchrl": "torchrl", "rllib": "ray"}
@@ -30,10 +32,26 @@ def script(library):
     return importlib.import_module(f"examples.greenhouse_coop.experiment.{library}")
 
 
-def carry_out(library, out, *, questions, seed=3, budget=1024):
-    script(library).main([
-        "--questions", *questions, "--seeds", str(seed), "--budget", str(budget), "--out", str(out)
-    ])  # fmt: skip
+def line(out, *, questions, seeds=(3,), budget=1024, workers=1):
+    """A command line."""
+    return ["--questions", *questions, "--seeds", *map(str, seeds), *f"--budget {budget} --workers {workers}".split(),
+            "--out", str(out)]  # fmt: skip
+
+
+def carry_out(library, out, **options):
+    script(library).main(line(out, **options))
+
+
+def carry_out_elsewhere(library, out, *, hashes, **options):
+    """In a process of its own, as ``make experiment`` does, where sets of strings are in another order than in others.
+
+    Args:
+        library: Whose script.
+        out: The folder of all runs.
+        hashes: Determines the order.
+        **options: Of the command line.
+    """
+    commands.example(f"greenhouse_coop.experiment.{library}", *line(out, **options), PYTHONHASHSEED=hashes)
 
 
 def policy(out, library, question):
@@ -56,7 +74,7 @@ def library(request):
 @pytest.fixture(scope="module")
 def runs(library, tmp_path_factory):
     out = tmp_path_factory.mktemp(library)
-    carry_out(library, out, questions=QUESTIONS[library])
+    carry_out_elsewhere(library, out, hashes="0", questions=QUESTIONS[library], seeds=(3, 4), workers=2)
     return out
 
 
@@ -129,14 +147,12 @@ def test_runs_that_are_there_are_not_done_again(library, made, capsys):
     assert capsys.readouterr().out.count("is there already") == len(others)
 
 
-def test_the_same_seed_comes_to_the_same(library, made, tmp_path_factory):
+def test_the_same_seed_comes_to_the_same_in_whatever_process(library, made, tmp_path):
     question = QUESTIONS[library][0]
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
-    carry_out(library, elsewhere, questions=[question])
+    carry_out_elsewhere(library, tmp_path, hashes="2", questions=[question])
     name = f"{library}-{question}-3"
-    assert found(elsewhere, name) == found(made, name)
-    carry_out(library, elsewhere, questions=[question], seed=4)
-    assert found(elsewhere, f"{library}-{question}-4")["final"] != found(made, name)["final"]
+    assert found(tmp_path, name) == found(made, name)
+    assert found(made, f"{library}-{question}-4")["final"] != found(made, name)["final"]
 
 
 def test_a_run_of_another_budget_is_not_taken_for_one_of_this(library, made):
@@ -147,14 +163,6 @@ def test_a_run_of_another_budget_is_not_taken_for_one_of_this(library, made):
 def test_whoever_needs_another_answer_says_so(tmp_path):
     with pytest.raises(SystemExit, match="question 1 of seed 3 has to be answered first"):
         carry_out("sb3", tmp_path, questions=["5c"])
-
-
-def test_runs_are_the_same_in_several_processes(tmp_path):
-    name = "sb3-1-0"
-    command = ["--questions", "1", "--budget", "1024", "--seeds", "0", "1"]
-    script("sb3").main([*command, "--workers", "2", "--out", str(tmp_path / "two")])
-    script("sb3").main([*command, "--out", str(tmp_path / "one")])
-    assert found(tmp_path / "two", name) == found(tmp_path / "one", name)
 
 
 def test_batches_of_torchrl_follow_the_greenhouses_and_explore():
@@ -182,13 +190,14 @@ def test_policies_do_in_the_models_own_loop_what_they_do_in_environments(library
     assert greenhouse.alive == played.alive[-1]
 
 
-def test_it_is_told_beside_what_the_rules_do(library, made, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "160")
-    path = policy(made, library, QUESTIONS[library][0])
-    back_in_the_model.main([str(path), "--greenhouses", "2"])
-    told = capsys.readouterr().out
+def test_it_is_told_beside_what_the_rules_do(library, made):
+    policies = [policy(made, library, question) for question in QUESTIONS[library]]
+    told = commands.example(
+        "greenhouse_coop.experiment.back_in_the_model", *policies, "--greenhouses", 2, COLUMNS="160"
+    )
     assert told.count("the rules") == 2
-    assert told.count(path.stem) == 2
+    for path in policies:
+        assert told.count(path.stem) == 2
 
 
 def test_policies_that_cannot_be_loaded_say_why(tmp_path, monkeypatch):

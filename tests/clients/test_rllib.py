@@ -23,6 +23,7 @@ from ray.tune.registry import register_env
 
 from simenv_marl import aec_env, parallel_env, simulate
 
+from . import commands
 from .hive import BEES, DEFINITION, MASK_OBSERVED, Bee, HiveSim, points
 from .page import blocks
 
@@ -139,6 +140,16 @@ def in_the_hive(policy, seeds=range(10_000, 10_040)):
     return brought / len(seeds)
 
 
+TAKE_OUT = """
+import sys
+from tests.clients.page import blocks
+names = {"checkpoint": sys.argv[1]}
+for code in blocks("_clients_rllib.md")[3:]:
+    exec(code, names)
+print(names["greenhouse"].day, names["greenhouse"].water_use)
+"""
+
+
 def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
     _, build, train, define, take_out = blocks("_clients_rllib.md")
     names = {"__name__": "__main__"}
@@ -165,6 +176,8 @@ def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
         env.step(policies[env.agent_selection](env.observe(env.agent_selection)))
     assert names["greenhouse"].day == env.simulation.greenhouse.day
     assert names["greenhouse"].water_use == env.simulation.greenhouse.water_use > 0
+    elsewhere = commands.python("-c", TAKE_OUT, names["checkpoint"]).split()
+    assert elsewhere[-2:] == [str(names["greenhouse"].day), str(names["greenhouse"].water_use)]
 
 
 @pytest.fixture

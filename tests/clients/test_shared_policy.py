@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch
 from examples.wolf_sheep import picture, results, train
-from examples.wolf_sheep.env import MOVE, Meadow, sheep_points
+from examples.wolf_sheep.env import MOVE, TICKS, Meadow, sheep_points
 
 from simenv_marl import collect_episodes
+
+from . import commands
 
 torch.set_num_threads(1)
 
@@ -119,22 +121,21 @@ def test_by_hand_one_stays_away_from_wolves():
     assert eaten["hand"] < 0.7 * eaten["random"]
 
 
-def test_from_training_to_the_pictures(tmp_path, capsys):
-    curves = tmp_path / "shared-policy-training.csv"
-    train.main(["--seeds", "2", "--decisions", "1", "--ticks", "5", "--out", str(tmp_path), "--curves", str(curves)])
+def test_from_training_to_the_pictures(tmp_path):
+    curves, path = tmp_path / "shared-policy-training.csv", tmp_path / "shared-policy.json"
+    options = "--seeds", 2, "--decisions", 1, "--ticks", 5
+    commands.example("wolf_sheep.train", *options, "--out", tmp_path, "--curves", curves)
     with curves.open(newline="") as file:
         course = list(csv.DictReader(file))
     assert {(row["sight"], row["seed"]) for row in course} == {(s, n) for s in "12" for n in "01"}
-    path = tmp_path / "shared-policy.json"
-    compared = results.compare(tmp_path, range(2), ticks=20)
-    results.write(compared, path)
-    assert json.loads(path.read_text()) == compared
+    commands.example("wolf_sheep.results", "--meadows", 2, "--out", tmp_path, "--results", path)
+    compared = json.loads(path.read_text())
     assert list(compared["results"]) == list(picture.STYLES)
     rule = compared["results"]["the model's rule"]
     assert rule["numbers"]["sheep"]["50"][0] == 100
-    assert len(rule["numbers"]["wolves"]["25"]) == 21
+    assert len(rule["numbers"]["wolves"]["25"]) == TICKS + 1
     assert len(compared["results"]["trained, one step of sight"]["survived"]) == 2
-    picture.main(["--figures", str(tmp_path)])
+    told = commands.example("wolf_sheep.picture", "--figures", tmp_path)
     assert (tmp_path / "shared-policy.png").stat().st_size > 10_000
     assert (tmp_path / "shared-policy-training.png").stat().st_size > 10_000
-    assert capsys.readouterr().out.count("\n") == 2 + len(picture.STYLES)
+    assert told.count("\n") == 2 + len(picture.STYLES)

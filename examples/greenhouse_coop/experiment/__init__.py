@@ -9,6 +9,7 @@ the model is changed for any of them, and nothing in its definitions either; onl
     sb3                 questions 1, 2, 3 and 5, by PPO of stable-baselines3
     torchrl             question 4, by IPPO and MAPPO of TorchRL
     rllib               question 4 without a common critic, by PPO of RLlib
+    rllib_module        the module that it learns with
     results             learning curves and a table out of all runs
     back_in_the_model   what has been learnt, at work in the model's own loop
 

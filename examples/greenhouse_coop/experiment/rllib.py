@@ -36,11 +36,12 @@ os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
 import ray
 from ray.rllib.algorithms.ppo import PPOConfig
-from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPPOTorchRLModule
 from ray.rllib.core.rl_module import MultiRLModuleSpec, RLModule, RLModuleSpec
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
 from ray.tune.registry import register_env
+
+from .rllib_module import LOG_STD, Module
 
 LIBRARY: Final = "rllib"
 
@@ -63,7 +64,6 @@ SETTINGS: Final[dict[str, Any]] = {
 }
 CELLS: Final = (64, 64)
 REWARD_SCALE: Final = 1 / 20
-LOG_STD: Final = -1.0
 
 BATCHES_A_POINT: Final = 5
 """After how many batches there is a point of the learning curve."""
@@ -76,15 +76,6 @@ class ScaledRewards(BaseParallelWrapper):
         """Play a round."""
         observations, rewards, *others = super().step(actions)
         return observations, {agent: reward * REWARD_SCALE for agent, reward in rewards.items()}, *others
-
-
-class Module(DefaultPPOTorchRLModule):
-    """RLlib's own module, which begins less wildly."""
-
-    def setup(self) -> None:
-        """Make the networks."""
-        super().setup()
-        torch.nn.init.constant_(self.pi.log_std, LOG_STD)
 
 
 def environment(_: Mapping[str, Any]) -> ParallelPettingZooEnv:

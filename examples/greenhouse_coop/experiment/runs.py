@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -169,13 +170,12 @@ def each(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -
     Args:
         function: Does a job; such as can be pickled.
         jobs: What is to be done.
-        workers: In how many processes; 1: in this one.
+        workers: In how many processes. None of them is this one: in theirs, all sets of strings have the same order,
+            on which it depends what RLlib comes to.
     """
-    if workers == 1 or len(jobs) < 2:
-        yield from map(function, jobs)
-        return
+    os.environ["PYTHONHASHSEED"] = "0"
     context = multiprocessing.get_context("spawn")  # forks of a process that may have threads are no good
-    with ProcessPoolExecutor(min(workers, len(jobs)), context) as executor:
+    with ProcessPoolExecutor(workers, context) as executor:
         yield from executor.map(function, jobs)
 
 

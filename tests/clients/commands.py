@@ -1,0 +1,38 @@
+"""Commands, each in a process of its own: what one of them has saved another one has to load."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def python(*arguments: object, **environment: str) -> str:
+    """Let another Python run something.
+
+    Args:
+        *arguments: Of its command line.
+        **environment: Variables of its process, beside those of this one.
+
+    Returns:
+        What it has printed.
+    """
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def example(name: str, *arguments: object, **environment: str) -> str:
+    """Run a module of the examples as the Makefile does; otherwise like ``python``."""
+    return python("-m", f"examples.{name}", *arguments, **environment)

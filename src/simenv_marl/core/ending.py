@@ -13,6 +13,7 @@ from ..errors import (
     ReentrancyError,
     annotate,
     clear_frames,
+    shown,
     warn_user,
 )
 from .agent import Agent
@@ -111,7 +112,7 @@ class Ending(Participants):
         except Warning as warning:  # where these are errors; another one must not take its place
             problems = [warning]
         for problem in problems:
-            annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
+            annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {shown(problem)}")
         clear_frames(error)
 
     def annotate(self, error: BaseException) -> None:
@@ -157,7 +158,7 @@ class Ending(Participants):
             return
         with self.at_work():
             for problem in self._unwind():
-                warn_user(f"a simulation that was abandoned raised {problem!r}", ResourceWarning)
+                warn_user(f"a simulation that was abandoned raised {shown(problem)}", ResourceWarning)
 
     def _unwind(self) -> list[BaseException]:
         """Unwind the simulation, if it is suspended. Returns what it has raised."""

@@ -38,6 +38,7 @@ from ..errors import (
     InvalidActionError,
     NoDecisionError,
     UnknownAgentError,
+    shown,
 )
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE, Sentinel
@@ -293,11 +294,11 @@ class Episode(Ending):
         if pending is None:
             raise self.refusal()
         if type(actions) is not dict and not isinstance(actions, Mapping):
-            raise InvalidActionError(f"a round takes a dict of actions by agent, not {actions!r}")
+            raise InvalidActionError(f"a round takes a dict of actions by agent, not {shown(actions)}")
         for name, action in actions.items():
             agent = agents.get(name)
             if agent is None:
-                raise UnknownAgentError(f"there is an action for {name!r}, which is no live agent: {self.names()}")
+                raise UnknownAgentError(f"there is an action for {shown(name)}, which is no live agent: {self.names()}")
             if action is not RULE:
                 action = agent.point.checked(action, name, agent.mask if agent is pending else None)
             checked[name] = action

@@ -18,6 +18,7 @@ from ..errors import (
     OptionValueError,
     SimEnvError,
     UnknownPointError,
+    shown,
     warn_user,
 )
 from ..hooks.hook import Hook
@@ -81,7 +82,8 @@ class Plan:
         self.render_modes, self.render_fps = render_modes, render_fps
         if options.render_mode is not None and options.render_mode not in render_modes:
             raise OptionValueError(
-                f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
+                f"render_mode {shown(options.render_mode)} is not one of the simulation's:"
+                f" {render_modes or 'it has none'}"
             )
         self.unanswered, self.rewarded = unanswered, rewarded
         agents = _name_agents(named)
@@ -329,7 +331,7 @@ def _call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, B
             point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
             if point is None:
                 raise OptionValueError(
-                    f"possible_agents names {key!r}, which is no active decision point whose agents are named by a"
+                    f"possible_agents names {shown(key)}, which is no active decision point whose agents are named by a"
                     f" callable; those are {[b.point.name for b in named]}"
                 )
             names[point] = value
@@ -345,7 +347,7 @@ def _call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, B
     for binding in active:
         for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
             if not isinstance(name, str) or name in roster:
-                raise AgentError(f"possible_agents must be names, and each but once, not {name!r}")
+                raise AgentError(f"possible_agents must be names, and each but once, not {shown(name)}")
             roster[name] = binding
     return roster, not named or declared is not None
 
@@ -374,7 +376,7 @@ def _assign(
                     continue
                 names = sorted([a for a in agents if a] + [p.point.name for p in named])
                 raise UnknownPointError(
-                    f"policies names {key!r}, which is neither an agent nor a decision point ({error});"
+                    f"policies names {shown(key)}, which is neither an agent nor a decision point ({error});"
                     f" known are {', '.join(names)}"
                 ) from error
             if not any(point.point is other.point for other in (*named, *extra)):

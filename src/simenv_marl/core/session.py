@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 
-from ..errors import BranchError, OptionValueError, annotate, warn_user
+from ..errors import BranchError, OptionValueError, annotate, shown, warn_user
 from ..simulation import make_simulation, resetter
 from .contexts import Claim, at_work
 from .drivers import DRIVERS, run_job
@@ -342,10 +342,10 @@ def checked_seed(seed: Any) -> int | None:
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise OptionValueError(f"seed must be a non-negative integer or None, not {seed!r}")
+        raise OptionValueError(f"seed must be a non-negative integer or None, not {shown(seed)}")
     return int(seed)
 
 
 def seed_space(space: spaces.Space[Any], seed: int, agent: str) -> None:
     """Seed a space of an agent: for every agent differently, and for every order of joining alike."""
-    space.seed(int(np.random.SeedSequence([seed, crc32(agent.encode())]).generate_state(1)[0]))
+    space.seed(int(np.random.SeedSequence([seed, crc32(agent.encode(errors="surrogatepass"))]).generate_state(1)[0]))

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..errors import MaskError, ObservationError
+from ..errors import MaskError, ObservationError, shown
 from ..simulation import Sentinel
 
 ILLEGAL: Final = Sentinel("ILLEGAL")
@@ -57,7 +57,7 @@ def observation_cast(space: spaces.Space[Any]) -> Cast:
 
     def cast(value: Any) -> Any:
         if not space.contains(value):
-            raise ObservationError(f"the observation {value!r} is not in {space}")
+            raise ObservationError(f"the observation {shown(value)} is not in {shown(space)}")
         return copy.deepcopy(value)
 
     return cast
@@ -82,20 +82,21 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise ObservationError(f"the observation {value!r} is no array for {space}: {error}") from error
+        raise ObservationError(f"the observation {shown(value)} is no array for {shown(space)}: {error}") from error
     if array.shape != space.shape:
         raise ObservationError(
-            f"the observation has shape {array.shape}, its space {space} has shape {space.shape}; it was {value!r}"
+            f"the observation has shape {array.shape}, its space {shown(space)} has shape {space.shape}; it was"
+            f" {shown(value)}"
         )
     if array.dtype.kind not in "biuf":
-        raise ObservationError(f"the observation {value!r} has dtype {array.dtype}, which is no number")
+        raise ObservationError(f"the observation {shown(value)} has dtype {array.dtype}, which is no number")
     assert space.dtype is not None
     if space.dtype.kind in "iu" and array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ObservationError(f"the observation {value!r} is not finite, which {space.dtype} cannot hold")
+        raise ObservationError(f"the observation {shown(value)} is not finite, which {space.dtype} cannot hold")
     if space.dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, space.dtype):
         limits = np.iinfo(space.dtype)
         if array.min() < limits.min or array.max() > limits.max:
-            raise ObservationError(f"the observation {value!r} has numbers that {space.dtype} cannot hold")
+            raise ObservationError(f"the observation {shown(value)} has numbers that {space.dtype} cannot hold")
     return array.astype(space.dtype, copy=True)
 
 
@@ -112,7 +113,7 @@ def _discrete_cast(space: spaces.Discrete) -> Cast:
                     return number
             except (TypeError, ValueError, OverflowError):
                 pass
-        raise ObservationError(f"the observation {value!r} is no integer for {space}")
+        raise ObservationError(f"the observation {shown(value)} is no integer for {shown(space)}")
 
     return cast
 
@@ -126,7 +127,9 @@ def _dict_cast(space: spaces.Dict) -> Cast:
                 return {key: part(value[key]) for key, part in casts.items()}
         except (TypeError, KeyError):
             pass
-        raise ObservationError(f"the observation {value!r} has not just the keys {sorted(casts)} of {space}")
+        raise ObservationError(
+            f"the observation {shown(value)} has not just the keys {shown(sorted(casts))} of {shown(space)}"
+        )
 
     return cast
 
@@ -136,7 +139,7 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
 
     def cast(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (tuple, list)) or len(value) != len(casts):
-            raise ObservationError(f"the observation {value!r} has not the {len(casts)} parts of {space}")
+            raise ObservationError(f"the observation {shown(value)} has not the {len(casts)} parts of {shown(space)}")
         return tuple(part(item) for part, item in zip(casts, value, strict=True))
 
     return cast
@@ -298,7 +301,7 @@ def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
 
         def cast(value: Any) -> Any:
             if not isinstance(value, (tuple, list)) or len(value) != len(parts):
-                raise MaskError(f"the mask {value!r} has not the {len(parts)} parts of {space}")
+                raise MaskError(f"the mask {shown(value)} has not the {len(parts)} parts of {shown(space)}")
             return tuple(part(item) for part, item in zip(parts, value, strict=True))
 
         return cast
@@ -310,12 +313,14 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
     def cast(value: Any) -> NDArray[np.int8]:
         mask = np.asarray(value)
         if mask.shape != (number,):
-            raise MaskError(f"the mask {value!r} has shape {mask.shape} and not ({number},), as {space} asks")
+            raise MaskError(
+                f"the mask {shown(value)} has shape {mask.shape} and not ({number},), as {shown(space)} asks"
+            )
         legal = mask.astype(bool)
         if not (legal == mask).all():
-            raise MaskError(f"the mask {value!r} has values other than 0 and 1")
+            raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
         if not legal.any():
-            raise MaskError(f"the mask {value!r} leaves no legal action of {space}")
+            raise MaskError(f"the mask {shown(value)} leaves no legal action of {shown(space)}")
         return legal.astype(np.int8)
 
     return cast

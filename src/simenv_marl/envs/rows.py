@@ -20,7 +20,7 @@ from ..core.events import WAIT
 from ..core.plan import Plan
 from ..core.session import Session
 from ..core.stacking import stacker
-from ..errors import InvalidActionError, OptionValueError, annotate
+from ..errors import InvalidActionError, OptionValueError, annotate, shown
 from ..hooks.stacks import EVALUATING
 from .batches import IGNORED, Batch, of_one
 from .gymnasium_base import OneAgentView
@@ -54,7 +54,7 @@ class SubEnvironments:
         if view is None:
             view = "single" if len(plan.active) == 1 and plan.active[0].agent is not None else "joint"
         if view not in ("single", "joint"):
-            raise OptionValueError(f'view must be None, "single" or "joint", not {view!r}')
+            raise OptionValueError(f'view must be None, "single" or "joint", not {shown(view)}')
         self.joint: Joint | None = None
         self._view: type[OneAgentView]
         if view == "single":
@@ -398,7 +398,7 @@ class Row:
                 if raised is None:
                     raised = error
                 else:
-                    annotate(raised, f"simenv_marl: and in sub-environment {self._offset + number}: {error!r}")
+                    annotate(raised, f"simenv_marl: and in sub-environment {self._offset + number}: {shown(error)}")
         if raised is not None:
             raise raised
 

@@ -15,7 +15,8 @@ from itertools import count
 from typing import Any, Final
 from weakref import WeakSet
 
-from .attached import CALLS, ITEMS, Attached, Call, ChangedArgs, ChangedResult, short
+from ..errors import shown
+from .attached import CALLS, ITEMS, Attached, Call, ChangedArgs, ChangedResult
 from .stacks import Taker, plugins_at_work
 
 Slot = dict[Any, "Handlers"]
@@ -126,7 +127,7 @@ class _Recording:
         return self._results
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        result = short(self._results[0]) if error is None else f"raised {short(error)}"
+        result = shown(self._results[0], 60) if error is None else f"raised {shown(error, 60)}"
         for call in self._calls:
             call.result = result
 

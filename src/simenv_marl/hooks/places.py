@@ -17,7 +17,7 @@ from types import FunctionType, MethodType, ModuleType
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
-from ..errors import PatchError
+from ..errors import PatchError, shown
 from .attached import title
 from .hook import Hook, beneath, hook_of
 from .stacks import LOCK
@@ -110,7 +110,7 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
         if isinstance(function.__self__, type) and isinstance(function.__func__, FunctionType):
             return function.__func__, classmethod
         raise PatchError(
-            f"{function!r} is bound to one object; name the function of its class,"
+            f"{shown(function)} is bound to one object; name the function of its class,"
             f" {type(function.__self__).__name__}.{function.__name__}"
         )
     elif isinstance(function, FunctionType):
@@ -123,7 +123,7 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
         if isinstance(held, staticmethod) and held.__func__ is function:
             return function, staticmethod
         return function, None
-    raise PatchError(f"{function!r} is no function written in Python")
+    raise PatchError(f"{shown(function)} is no function written in Python")
 
 
 def leads_there(name: str) -> bool:

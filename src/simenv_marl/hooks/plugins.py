@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
-from ..errors import HandlerError, SimEnvError
+from ..errors import HandlerError, SimEnvError, shown
 from .attached import Attached, Call, title
 from .handlers import Target
 from .hook import Hook
@@ -113,7 +113,7 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
         if not there:
             what = "no handler" if handler is None else f"{title(handler)} not"
             at = ", ".join(sorted({a.position for a in found.attached})) or "nowhere"
-            raise HandlerError(f"{what} attached {position!r} {found.name}; handlers are attached: {at}")
+            raise HandlerError(f"{what} attached {shown(position)} {found.name}; handlers are attached: {at}")
         for attached in there if handler is None else there[-1:]:
             found.remove(attached)
 
@@ -148,7 +148,7 @@ def checked_entry(entry: Any) -> Entry:
         HandlerError: It is not.
     """
     if not isinstance(entry, (tuple, list)) or len(entry) != 3:
-        raise HandlerError(f"handlers are given as (handler, target, position), not {entry!r}")
+        raise HandlerError(f"handlers are given as (handler, target, position), not {shown(entry)}")
     handler, target, position = entry
     return handler, target, position
 

@@ -11,7 +11,7 @@ from types import FunctionType, MethodType
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
-from ..errors import PatchError, SimEnvError, UnknownTargetError
+from ..errors import PatchError, SimEnvError, UnknownTargetError, shown
 from .attached import ITEMS, title
 from .handlers import Items, Target, next_item
 from .hook import Hook, beneath, hook_of
@@ -178,7 +178,7 @@ def expose(thing: Any) -> Any:
         hook = Hook(thing, f"{getattr(thing, '__module__', None) or '?'}.{title(thing)}")
         hook.exposed = True
         return hook.stand_in()
-    raise PatchError(f"{thing!r} cannot be exposed to plugins: it is neither a function nor an iterable")
+    raise PatchError(f"{shown(thing)} cannot be exposed to plugins: it is neither a function nor an iterable")
 
 
 def _expose_function(thing: Any) -> Any:
@@ -239,8 +239,8 @@ def find_target(target: Any) -> Target:
         return found
     if not isinstance(target, (staticmethod, classmethod, FunctionType, MethodType)):
         raise PatchError(
-            f"no handlers can be attached to {target!r}: expose it to plugins, and name what that returns; or give its"
-            " dotted name"
+            f"no handlers can be attached to {shown(target)}: expose it to plugins, and name what that returns; or give"
+            " its dotted name"
         )
     function, _ = unbind(target)
     hook = hook_of(function)

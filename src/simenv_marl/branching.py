@@ -223,6 +223,6 @@ def _result(child: _Child) -> Any:
     if not isinstance(error, Exception):  # which is not to be raised here, as an exit or an interrupt
         raise BranchError(f"branch {number} has raised {told(error)}") from error
     if type(error) is WorkerError:
-        raise BranchError(f"branch {number}: {error}") from error.__cause__
+        raise BranchError(f"branch {number}: {error}") from error.__cause__ or error.__context__
     annotate(error, f"simenv_marl: in branch {number}")
     raise error

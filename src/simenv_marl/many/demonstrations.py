@@ -58,7 +58,8 @@ def record_dataset(
         **options: As ``aec_env`` takes them.
 
     Returns:
-        The ``minari.MinariDataset``; where ``dataset_id`` is a dict, a dict of these.
+        The ``minari.MinariDataset``; where ``dataset_id`` is a dict, a dict of these. An error or an interrupt leaves
+        none of them behind.
 
     Raises:
         OptionValueError: There is such a data set already, or an argument cannot have its value.
@@ -76,11 +77,17 @@ def record_dataset(
     for key, name in names.items():
         _check_writable(name, collected[key])
     origin = provenance(simulation, points, **options)
-    written = {}
-    for key, name in names.items():
-        given = {"algorithm_name": name_of(policies[key]), **(metadata or {})}
-        written[key] = save_dataset(name, collected[key], **given)
-        written[key].storage.update_metadata({"provenance": origin})
+    written, begun = {}, list[Any]()
+    try:
+        for key, name in names.items():
+            begun += _check_free([name])
+            given = {"algorithm_name": name_of(policies[key]), **(metadata or {})}
+            written[key] = save_dataset(name, collected[key], **given)
+            written[key].storage.update_metadata({"provenance": origin})
+    except BaseException:
+        for path in begun:
+            shutil.rmtree(path, ignore_errors=True)  # all of them or none
+        raise
     return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
 
 

@@ -1,6 +1,7 @@
 """Where functions are found, set, and put back."""
 
 import gc
+import itertools
 import sys
 import types
 import weakref
@@ -12,8 +13,9 @@ from greenlet import getcurrent
 
 from simenv_marl import PatchError, UnknownTargetError, aec_env, attach_handler, handlers, remove_handler
 from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.places import hook_at, places_of, resolve
+from simenv_marl.hooks.places import Held, hook_at, places_of, plain, resolve
 from simenv_marl.hooks.targets import TARGET
+from tests.contract.test_faults import interrupt_at
 from tests.worlds.models import calling, define
 
 HERE = __name__
@@ -62,10 +64,10 @@ def taken(hook):
 def test_private_names_are_found_as_they_are_written_and_as_they_are(name):
     assert resolve(f"{HERE}.{name}", TARGET) == (Base, "_Base__hidden")
     hook = hook_of_name(f"{HERE}.{name}")
-    hook.hold()
+    hook.hold(1)
     taken(hook)
     assert Base().look() == "taken"
-    hook.let_go()
+    hook.let_go(1)
     assert Base().look() == "hidden"
 
 
@@ -101,15 +103,48 @@ def test_what_is_set_goes_with_the_last_who_has_let_go(name):
     owner, attribute = resolve(f"{HERE}.{name}", TARGET)
     before = vars(owner).get(attribute)
     hook = hook_of_name(f"{HERE}.{name}")
-    hook.hold()
-    hook.hold()
+    hook.hold(1)
+    hook.hold(2)
     assert type(vars(owner)[attribute]) is type(vars(Base)[attribute])
     taken(hook)
     assert getattr(owner(), attribute)() == "taken"
-    hook.let_go()
+    hook.let_go(2)
     assert hook_of_name(f"{HERE}.{name}") is hook
-    hook.let_go()
+    hook.let_go(1)
     assert vars(owner).get(attribute) is before
+
+
+def set_and_put_back(hooks):
+    held = Held(hooks)
+    held.let_go()
+
+
+@pytest.mark.parametrize("again", [True, False])
+@pytest.mark.parametrize("name", ["Base.method", "Base.static", "Sub.method", "Sub.of_class", "function"])
+def test_an_interrupt_while_something_is_set_or_put_back_leaves_nothing(name, again, monkeypatch):
+    other = types.ModuleType("other_module")
+    other.alias = function
+    monkeypatch.setitem(sys.modules, "other_module", other)
+    # Of all modules these will do.
+    monkeypatch.setattr("simenv_marl.hooks.places.modules", {HERE: sys.modules[HERE], "other_module": other})
+    owner, attribute = resolve(f"{HERE}.{name}", TARGET)
+    before = vars(owner).get(attribute), other.alias
+    hooks = [hook_of_name(f"{HERE}.{name}"), hook_of_name(f"{HERE}.Base.look")]
+    for number in itertools.count(1):
+        kept = Held(hooks)
+        where, raised = interrupt_at(number, kept.let_go) if again else interrupt_at(number, set_and_put_back, hooks)
+        del raised
+        gc.collect(0)
+        kept.let_go()
+        assert (vars(owner).get(attribute), other.alias) == before, where
+        assert hook_of(vars(Base)["look"]) is None, where
+        assert not kept.whole
+        kept = Held(hooks)
+        assert hook_of(plain(vars(owner)[attribute])) is hooks[0], where
+        kept.let_go()
+        if where is None:
+            break
+    assert number > 10
 
 
 def test_a_function_of_a_module_is_set_under_all_its_names():
@@ -120,10 +155,10 @@ def test_a_function_of_a_module_is_set_under_all_its_names():
         hook = hook_of_name(f"{HERE}.function")
         assert hook_at("other_module.alias", other, "alias", TARGET) is hook
         original = function
-        hook.hold()
+        hook.hold(1)
         assert hook_of(other.alias) is hook_of(function) is hook
         late = other.late = other.alias
-        hook.let_go()
+        hook.let_go(1)
         assert other.alias is other.late is function is original
         assert late() == "rule"
         assert {owner.__name__ for owner, _ in places_of(function)} == {HERE, "other_module"}
@@ -134,19 +169,19 @@ def test_a_function_of_a_module_is_set_under_all_its_names():
 def test_what_something_else_has_set_is_left_alone_and_usable_afterwards():
     before = vars(Base)["method"]
     hook = hook_of_name(f"{HERE}.Base.method")
-    hook.hold()
+    hook.hold(1)
     with mock.patch.object(Base, "method", return_value="mocked"):
-        hook.let_go()
+        hook.let_go(1)
         assert Base().method() == "mocked"
         assert hook.stale
         with pytest.raises(PatchError, match="has been replaced"):
-            hook.hold()
+            hook.hold(1)
     assert Base().method() == "rule"  # what the mock has put back
     hook = hook_of_name(f"{HERE}.Base.method")
-    hook.hold()
+    hook.hold(1)
     taken(hook)
     assert Base().method() == "taken"
-    hook.let_go()
+    hook.let_go(1)
     hook.leave(getcurrent())
     assert vars(Base)["method"] is before
 

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 
 from ..errors import BranchError, OptionValueError, annotate, shown, warn_user
+from ..hooks.places import Held
 from ..simulation import make_simulation, resetter
 from .contexts import Claim, at_work
 from .drivers import DRIVERS, run_job
@@ -58,7 +59,7 @@ class Session:
         self._np_random: np.random.Generator | None = None
         self._closed = False
         self._starting = False
-        self._held: list[Any] = []  # what is set, and is to be put back
+        self._held: Held | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.claim = Claim() if plan.options.driver == "thread" else None
         self._driver: BaseDriver | None = None
@@ -265,8 +266,8 @@ class Session:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to end."""
-        return self.episode is None
+        """Whether there is nothing to end, and nothing to put back."""
+        return self.episode is None and self._held is None
 
     def render(self) -> Any:
         """Render the simulation in the environment's render mode; None, with a warning, where it has none."""
@@ -302,22 +303,14 @@ class Session:
             self._let_go_of_patches()
 
     def _hold_patches(self) -> None:
-        if self._held:
-            return
-        try:
-            for patch in self.plan.patches:
-                patch.hold()
-                self._held.append(patch)
-        except BaseException:
+        if self._held is None or not self._held.whole:
             self._let_go_of_patches()
-            raise
+            self._held = Held(self.plan.patches)
 
     def _let_go_of_patches(self) -> None:
-        while self._held:
-            try:
-                self._held[-1].let_go()
-            finally:
-                self._held.pop()
+        if self._held is not None:
+            self._held.let_go()
+            self._held = None
 
 
 def _stand_alike(one: Episode, other: Episode) -> bool:

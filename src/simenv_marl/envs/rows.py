@@ -409,8 +409,8 @@ class Row:
 
     @property
     def suspended(self) -> bool:
-        """Whether a simulation still waits for an action."""
-        return any(map(self._waits, self.sessions))
+        """Whether a simulation still waits for an action, or something is still to be put back."""
+        return not all(session.idle for session in self.sessions)
 
     @staticmethod
     def _waits(session: Session) -> bool:

@@ -360,7 +360,7 @@ class Workers:
 
     @property
     def suspended(self) -> bool:
-        """Whether a simulation still waits for an action here: none does."""
+        """Whether something is still to be ended here: nothing is."""
         return False
 
     def abandon(self) -> None:

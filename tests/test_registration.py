@@ -16,7 +16,15 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test
 
-from simenv_marl import RULE, SimEnvError, UnknownOptionError, UnknownPointError, register_simulation
+from simenv_marl import (
+    RULE,
+    OptionValueError,
+    SimEnvError,
+    UnknownOptionError,
+    UnknownPointError,
+    Variant,
+    register_simulation,
+)
 from tests.worlds import many_registered
 from tests.worlds.many_registered import Boat, Voyage
 from tests.worlds.many_worlds import Being, beings
@@ -332,13 +340,45 @@ def test_an_entitys_policy_stands_in_the_single_view_of_another_point(register):
         ({"speed": 3}, UnknownOptionError),
         ({"max_steps": 0}, SimEnvError),
         ({"simulation": 3}, SimEnvError),
+        *(
+            ({"name": name}, OptionValueError)
+            for name in ("a:b", "a/b", "a.b", "a b", "", "a\n", 3, "\ud800", ["a"], None)
+        ),
+        *(({"version": version}, OptionValueError) for version in (-1, "2", 1.0, True, None)),
+        ({"simulation": Variant("hot summer", Voyage), "name": None}, OptionValueError),
     ],
 )
 def test_what_cannot_be_registered(register, changes, error):
-    before = set(gymnasium.registry)
+    registries = gymnasium.registry, pettingzoo.aec_registry, pettingzoo.parallel_registry
+    before = [dict(registry) for registry in registries]
     with pytest.raises(error):
         register(**{"simulation": Voyage, "points": None, "name": "broken"} | changes)
-    assert set(gymnasium.registry) == before
+    assert [dict(registry) for registry in registries] == before
+
+
+def test_points_inside_functions_have_ids_too(register):
+    class Boat:
+        @define(agent="boat_0")
+        def choose(self):
+            return 0
+
+    def another():
+        class Boat:
+            @define(agent="boat_1")
+            def choose(self):
+                return 0
+
+        return Boat
+
+    @define(agent="boat_2")
+    def choose():
+        return 0
+
+    points = [Boat.choose, another().choose, choose, define(agent="boat_3")(lambda: 0)]
+    ids = register(calling(choose), points, name="inside")
+    assert len(set(ids)) == 6
+    for identity in ids[:-1]:
+        gymnasium.make(identity).close()
 
 
 # -- conformance ----------------------------------------------------------------------------------

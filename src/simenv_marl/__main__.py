@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any
 
-from .errors import SimEnvError
+from .errors import SimEnvError, told
 
 
 class _UsageError(Exception):
@@ -122,7 +122,7 @@ def _inspected(simulation: Any, options: argparse.Namespace) -> Any:
     except SimEnvError:
         raise
     except Exception as error:
-        raise _UsageError(f"{options.simulation} cannot be run: {type(error).__name__}: {error}") from error
+        raise _UsageError(f"{options.simulation} cannot be run: {told(error)}") from error
 
 
 def _found(text: str) -> Any:
@@ -162,7 +162,7 @@ def _module(name: str) -> Any:
             f"there is no module {error.name!r}{hint} (looked for in {os.getcwd()} and on Python's path)"
         ) from None
     except Exception as error:
-        raise _UsageError(f"the module {name!r} cannot be imported: {type(error).__name__}: {error}") from error
+        raise _UsageError(f"the module {name!r} cannot be imported: {told(error)}") from error
 
 
 def _alternatives(name: str, owner: Any) -> str:

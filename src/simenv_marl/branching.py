@@ -17,7 +17,7 @@ from typing import Any, Final, NoReturn, TypeVar
 from .core.forking import Standing
 from .core.processes import pack, pack_error, unpack, unpack_error
 from .envs import View
-from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate
+from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, shown, told
 
 Result = TypeVar("Result")
 
@@ -63,11 +63,11 @@ def branch(
     """
     view = getattr(env, "unwrapped", env)
     if not isinstance(view, View):
-        raise ViewError(f"branch continues environments of one simulation, and {env!r} is none")
+        raise ViewError(f"branch continues environments of one simulation, and {shown(env)} is none")
     if isinstance(n, bool) or not isinstance(n, int) or n < 0:
-        raise OptionValueError(f"n must be a number of continuations, not {n!r}")
+        raise OptionValueError(f"n must be a number of continuations, not {shown(n)}")
     if method not in (None, *METHODS):
-        raise OptionValueError(f"method must be None or one of {', '.join(map(repr, METHODS))}, not {method!r}")
+        raise OptionValueError(f"method must be None or one of {', '.join(map(repr, METHODS))}, not {shown(method)}")
     forks = hasattr(os, "fork") and view.driver == "greenlet"
     if method == "fork" and not forks:
         raise OptionValueError(
@@ -203,7 +203,7 @@ def _answer(value: Any) -> bytes:
         parcel = pack(value)
         unpack(parcel)  # what can be pickled cannot always be made again
     except Exception as error:
-        raise BranchError(f"it has returned what cannot be pickled ({type(error).__name__}: {error})") from error
+        raise BranchError(f"it has returned what cannot be pickled ({told(error)})") from error
     return parcel
 
 
@@ -221,8 +221,8 @@ def _result(child: _Child) -> Any:
         return unpack(parcel)
     error = unpack_error(parcel)
     if not isinstance(error, Exception):  # which is not to be raised here, as an exit or an interrupt
-        raise BranchError(f"branch {number} has raised {type(error).__name__}: {error}") from error
+        raise BranchError(f"branch {number} has raised {told(error)}") from error
     if type(error) is WorkerError:
-        raise BranchError(f"branch {number}: {error}") from error.__cause__
+        raise BranchError(f"branch {number}: {error}") from error.__cause__ or error.__context__
     annotate(error, f"simenv_marl: in branch {number}")
     raise error

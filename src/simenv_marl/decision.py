@@ -20,7 +20,7 @@ import numpy as np
 from greenlet import getcurrent
 from gymnasium import spaces
 
-from .errors import DefinitionError, PatchError
+from .errors import DefinitionError, PatchError, shown
 from .hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
 from .hooks.places import stays, unbind
 from .hooks.stacks import DIFFERENCES, EVALUATING
@@ -90,7 +90,7 @@ class Definition:
             name = f"{given.__module__}.{given.__qualname__}"
             hook = Hook(given, name, bound=binding is not staticmethod)
         elif not isinstance(hook.function, FunctionType):
-            raise PatchError(f"{hook.function!r} cannot be a decision point: it is no function written in Python")
+            raise PatchError(f"{shown(hook.function)} cannot be a decision point: it is no function written in Python")
         elif not hook.for_good:  # fetched while it was set for a while
             stays(hook)
         point = point_for(hook)
@@ -176,18 +176,18 @@ def _check_kinds(definition: Definition) -> None:
     for name in ("observation_space", "action_space", "goal_space"):
         space = getattr(definition, name)
         if not isinstance(space, spaces.Space) and (name != "goal_space" or space is not None):
-            raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {space!r}")
+            raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {shown(space)}")
     for name in (*REQUIRED, *ANSWERS[1:], "action_mask_mapping", *GOALS[1:]):
         function = getattr(definition, name)
         if not callable(function) and (name in REQUIRED or function is not None):
-            raise DefinitionError(f"make_step: {name} must be callable, not {function!r}")
+            raise DefinitionError(f"make_step: {name} must be callable, not {shown(function)}")
     for name in ("action_space_mapping", "rule_action_mapping"):
         mapping = getattr(definition, name)
         if mapping is not None and not callable(mapping) and not isinstance(mapping, Mapping):
-            raise DefinitionError(f"make_step: {name} must be a callable or a dict, not {mapping!r}")
+            raise DefinitionError(f"make_step: {name} must be a callable or a dict, not {shown(mapping)}")
     agent = definition.agent
     if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
-        raise DefinitionError(f"make_step: agent must be a name or a callable, not {agent!r}")
+        raise DefinitionError(f"make_step: agent must be a name or a callable, not {shown(agent)}")
 
 
 def _check_together(definition: Definition) -> None:
@@ -220,7 +220,7 @@ def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
     for name, agent in named.items():
         if not isinstance(name, str) or not (agent is None or callable(agent)):
             raise DefinitionError(
-                f"make_step: removed_by goes from dotted names to callables that name an agent, not {name!r}: {agent!r}"
+                f"make_step: removed_by goes from dotted names to callables, not {shown(name)}: {shown(agent)}"
             )
     return dict(named)
 
@@ -381,7 +381,7 @@ class Difference:
 
     def __init__(self, function: Mapped) -> None:
         if not DIFFERENCES:  # one will do
-            DIFFERENCES.append(getattr(function, "__qualname__", repr(function)))
+            DIFFERENCES.append(getattr(function, "__qualname__", None) or shown(function))
         self._function = function
         update_wrapper(self, function)
 
@@ -417,5 +417,5 @@ def difference(function: Mapped) -> Difference:
         DefinitionError: ``function`` is not callable.
     """
     if not callable(function):
-        raise DefinitionError(f"difference: {function!r} is not callable")
+        raise DefinitionError(f"difference: {shown(function)} is not callable")
     return Difference(function)

@@ -34,10 +34,12 @@
 Every error is raised with its message alone, so that it survives pickling.
 """
 
+import reprlib
 import sys
 import warnings
 from contextlib import suppress
 from pathlib import Path
+from typing import Any, Final
 
 __all__ = [
     "AgentError",
@@ -72,6 +74,43 @@ __all__ = [
 
 _PACKAGE = str(Path(__file__).parent)
 
+LONGEST: Final = 200
+"""How many characters of a value stand in a message."""
+
+_repr = reprlib.Repr()
+_repr.maxlist = _repr.maxtuple = _repr.maxset = _repr.maxfrozenset = _repr.maxdict = _repr.maxdeque = 20
+_repr.maxstring = _repr.maxother = _repr.maxlong = LONGEST
+
+
+def shown(value: Any, longest: int = LONGEST) -> str:
+    """What a value of a user's looks like in a message: in short, and also where its ``repr`` fails."""
+    try:
+        text = _repr.repr(value)
+    except Exception:  # as of an integer of many thousand digits
+        text = object.__repr__(value)
+    return text if len(text) <= longest else f"{text[: longest - 23]}...{text[-20:]}"
+
+
+def text_of(error: BaseException) -> str:
+    """The text of an error, also where its ``str`` fails."""
+    try:
+        return str(error)
+    except Exception:
+        return "its text cannot be told"
+
+
+def told(error: BaseException) -> str:
+    """The class and the text of an error."""
+    return f"{type(error).__name__}: {text_of(error)}"
+
+
+def notes_of(error: BaseException) -> list[str]:
+    """The notes of an error, also where it has something else in their place."""
+    notes = None
+    with suppress(Exception):
+        notes = error.__notes__
+    return [note for note in notes if isinstance(note, str)] if isinstance(notes, (list, tuple)) else []
+
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
     """Warn, and point at the line outside this package that has led here."""
@@ -86,9 +125,10 @@ def annotate(error: BaseException, note: str) -> None:
     try:
         error.add_note(note)
     except Exception:
-        notes = vars(error).setdefault("__notes__", [])
-        if isinstance(notes, list):
-            notes.append(note)
+        with suppress(Exception):  # an error without its note is better than another one
+            notes = vars(error).setdefault("__notes__", [])
+            if isinstance(notes, list):
+                notes.append(note)
 
 
 def clear_frames(error: BaseException) -> None:

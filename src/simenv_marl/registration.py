@@ -14,7 +14,7 @@ import pettingzoo
 from .core.plan import Plan
 from .core.variant import Variant
 from .envs import aec_env, joint_env, parallel_env, single_env, vector_env
-from .errors import OptionValueError, UnknownPointError
+from .errors import OptionValueError, UnknownPointError, shown
 from .simulation import RULE
 
 
@@ -44,7 +44,8 @@ def register_simulation(
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The decision points, as ``generate_env`` takes them.
-        name: The namespace of the ids; None: the name of the variant, if the simulation is one.
+        name: The namespace of the ids, of letters, digits, ``_`` and ``-``; None: the name of the variant, if the
+            simulation is one.
         version: Their version.
         **options: As ``aec_env`` takes them.
 
@@ -58,6 +59,10 @@ def register_simulation(
         if not isinstance(simulation, Variant):
             raise OptionValueError("register_simulation needs a name= for the ids")
         name = simulation.name
+    if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
+        raise OptionValueError(f"name must be of letters, digits, _ and -, as ids take it, not {shown(name)}")
+    if isinstance(version, bool) or not isinstance(version, int) or version < 0:
+        raise OptionValueError(f"version must be a non-negative integer, not {shown(version)}")
     flatten = options.pop("flatten", False)
     if isinstance(simulation, Variant) and "flatten" in simulation.options:  # an option of the joint view alone
         others = dict(simulation.options)
@@ -84,8 +89,8 @@ def register_simulation(
 
 def _titles(points: list[str]) -> list[str]:
     """What decision points are called in ids: the function's name, with its class where that alone is taken."""
-    whole = [re.sub(r"[^\w.]", "", point) for point in points]
-    styles = [[_camel(point, 1) for point in points], [_camel(point, 2) for point in points], whole]
+    whole = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
+    styles = [[_camel(point, 1) for point in whole], [_camel(point, 2) for point in whole], whole]
     return [
         next(style[number] for style in styles if [*style, "Joint"].count(style[number]) == 1)
         for number in range(len(points))

@@ -10,7 +10,7 @@ from types import FunctionType, MethodType
 from typing import Any, Final, final
 from weakref import WeakKeyDictionary
 
-from .errors import SimulationError
+from .errors import SimulationError, shown, told
 
 
 @final
@@ -98,18 +98,18 @@ def make_simulation(source: Any) -> Any:
             simulation = copy.deepcopy(source)
         except Exception as error:
             raise SimulationError(
-                f"the simulation {source!r} cannot be copied ({type(error).__name__}: {error}); give its class"
+                f"the simulation {shown(source)} cannot be copied ({told(error)}); give its class"
                 " or a zero-argument factory instead of an instance"
             ) from error
     elif callable(source):
         simulation = source()
     else:
         raise SimulationError(
-            f"{source!r} is no simulation: give an object with run() and reset(), its class, or a factory"
+            f"{shown(source)} is no simulation: give an object with run() and reset(), its class, or a factory"
         )
     for name in ("run", "reset"):
         if not callable(getattr(simulation, name, None)):
-            raise SimulationError(f"{simulation!r} has no method {name}(), which every simulation needs")
+            raise SimulationError(f"{shown(simulation)} has no method {name}(), which every simulation needs")
     return simulation
 
 

@@ -1,5 +1,7 @@
 """Minari data sets of what was decided, read again by Minari and by a learner."""
 
+import json
+import os
 import sys
 from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, SKIP, DocTestParser, DocTestRunner
 from pathlib import Path
@@ -19,6 +21,7 @@ from simenv_marl import (
     record_dataset,
     save_dataset,
 )
+from simenv_marl.many import demonstrations
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script
 
@@ -215,6 +218,54 @@ def test_half_a_data_set_is_none():
     with pytest.raises(TypeError):
         record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1], metadata={"no such argument": 1})
     record_dataset(NAME, calling(ant), {ant: ones}, points=ant, seeds=[1])
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_an_interrupt_at_any_time_leaves_no_name_taken():
+    """Neither by half a data set, nor by the first of two."""
+    ant, bee = decision(agent="ant_0"), decision(agent="bee_0")
+    names = {ant: "simenv/ants-v0", bee: "simenv/bees-v0"}
+
+    def record():
+        return record_dataset(names, calling(ant, bee), {ant: ones, bee: ones}, points=[ant, bee], seeds=[1])
+
+    class Interrupt(BaseException):
+        pass
+
+    def until(number):
+        """Whether that many calls were reached, in what writes; the last of them is interrupted."""
+        left = number
+
+        def look(frame, event, arg):
+            nonlocal left
+            if event not in ("call", "c_return") or not frame.f_code.co_filename.startswith(WRITERS):
+                return
+            left -= 1
+            if left == 0:
+                sys.setprofile(None)
+                raise Interrupt
+
+        sys.setprofile(look)
+        try:
+            record()
+        except Interrupt:
+            return True
+        finally:
+            sys.setprofile(None)
+        return False
+
+    number = 1
+    while until(number):
+        assert not minari.list_local_datasets()
+        root = Path(os.environ["MINARI_DATASETS_PATH"])
+        assert not list(root.rglob("*-v0"))
+        number += 17
+    assert number > 200
+    for name in names.values():
+        assert minari.load_dataset(name).storage.metadata["provenance"]
+
+
+WRITERS = (os.path.dirname(minari.__file__), demonstrations.__file__, os.path.dirname(json.__file__))
 
 
 def told(**changes):

@@ -14,7 +14,19 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import RULE, ResetNeededError, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import (
+    RULE,
+    ResetNeededError,
+    aec_env,
+    handlers,
+    joint_env,
+    parallel_env,
+    simulate,
+    simulate_many,
+    single_env,
+    trace,
+    vector_env,
+)
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play
 
@@ -326,8 +338,8 @@ def interrupt_at(number, function, *args):
         nonlocal left, where
         if event not in ("call", "c_return") or not frame.f_code.co_filename.startswith(_PACKAGE):
             return
-        if frame.f_code.co_name in ("__exit__", "let_go"):
-            return  # where a ``with`` or ``finally`` ends: there nobody can help it
+        if frame.f_code.co_name in ("__exit__", "__del__"):
+            return  # where a ``with`` ends: there nobody can help it; and where Python itself swallows it
         left -= 1
         if left == 0:
             sys.setprofile(None)
@@ -390,6 +402,83 @@ def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view, mo
             env.close()
         assert in_a_thread(env.close) is None, where  # nothing of it is left to this one
     assert number > 100
+
+
+def close_again(env):
+    env.close()
+
+
+def drop(env):
+    pass  # the last one who knows it
+
+
+def begin_again(env):
+    assert cycle_of(env) == cycle_of(farm_env(aec_env, "before"))
+
+
+def cycle_of(env):
+    """What an environment that is used and closed tells."""
+    told = run(env, aec_env)
+    env.close()
+    return told
+
+
+@pytest.mark.parametrize("then", [close_again, drop, begin_again])
+def test_an_interrupt_anywhere_in_a_close_leaves_nothing_patched_in_the_end(then):
+    fresh = cycle_of(farm_env(aec_env, "before"))
+    reached = set()
+    for number in count(1):
+        env = farm_env(aec_env, "before")
+        env.reset(seed=11)
+        env.step(RULE)
+        where, raised = interrupt_at(number, env.close)
+        assert type(raised) is (type(None) if where is None else KeyboardInterrupt), where
+        if where is None:
+            break
+        reached.add(where)
+        del raised
+        then(env)
+        del env
+        gc.collect(0)
+        nothing_is_left()
+        if number % 10 == 0:
+            assert cycle_of(farm_env(aec_env, "before")) == fresh, where
+    assert {word for where in reached for word in ("let_go", "put_back", "remove") if word in where} == {
+        "let_go", "put_back", "remove",
+    }  # fmt: skip
+
+
+@pytest.mark.greenlet("the release is the same with every driver")
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: vector_env(Farm, {f"{PLACE}.plan": POINTS[f"{PLACE}.plan"]}, num_envs=2).close(),
+        lambda: simulate(Farm, points=POINTS),
+        lambda: simulate_many(Farm, {"planner": lambda o: [0] * len(o)}, points=POINTS, seeds=[1, 2]),
+        lambda: handled(),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # in a finalizer
+def test_an_interrupt_anywhere_in_what_opens_and_closes_leaves_nothing_patched(use):
+    use()
+    where, number = "", 0
+    while where is not None:
+        number += 7
+        where, raised = interrupt_at(number, use)
+        assert raised is None or type(raised) is KeyboardInterrupt, where
+        del raised
+        gc.collect()
+        nothing_is_left()
+    assert number > 100
+
+
+def handled():
+    farm = Farm()
+    farm.reset(1)
+    with handlers((handler("before"), f"{PLACE}.plan", "before"), (handler("after"), f"{PLACE}.pick", "after")):
+        assert farm.plan() in range(10)
+    with trace(f"{PLACE}.work"):
+        assert farm.work() in range(3)
 
 
 # -- the end of the stack -------------------------------------------------------------------------

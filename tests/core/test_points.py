@@ -49,12 +49,12 @@ def test_an_undecorated_function_is_one_point_however_it_is_named():
 
 def test_it_is_found_while_it_is_set_and_while_it_has_handlers():
     point, _ = locate(Base.plain)
-    point.hook.hold()
+    point.hook.hold(1)
     try:
         assert locate(Base.plain)[0] is locate(f"{HERE}.Base.plain")[0] is point
         assert unwrapped(Base.plain) is point.rule
     finally:
-        point.hook.let_go()
+        point.hook.let_go(1)
     with handlers((lambda self: None, f"{HERE}.Base.plain", "before")):
         assert locate(Base.plain)[0] is point
     fetched = Base.plain
@@ -65,13 +65,13 @@ def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_
     inherited = find_point(f"{HERE}.Sub.decorated")
     assert inherited.point is not point_of(Base.decorated)[0]
     assert inherited.definition is point_of(Base.decorated)[1]
-    inherited.point.hook.hold()
+    inherited.point.hook.hold(1)
     try:
         again = find_point(f"{HERE}.Sub.decorated")
         assert (again.point, again.definition) == (inherited.point, inherited.definition)
         assert Sub().decorated() == "decorated"
     finally:
-        inherited.point.hook.let_go()
+        inherited.point.hook.let_go(1)
     assert "decorated" not in vars(Sub)
 
 

@@ -542,17 +542,48 @@ def test_modes_are_kept_by_the_workers():
     envs.close()
 
 
-def test_a_worker_that_cannot_be_started_leaves_no_descriptors(monkeypatch):
-    def refuse(process):
-        raise OSError("no more processes")
+class Ending(Breaking):
+    """A factory that ends all other processes."""
 
+    def __call__(self) -> Any:
+        return Counter() if os.getpid() == self.process else os._exit(3)
+
+
+@pytest.mark.parametrize(
+    ("what", "error"),
+    [
+        (("Process.start", 1), OSError),
+        (("Process.start", 2), OSError),
+        (("Pipe", 1), OSError),
+        (("Pipe", 2), OSError),
+        (Breaking, ZeroDivisionError),
+        (Ending, WorkerError),
+    ],
+)
+def test_a_worker_that_cannot_be_started_leaves_no_descriptors(what, error, monkeypatch):
+    context = multiprocessing.get_context(FORK)
+    workers().close()  # multiprocessing keeps its shared memory for the next time
     gc.collect()
-    before = len(os.listdir("/proc/self/fd"))
-    monkeypatch.setattr(multiprocessing.get_context(FORK).Process, "start", refuse)
-    with pytest.raises(OSError, match="no more processes") as caught:
-        workers()
-    assert len(os.listdir("/proc/self/fd")) == before
-    del caught
+    before = sorted(os.listdir("/proc/self/fd"))
+    model: Any = Counter
+    if isinstance(what, tuple):
+        path, number = what
+        owner = context.Process if path == "Process.start" else context
+        name, calls = path.rpartition(".")[2], iter(range(1, 10))
+        real = getattr(owner, name)
+
+        def refuse(*args):
+            if next(calls) == number:
+                raise OSError("no more")
+            return real(*args)
+
+        monkeypatch.setattr(owner, name, refuse)
+    else:
+        model = what(os.getpid())
+    with pytest.raises(error):
+        workers(model, context=context)
+    gc.collect()
+    assert sorted(os.listdir("/proc/self/fd")) == before
 
 
 def test_a_script_without_its_guard_is_told_what_it_lacks(tmp_path):

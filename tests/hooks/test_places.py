@@ -1,7 +1,11 @@
 """Where functions are found, set, and put back."""
 
 import gc
+import itertools
+import random
 import sys
+import threading
+import time
 import types
 import weakref
 from textwrap import dedent
@@ -12,8 +16,9 @@ from greenlet import getcurrent
 
 from simenv_marl import PatchError, UnknownTargetError, aec_env, attach_handler, handlers, remove_handler
 from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.places import hook_at, places_of, resolve
+from simenv_marl.hooks.places import Held, Place, hook_at, places_of, plain, resolve
 from simenv_marl.hooks.targets import TARGET
+from tests.contract.test_faults import interrupt_at
 from tests.worlds.models import calling, define
 
 HERE = __name__
@@ -62,10 +67,10 @@ def taken(hook):
 def test_private_names_are_found_as_they_are_written_and_as_they_are(name):
     assert resolve(f"{HERE}.{name}", TARGET) == (Base, "_Base__hidden")
     hook = hook_of_name(f"{HERE}.{name}")
-    hook.hold()
+    hook.hold(1)
     taken(hook)
     assert Base().look() == "taken"
-    hook.let_go()
+    hook.let_go(1)
     assert Base().look() == "hidden"
 
 
@@ -101,15 +106,48 @@ def test_what_is_set_goes_with_the_last_who_has_let_go(name):
     owner, attribute = resolve(f"{HERE}.{name}", TARGET)
     before = vars(owner).get(attribute)
     hook = hook_of_name(f"{HERE}.{name}")
-    hook.hold()
-    hook.hold()
+    hook.hold(1)
+    hook.hold(2)
     assert type(vars(owner)[attribute]) is type(vars(Base)[attribute])
     taken(hook)
     assert getattr(owner(), attribute)() == "taken"
-    hook.let_go()
+    hook.let_go(2)
     assert hook_of_name(f"{HERE}.{name}") is hook
-    hook.let_go()
+    hook.let_go(1)
     assert vars(owner).get(attribute) is before
+
+
+def set_and_put_back(hooks):
+    held = Held(hooks)
+    held.let_go()
+
+
+@pytest.mark.parametrize("again", [True, False])
+@pytest.mark.parametrize("name", ["Base.method", "Base.static", "Sub.method", "Sub.of_class", "function"])
+def test_an_interrupt_while_something_is_set_or_put_back_leaves_nothing(name, again, monkeypatch):
+    other = types.ModuleType("other_module")
+    other.alias = function
+    monkeypatch.setitem(sys.modules, "other_module", other)
+    # Of all modules these will do.
+    monkeypatch.setattr("simenv_marl.hooks.places.modules", {HERE: sys.modules[HERE], "other_module": other})
+    owner, attribute = resolve(f"{HERE}.{name}", TARGET)
+    before = vars(owner).get(attribute), other.alias
+    hooks = [hook_of_name(f"{HERE}.{name}"), hook_of_name(f"{HERE}.Base.look")]
+    for number in itertools.count(1):
+        kept = Held(hooks)
+        where, raised = interrupt_at(number, kept.let_go) if again else interrupt_at(number, set_and_put_back, hooks)
+        del raised
+        gc.collect(0)
+        kept.let_go()
+        assert (vars(owner).get(attribute), other.alias) == before, where
+        assert hook_of(vars(Base)["look"]) is None, where
+        assert not kept.whole
+        kept = Held(hooks)
+        assert hook_of(plain(vars(owner)[attribute])) is hooks[0], where
+        kept.let_go()
+        if where is None:
+            break
+    assert number > 10
 
 
 def test_a_function_of_a_module_is_set_under_all_its_names():
@@ -120,10 +158,10 @@ def test_a_function_of_a_module_is_set_under_all_its_names():
         hook = hook_of_name(f"{HERE}.function")
         assert hook_at("other_module.alias", other, "alias", TARGET) is hook
         original = function
-        hook.hold()
+        hook.hold(1)
         assert hook_of(other.alias) is hook_of(function) is hook
         late = other.late = other.alias
-        hook.let_go()
+        hook.let_go(1)
         assert other.alias is other.late is function is original
         assert late() == "rule"
         assert {owner.__name__ for owner, _ in places_of(function)} == {HERE, "other_module"}
@@ -134,19 +172,19 @@ def test_a_function_of_a_module_is_set_under_all_its_names():
 def test_what_something_else_has_set_is_left_alone_and_usable_afterwards():
     before = vars(Base)["method"]
     hook = hook_of_name(f"{HERE}.Base.method")
-    hook.hold()
+    hook.hold(1)
     with mock.patch.object(Base, "method", return_value="mocked"):
-        hook.let_go()
+        hook.let_go(1)
         assert Base().method() == "mocked"
         assert hook.stale
         with pytest.raises(PatchError, match="has been replaced"):
-            hook.hold()
+            hook.hold(1)
     assert Base().method() == "rule"  # what the mock has put back
     hook = hook_of_name(f"{HERE}.Base.method")
-    hook.hold()
+    hook.hold(1)
     taken(hook)
     assert Base().method() == "taken"
-    hook.let_go()
+    hook.let_go(1)
     hook.leave(getcurrent())
     assert vars(Base)["method"] is before
 
@@ -242,33 +280,128 @@ def test_a_function_that_is_decorated_while_an_environment_uses_it_stays_decorat
     env.close()
 
 
-def test_setting_and_putting_back_in_many_threads_at_once():
-    import threading
+@pytest.fixture
+def _dawdling(monkeypatch):
+    """Others may have their turn between any two looks and changes at a place."""
+    drawn = random.Random(1)
 
-    class Model:
-        def decide(self):
-            return "rule"
+    def dawdle(function):
+        def slow(*args):
+            time.sleep(drawn.choice([0, 1e-3]))
+            value = function(*args)
+            time.sleep(drawn.choice([0, 1e-3]))
+            return value
 
-    before, errors = vars(Model)["decide"], []
+        return slow
+
+    for name in ("__init__", "is_free", "put", "put_back"):
+        monkeypatch.setattr(Place, name, dawdle(getattr(Place, name)))
+
+
+SOURCE = """
+class Base:
+    def method(self): return "rule"
+    def look(self): return "rule"
+
+class Sub(Base): pass
+
+def function(): return "rule"
+"""
+
+
+@pytest.mark.usefixtures("_dawdling")
+@pytest.mark.parametrize("how", ["environment", "handlers"])
+@pytest.mark.parametrize("path", ["Base.method", "Sub.method", "function"])
+def test_threads_come_and_go_at_once(path, how, monkeypatch):
+    """In each round eight of them come to a module that is new, and go."""
+    module, errors = types.ModuleType("new_model"), []
+    monkeypatch.setitem(sys.modules, "new_model", module)
+    monkeypatch.setattr("simenv_marl.hooks.places.modules", {"new_model": module})  # looking at all takes its time
+    *_, attribute = path.split(".")
+
+    def owner():
+        return getattr(module, path.split(".")[0]) if "." in path else module
+
+    def call():
+        return getattr(owner()() if "." in path else owner(), attribute)()
+
+    def renew():
+        exec(SOURCE, vars(module))
+        before.append(vars(owner()).get(attribute))
+
+    def environment():
+        plugins = [(lambda *_: None, "new_model.Base.look", "before")]
+        env = aec_env(calling(call), {f"new_model.{path}": define()}, plugins=plugins)
+        env.reset()
+        env.step(1)
+        assert env.unwrapped.simulation.log == [1]
+        return env.close
+
+    def handled():
+        called = []
+        block = handlers((lambda *_: called.append(1), f"new_model.{path}", "before"))
+        block.__enter__()
+        assert call() == "rule"
+        assert called
+        return lambda: block.__exit__(None, None, None)
 
     def work():
         try:
-            for _ in range(50):
-                env = aec_env(calling(lambda: Model().decide()), {Model.decide: define()})
-                env.reset()
-                env.step(1)
-                assert env.unwrapped.simulation.log == [1]
-                env.close()
+            for number in range(10):
+                if ready.wait(30) == 0:
+                    renew()
+                ready.wait(30)
+                go = environment() if how == "environment" else handled()
+                ready.wait(30)
+                go()
+                ready.wait(30)
+                assert vars(owner()).get(attribute) is before[number]
+                assert hook_of(vars(module.Base)["look"]) is None
         except BaseException as error:
             errors.append(error)
+            ready.abort()
 
-    threads = [threading.Thread(target=work) for _ in range(8)]
+    before, ready = [], threading.Barrier(8)
+    threads = [threading.Thread(target=work, daemon=True) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
-    assert not errors
-    assert vars(Model)["decide"] is before
+        thread.join(60)
+    assert not any(thread.is_alive() for thread in threads)
+    assert errors == []
+    assert len(before) == 10
+
+
+@pytest.mark.parametrize("end", ["close", "drop"])
+@pytest.mark.parametrize("name", ["Base.method", "Base.static", "Base.of_class", "Sub.method", "function"])
+def test_a_point_can_be_used_after_a_mock_stood_there_while_an_environment_ended(name, end):
+    owner, attribute = resolve(f"{HERE}.{name}", TARGET)
+    before, rule = vars(owner).get(attribute), getattr(Base if isinstance(owner, type) else owner, attribute)
+
+    def call():
+        return getattr(owner() if isinstance(owner, type) else owner, attribute)()
+
+    expected = call()
+    points = {f"{HERE}.{name}": define(agent="one_0")}
+    for _ in range(3):
+        env = aec_env(calling(call), points)
+        env.reset()
+        with mock.patch.object(owner, attribute, return_value="mocked"):
+            if end == "close":
+                env.close()
+            del env
+            gc.collect()
+            assert call() == "mocked"
+        assert call() == expected
+        env = aec_env(calling(call, call), points)
+        env.reset()
+        env.step(1)
+        env.step(2)
+        assert env.unwrapped.simulation.log == [1, 2]
+        env.close()
+        assert vars(owner).get(attribute) is before
+        assert call() == expected
+    assert getattr(Base if isinstance(owner, type) else owner, attribute) == rule
 
 
 def test_definitions_are_made_of_functions_alone():

@@ -1,6 +1,7 @@
 """Many simulations, spread over processes by joblib."""
 
 import dataclasses
+import gc
 import os
 import signal
 import subprocess
@@ -306,3 +307,36 @@ def test_what_is_collected_of_lots_in_which_nobody_decides():
             assert found.seeds == tuple(seeds)
             assert found.collected == tuple(10 * seed for seed in seeds)
             assert found.episodes.tolist() == ([5] if 5 in seeds else [])
+
+
+class Ending:
+    """A factory of simulations that ends all other processes."""
+
+    def __init__(self):
+        self.process = os.getpid()
+
+    def __call__(self):
+        return Colony(DESIGN) if os.getpid() == self.process else os._exit(3)
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
+@pytest.mark.parametrize("what", ["it cannot be started", "it ends"])
+def test_a_worker_that_cannot_work_leaves_no_descriptors(what, monkeypatch):
+    loky = joblib.externals.loky
+
+    def refuse(process):
+        raise OSError("no more processes")
+
+    def run():
+        loky.get_reusable_executor().shutdown(wait=True)
+        model = Ending() if what == "it ends" else lambda: Colony(DESIGN)
+        with pytest.raises(Exception):  # noqa: B017
+            simulate_many(model, {Creature.act: policy}, points=POINTS, seeds=range(4), workers=2)
+        loky.get_reusable_executor().shutdown(wait=True)
+        gc.collect()
+        return len(os.listdir("/proc/self/fd"))
+
+    if what == "it cannot be started":
+        monkeypatch.setattr(loky.backend.process.LokyProcess, "start", refuse)
+    first = run()  # joblib keeps some for the next time
+    assert min(run(), run()) <= first  # some of it goes a little later

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..errors import MaskError
+from ..errors import MaskError, shown
 from ..simulation import Sentinel
 from .spaces import duplicate
 
@@ -165,7 +165,7 @@ def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
 
         def cast(value: Any) -> Any:
             if not isinstance(value, (tuple, list)) or len(value) != len(parts):
-                raise MaskError(f"the mask {value!r} has not the {len(parts)} parts of {space}")
+                raise MaskError(f"the mask {shown(value)} has not the {len(parts)} parts of {shown(space)}")
             return tuple(part(item) for part, item in zip(parts, value, strict=True))
 
         return cast
@@ -177,12 +177,14 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
     def cast(value: Any) -> NDArray[np.int8]:
         mask = np.asarray(value)
         if mask.shape != (number,):
-            raise MaskError(f"the mask {value!r} has shape {mask.shape} and not ({number},), as {space} asks")
+            raise MaskError(
+                f"the mask {shown(value)} has shape {mask.shape} and not ({number},), as {shown(space)} asks"
+            )
         legal = mask.astype(bool)
         if not (legal == mask).all():
-            raise MaskError(f"the mask {value!r} has values other than 0 and 1")
+            raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
         if not legal.any():
-            raise MaskError(f"the mask {value!r} leaves no legal action of {space}")
+            raise MaskError(f"the mask {shown(value)} leaves no legal action of {shown(space)}")
         return legal.astype(np.int8)
 
     return cast

@@ -11,7 +11,7 @@ from weakref import ref
 import numpy as np
 from greenlet import getcurrent, greenlet
 
-from ..errors import MaskError, RewardError
+from ..errors import MaskError, RewardError, shown
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
 from .actions import MASK
@@ -270,11 +270,11 @@ def checked_reward(agent: Agent, reward: Any) -> float:
     """
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):
-        raise RewardError(f"the reward {reward!r} is not one number")
+        raise RewardError(f"the reward {shown(reward)} is not one number")
     try:
         value = float(value)
     except OverflowError:
-        raise RewardError(f"the reward {reward!r} is too large for a float") from None
+        raise RewardError(f"the reward {shown(reward)} is too large for a float") from None
     if not isfinite(value):
         raise RewardError(f"the reward of {agent.name!r} is {value}, which is not finite")
     return value

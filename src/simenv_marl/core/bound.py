@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
-from ..errors import InvalidActionError, MaskError, warn_user
+from ..errors import InvalidActionError, MaskError, shown, warn_user
 from . import actions, spaces
 from .actions import ILLEGAL, MASK
 from .points import NamedPoint
@@ -199,10 +199,11 @@ class BoundPoint:
         legal = self.check(action)
         if legal is ILLEGAL:
             raise InvalidActionError(
-                f"the action {action!r} of {agent!r} is not in its action space {self.definition.action_space}"
+                f"the action {shown(action)} of {agent!r} is not in its action space"
+                f" {shown(self.definition.action_space)}"
             )
         if mask is not None and not self.allows(mask, legal):
-            raise InvalidActionError(f"the action {action!r} of {agent!r} is masked; its mask is {mask!r}")
+            raise InvalidActionError(f"the action {shown(action)} of {agent!r} is masked; its mask is {shown(mask)}")
         return legal
 
     def rule_action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any], choices: Any) -> Any:
@@ -226,8 +227,8 @@ class BoundPoint:
             legal = None if action is None else self.check(action)
             if legal is ILLEGAL:
                 raise InvalidActionError(
-                    f"rule_action_mapping of {self.point.name} says that the rule's decision {decision!r} is the"
-                    f" action {action!r}, which is not in its action space {definition.action_space}"
+                    f"rule_action_mapping of {self.point.name} says that the rule's decision {shown(decision)} is the"
+                    f" action {shown(action)}, which is not in its action space {shown(definition.action_space)}"
                 )
             return legal
         if choices is not None:
@@ -269,8 +270,8 @@ def _look_back(actions: Mapping[Any, Any]) -> Callable[..., Any]:
             return known[decision]
         except (KeyError, TypeError):
             raise InvalidActionError(
-                f"the dict rule_action_mapping has no action for the rule's decision {decision!r}; give it one, or a"
-                " callable that returns None where no action corresponds"
+                f"the dict rule_action_mapping has no action for the rule's decision {shown(decision)}; give it one,"
+                " or a callable that returns None where no action corresponds"
             ) from None
 
     return look_back

@@ -15,6 +15,7 @@ from ..errors import (
     UnknownAgentError,
     annotate,
     clear_frames,
+    shown,
     warn_user,
 )
 from ..simulation import RULE
@@ -139,8 +140,8 @@ class Ending(Participants):
         """Warn that many rounds had no action for the agent whose decision is pending."""
         assert self.pending is not None
         warn_user(
-            f"the last {MANY_ROUNDS} rounds had no action for {self.pending.name!r}, whose decision is pending, and so"
-            ' the simulation stands still; infos tell which agent is "deciding"'
+            f"the simulation stands still: {shown(self.pending.name)} is to decide, and {MANY_ROUNDS} rounds in a row"
+            ' had no action for it; infos tell which agent is "deciding"'
         )
 
     def check(self, actions: Mapping[str, Any]) -> dict[str, Any]:
@@ -156,11 +157,11 @@ class Ending(Participants):
         if pending is None:
             raise self.refusal()
         if type(actions) is not dict and not isinstance(actions, Mapping):
-            raise InvalidActionError(f"a round takes a dict of actions by agent, not {actions!r}")
+            raise InvalidActionError(f"a round takes a dict of actions by agent, not {shown(actions)}")
         for name, action in actions.items():
             agent = agents.get(name)
             if agent is None:
-                raise UnknownAgentError(f"there is an action for {name!r}, which is no live agent: {self.names()}")
+                raise UnknownAgentError(f"there is an action for {shown(name)}, which is no live agent: {self.names()}")
             if action is not RULE:
                 action = agent.point.checked(action, name, agent.mask if agent is pending else None)
             checked[name] = action
@@ -175,7 +176,7 @@ class Ending(Participants):
         except Warning as warning:  # where these are errors; another one must not take its place
             problems = [warning]
         for problem in problems:
-            annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {problem!r}")
+            annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {shown(problem)}")
         clear_frames(error)
 
     def annotate(self, error: BaseException) -> None:
@@ -221,7 +222,7 @@ class Ending(Participants):
             return
         with self.at_work():
             for problem in self._unwind():
-                warn_user(f"a simulation that was abandoned raised {problem!r}", ResourceWarning)
+                warn_user(f"a simulation that was abandoned raised {shown(problem)}", ResourceWarning)
 
     def _unwind(self) -> list[BaseException]:
         """Unwind the simulation, if it is suspended. Returns what it has raised."""

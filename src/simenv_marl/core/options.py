@@ -13,6 +13,7 @@ from gymnasium import spaces
 from ..errors import (
     OptionValueError,
     UnknownOptionError,
+    shown,
 )
 from ..simulation import RULE
 
@@ -66,34 +67,36 @@ class Options:
 
     def __post_init__(self) -> None:
         if self.driver not in ("greenlet", "thread"):
-            raise OptionValueError(f'driver must be "greenlet" or "thread", not {self.driver!r}')
+            raise OptionValueError(f'driver must be "greenlet" or "thread", not {shown(self.driver)}')
         if isinstance(self.possible_agents, str):
             raise OptionValueError(
-                f"possible_agents must be a list of names, not the one name {self.possible_agents!r}"
+                f"possible_agents must be a list of names, not the one name {shown(self.possible_agents)}"
             )
         if self.undeclared not in ("error", "rule"):
-            raise OptionValueError(f'undeclared must be "error" or "rule", not {self.undeclared!r}')
+            raise OptionValueError(f'undeclared must be "error" or "rule", not {shown(self.undeclared)}')
         if self.agent is not None and not (isinstance(self.agent, str) and self.agent):
-            raise OptionValueError(f"agent must be the name of an agent or None, not {self.agent!r}")
+            raise OptionValueError(f"agent must be the name of an agent or None, not {shown(self.agent)}")
         for name in ("clip_actions", "global_rng", "padded", "skip_forced"):
             if not isinstance(getattr(self, name), bool):
-                raise OptionValueError(f"{name} must be True or False, not {getattr(self, name)!r}")
+                raise OptionValueError(f"{name} must be True or False, not {shown(getattr(self, name))}")
         state_space = self.state_space
         if not (state_space is None or isinstance(state_space, spaces.Space) or state_space == "observations"):
-            raise OptionValueError(f'state_space must be a gymnasium space or "observations", not {state_space!r}')
+            raise OptionValueError(f'state_space must be a gymnasium space or "observations", not {shown(state_space)}')
         steps = self.max_steps
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
-            raise OptionValueError(f"max_steps must be a positive integer or None, not {steps!r}")
+            raise OptionValueError(f"max_steps must be a positive integer or None, not {shown(steps)}")
         if self.policies is not None and not isinstance(self.policies, Mapping):
-            raise OptionValueError(f"policies must be a dict from agents or points to callables, not {self.policies!r}")
+            raise OptionValueError(
+                f"policies must be a dict from agents or points to callables, not {shown(self.policies)}"
+            )
         if self.possible_agents is not None:  # it may be an iterator, and is read by every environment
             object.__setattr__(self, "possible_agents", _listed(self.possible_agents))
         for key, policy in (self.policies or {}).items():
             if policy is not RULE and not callable(policy):
-                raise OptionValueError(f"the policy of {key!r} must be a callable or RULE, not {policy!r}")
+                raise OptionValueError(f"the policy of {shown(key)} must be a callable or RULE, not {shown(policy)}")
 
         if isinstance(self.plugins, (str, Mapping)) or not isinstance(self.plugins, Iterable):
-            raise OptionValueError(f"plugins must be a list of (handler, target, position), not {self.plugins!r}")
+            raise OptionValueError(f"plugins must be a list of (handler, target, position), not {shown(self.plugins)}")
         object.__setattr__(self, "plugins", tuple(self.plugins))  # an iterator is to serve more than once
 
     def amended(self, options: Mapping[str, Any]) -> Options:
@@ -119,5 +122,5 @@ def _listed(names: Any) -> Any:
         return list(names)
     except TypeError:
         raise OptionValueError(
-            f"possible_agents must be names, or a dict from points to names, not {names!r}"
+            f"possible_agents must be names, or a dict from points to names, not {shown(names)}"
         ) from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Any
 
-from ..errors import AgentError
+from ..errors import AgentError, shown
 from .agent import Agent
 from .bound import BoundPoint
 from .plan import Plan
@@ -54,7 +54,7 @@ class Participants:
             AgentError: The name is none, or belongs to another point, or to an agent that has ended.
         """
         if not isinstance(name, str):
-            raise AgentError(f"agent= of {point.point.name} must name a string or None, not {name!r}")
+            raise AgentError(f"agent= of {point.point.name} must name a string or None, not {shown(name)}")
         agent = self.answered.get(name) or self.agents.get(name)
         if agent is None:
             if name in self.ended:

@@ -18,6 +18,7 @@ from ..errors import (
     OptionValueError,
     UnknownOptionError,
     UnknownPointError,
+    shown,
     warn_user,
 )
 from ..hooks.hook import Hook
@@ -89,13 +90,14 @@ class Plan:
         self.render_modes, self.render_fps = render_modes, render_fps
         if options.render_mode is not None and options.render_mode not in render_modes:
             raise OptionValueError(
-                f"render_mode {options.render_mode!r} is not one of the simulation's: {render_modes or 'it has none'}"
+                f"render_mode {shown(options.render_mode)} is not one of the simulation's:"
+                f" {render_modes or 'it has none'}"
             )
         self.unanswered, self.rewarded, self._ends_agents = unanswered, rewarded, ends_agents
         agents = name_agents(named)
         if options.agent is not None and options.agent not in agents and None not in agents:
             raise AgentError(
-                f"agent={options.agent!r} names no agent; the agents are {', '.join(filter(None, agents))}"
+                f"agent={shown(options.agent)} names no agent; the agents are {', '.join(filter(None, agents))}"
             )
         by_point, self.policies, extra = assign(options.policies or {}, named, agents)
         self._everything, self._by_point = [*named, *extra], by_point
@@ -179,14 +181,14 @@ class Plan:
         """
         if agent in self.policies:
             raise UnknownPointError(
-                f"agent={agent!r} is answered by policies, and no decision is left to the environment"
+                f"agent={shown(agent)} is answered by policies, and no decision is left to the environment"
             )
         if self.complete and agent not in self.roster:
-            raise AgentError(f"agent={agent!r} names no agent of the environment; known are {', '.join(self.roster)}")
+            raise AgentError(f"agent={shown(agent)} names no agent of the environment: {', '.join(self.roster)}")
         points = [self.roster[agent]] if self.complete else self.active
         if len(points) > 1:
             raise AgentError(
-                f"the agent {agent!r} may decide at {', '.join(point.point.name for point in points)}; name its"
+                f"the agent {shown(agent)} may decide at {', '.join(point.point.name for point in points)}; name its"
                 " decision point in points=, or declare the agents of each with possible_agents="
             )
         self.active, self.roster, self.complete = points, {agent: points[0]}, True

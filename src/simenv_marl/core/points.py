@@ -13,7 +13,7 @@ from types import FunctionType, MappingProxyType
 from typing import Any, Final
 
 from ..decision import DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
-from ..errors import DefinitionError, PatchError, UnknownPointError
+from ..errors import DefinitionError, PatchError, UnknownPointError, shown
 from ..hooks.attached import title
 from ..hooks.hook import Hook, beneath, hook_of
 from ..hooks.places import (
@@ -126,7 +126,7 @@ def find_point(
         UnknownPointError, DefinitionError, PatchError: As ``find_points``.
     """
     if definition is not None and not isinstance(definition, Definition):
-        raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {definition!r}")
+        raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {shown(definition)}")
     point, own = locate(key)
     definition = definition or own or given.get(point) or point.definition
     if definition is None:

@@ -11,18 +11,18 @@ import io
 import pickle
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
-from types import FunctionType
-from typing import Any
+from types import FunctionType, GetSetDescriptorType, MemberDescriptorType
+from typing import Any, Final, NamedTuple
 from uuid import uuid4
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import cloudpickle
 
 from ..decision import DecisionPoint, Definition, point_of, unwrapped
-from ..errors import WorkerError, annotate
+from ..errors import WorkerError, annotate, notes_of, told
 from ..hooks.hook import Hook, hook_of, made_with
 
 
@@ -58,43 +58,158 @@ def unpack(parcel: bytes) -> Any:
 
 # -- errors ---------------------------------------------------------------------------------------
 
+_PICKLED_BY: Final = {"__reduce__", "__reduce_ex__", "__getstate__", "__setstate__"}
+
+_LEFT_OUT: Final = vars(AttributeError)["obj"]
+"""Which may lead to all of the model; ``pickle`` leaves it out, too."""
+
+_IN_PYTHON: Final = 1 << 9
+"""The flag of types that are made at run time, as all that are written in Python."""
+
+
+class _Packed(NamedTuple):
+    """What crosses of an error.
+
+    Attributes:
+        parts: Of what it is made again; None where that cannot cross.
+        message: What it says.
+        notes: Its notes.
+        members: The numbers of the errors of which it is a group.
+        cause: The number of what is told of as its cause; None if there is nothing.
+        direct: Whether it was raised from that.
+    """
+
+    parts: bytes | None
+    message: str
+    notes: list[str]
+    members: list[int]
+    cause: int | None
+    direct: bool
+
 
 class RemoteTraceback(Exception):
-    """The cause of an error that was raised in another process: its traceback there, as text."""
+    """The first cause of an error that was raised in another process: its traceback there, as text."""
 
     def __str__(self) -> str:
         return f"\n\n{self.args[0]}"
 
 
 def pack_error(error: BaseException) -> bytes:
-    """Pickle an error for another process, so that it can be rebuilt there, or at least be told of."""
-    text = "".join(traceback.format_exception(error))
-    parts = None
-    with suppress(Exception):
-        parts = pack_plainly((type(error), error.args, vars(error)))
-        _rebuilt(parts)
-    return pickle.dumps((parts, f"{type(error).__name__}: {error}", list(getattr(error, "__notes__", ())), text), 5)
+    """Pickle an error for another process, with its causes, so that it can be rebuilt there, or at least be told of."""
+    try:
+        text = "".join(traceback.format_exception(error))
+    except Exception:  # whatever its parts do when they are looked at
+        text = told(error)
+    errors, numbers = [error], {id(error): 0}
+    for known in errors:  # which grows meanwhile
+        for other in (_cause_of(known), *_members_of(known)):
+            if other is not None and id(other) not in numbers:
+                numbers[id(other)] = len(errors)
+                errors.append(other)
+    packed = [
+        _Packed(
+            parts=_packed(known),
+            message=told(known),
+            notes=notes_of(known),
+            members=[numbers[id(member)] for member in _members_of(known)],
+            cause=numbers.get(id(_cause_of(known))),
+            direct=known.__cause__ is not None,
+        )
+        for known in errors
+    ]
+    return pickle.dumps((packed, text), 5)
 
 
 def unpack_error(parcel: bytes) -> BaseException:
-    """The error that was packed, with its traceback as its cause; a ``WorkerError`` if it cannot be rebuilt."""
-    parts, message, notes, text = pickle.loads(parcel)
-    try:
-        error = _rebuilt(parts)
-    except Exception:
-        error = WorkerError(f"another process has raised what cannot be pickled: {message}")
-        for note in notes:
-            annotate(error, note)
-    error.__cause__ = RemoteTraceback(text)
-    return error
+    """The error that was packed, with its causes and, as the first of them, its traceback.
+
+    What cannot be rebuilt is a ``WorkerError``.
+    """
+    packed, text = pickle.loads(parcel)
+    errors: dict[int, BaseException] = {}
+    for number in range(len(packed)):
+        _rebuild(number, packed, errors)
+    for number, known in enumerate(packed):
+        if known.cause is not None:
+            # It may be frozen.
+            name = "__cause__" if known.direct else "__context__"
+            BaseException.__setattr__(errors[number], name, errors[known.cause])
+    first, seen = 0, {0}
+    while (cause := packed[first].cause) is not None and cause not in seen:  # they may go in circles
+        first = cause
+        seen.add(cause)
+    BaseException.__setattr__(errors[first], "__cause__", RemoteTraceback(text))
+    return errors[0]
 
 
-def _rebuilt(parts: bytes) -> BaseException:
-    kind, args, state = pickle.loads(parts)
-    error: BaseException = kind.__new__(kind, *args)  # not called: its arguments may be others than its ``args``
-    error.args = args
+def _cause_of(error: BaseException) -> BaseException | None:
+    """What is told of as the cause of an error."""
+    return error.__cause__ if error.__cause__ is not None or error.__suppress_context__ else error.__context__
+
+
+def _members_of(error: BaseException) -> tuple[BaseException, ...]:
+    return error.exceptions if isinstance(error, BaseExceptionGroup) else ()
+
+
+def _packed(error: BaseException) -> bytes | None:
+    """The parts of an error, or itself where it says how it is pickled; None where neither can be."""
+    kinds = [kind for kind in type(error).__mro__ if kind.__flags__ & _IN_PYTHON]
+    itself = any(_PICKLED_BY & vars(kind).keys() for kind in kinds)
+    for whole in (itself, not itself):
+        with suppress(Exception):
+            parcel = pack_plainly(error if whole else _parts(error))
+            _made_again(parcel, _members_of(error))
+            return parcel
+    return None
+
+
+def _parts(error: BaseException) -> tuple[Any, ...]:
+    """What an error is made of, but for the members of a group."""
+    state = {name: value for name, value in vars(error).items() if name != "__notes__"}
+    slots = {}
+    for kind in set(type(error).__mro__) - {BaseException, BaseExceptionGroup, object}:
+        for name, slot in vars(kind).items():
+            if isinstance(slot, (MemberDescriptorType, GetSetDescriptorType)) and slot is not _LEFT_OUT:
+                with suppress(AttributeError):  # it was never set
+                    slots[name] = slot.__get__(error)
+    for name in slots.keys() & {"__dict__", "__weakref__"}:
+        del slots[name]
+    args = (error.message,) if isinstance(error, BaseExceptionGroup) else error.args
+    return type(error), args, slots, state
+
+
+def _made_again(parcel: bytes, members: Sequence[BaseException]) -> BaseException:
+    """An error of what was packed of it."""
+    thing = pickle.loads(parcel)
+    if isinstance(thing, BaseException):
+        return thing
+    kind, args, slots, state = thing
+    # Neither its ``__init__`` nor its ``__new__`` is called: they may take other arguments than its ``args``.
+    native = next(base for base in kind.__mro__ if not base.__flags__ & _IN_PYTHON)
+    if members:
+        args = *args, list(members)
+    error: BaseException = native.__new__(kind, *(args if members else ()))
+    for name, value in {**slots, "args": args}.items():
+        if value is not None or getattr(error, name, error) is not None:
+            getattr(kind, name).__set__(error, value)
     vars(error).update(state)
     return error
+
+
+def _rebuild(number: int, packed: list[_Packed], errors: dict[int, BaseException]) -> BaseException:
+    """Rebuild an error unless it is there already, after the members of a group."""
+    if number not in errors:
+        parts, message, notes, numbers, *_ = packed[number]
+        error: BaseException = WorkerError(f"another process has raised what cannot be pickled: {message}")
+        members = [_rebuild(member, packed, errors) for member in numbers]
+        if parts is not None:
+            with suppress(Exception):
+                error = _made_again(parts, members)
+        for note in notes:
+            if note not in notes_of(error):
+                annotate(error, note)
+        errors[number] = error
+    return errors[number]
 
 
 # -- functions ------------------------------------------------------------------------------------

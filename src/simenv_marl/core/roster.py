@@ -7,7 +7,7 @@ from sys import modules
 from typing import Any
 
 from ..decision import DecisionPoint, unwrapped
-from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError
+from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, shown
 from ..simulation import RULE, positional
 from .bound import BoundPoint, Policy
 from .points import NamedPoint, find_point
@@ -54,7 +54,7 @@ def call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, Bo
             point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
             if point is None:
                 raise OptionValueError(
-                    f"possible_agents names {key!r}, which is no active decision point whose agents are named by a"
+                    f"possible_agents names {shown(key)}, which is no active decision point whose agents are named by a"
                     f" callable; those are {[b.point.name for b in named]}"
                 )
             names[point] = value
@@ -70,7 +70,7 @@ def call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, Bo
     for binding in active:
         for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
             if not isinstance(name, str) or name in roster:
-                raise AgentError(f"possible_agents must be names, and each but once, not {name!r}")
+                raise AgentError(f"possible_agents must be names, and each but once, not {shown(name)}")
             roster[name] = binding
     return roster, not named or declared is not None
 
@@ -99,7 +99,7 @@ def assign(
                     continue
                 names = sorted([a for a in agents if a] + [p.point.name for p in named])
                 raise UnknownPointError(
-                    f"policies names {key!r}, which is neither an agent nor a decision point ({error});"
+                    f"policies names {shown(key)}, which is neither an agent nor a decision point ({error});"
                     f" known are {', '.join(names)}"
                 ) from error
             if not any(point.point is other.point for other in (*named, *extra)):

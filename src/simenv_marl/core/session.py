@@ -17,7 +17,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 
-from ..errors import BranchError, OptionValueError, annotate, warn_user
+from ..errors import BranchError, OptionValueError, annotate, shown, warn_user
+from ..hooks.places import Held
 from ..simulation import make_simulation, resetter
 from .contexts import Claim, at_work
 from .draws import WatchedDriver, is_watched, watched
@@ -62,7 +63,7 @@ class Session:
         self._open = False  # whether the simulation was reset and not closed since
         self._worn = False  # whether it was given up: what then may still use it is to meet no other episode
         self._bound: tuple[Any, Any, Plan] | None = None
-        self._held: list[Any] = []  # what is set, and is to be put back
+        self._held: Held | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.claim = Claim() if plan.options.driver == "thread" else None
         self._driver: BaseDriver | None = None
@@ -296,8 +297,8 @@ class Session:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to end."""
-        return self.episode is None
+        """Whether there is nothing to end, and nothing to put back."""
+        return self.episode is None and self._held is None
 
     def render(self) -> Any:
         """Render the simulation in the environment's render mode; None, with a warning, where it has none."""
@@ -342,28 +343,20 @@ class Session:
         try:
             self._close_simulation()
         except Exception as error:
-            warn_user(f"a simulation that was abandoned raised {error!r} when it was closed", ResourceWarning)
+            warn_user(f"a simulation that was abandoned raised {shown(error)} when it was closed", ResourceWarning)
 
     def _reachable(self) -> bool:
         return self._driver is not None and self._driver.reachable()
 
     def _hold_patches(self) -> None:
-        if self._held:
-            return
-        try:
-            for patch in self.plan.patches:
-                patch.hold()
-                self._held.append(patch)
-        except BaseException:
+        if self._held is None or not self._held.whole:
             self._let_go_of_patches()
-            raise
+            self._held = Held(self.plan.patches)
 
     def _let_go_of_patches(self) -> None:
-        while self._held:
-            try:
-                self._held[-1].let_go()
-            finally:
-                self._held.pop()
+        if self._held is not None:
+            self._held.let_go()
+            self._held = None
 
 
 def _stand_alike(one: Episode, other: Episode) -> bool:
@@ -388,10 +381,10 @@ def checked_seed(seed: Any) -> int | None:
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise OptionValueError(f"seed must be a non-negative integer or None, not {seed!r}")
+        raise OptionValueError(f"seed must be a non-negative integer or None, not {shown(seed)}")
     return int(seed)
 
 
 def seed_space(space: spaces.Space[Any], seed: int, agent: str) -> None:
     """Seed a space of an agent: for every agent differently, and for every order of joining alike."""
-    space.seed(int(np.random.SeedSequence([seed, crc32(agent.encode())]).generate_state(1)[0]))
+    space.seed(int(np.random.SeedSequence([seed, crc32(agent.encode(errors="surrogatepass"))]).generate_state(1)[0]))

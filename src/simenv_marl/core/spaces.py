@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..errors import ObservationError
+from ..errors import ObservationError, shown
 from ..simulation import Sentinel
 
 Cast = Callable[[Any], Any]
@@ -45,7 +45,7 @@ def observation_cast(space: spaces.Space[Any]) -> Cast:
 
     def cast(value: Any) -> Any:
         if not space.contains(value):
-            raise ObservationError(f"the observation {value!r} is not in {space}")
+            raise ObservationError(f"the observation {shown(value)} is not in {shown(space)}")
         return copy.deepcopy(value)
 
     return cast
@@ -70,20 +70,21 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise ObservationError(f"the observation {value!r} is no array for {space}: {error}") from error
+        raise ObservationError(f"the observation {shown(value)} is no array for {shown(space)}: {error}") from error
     if array.shape != space.shape:
         raise ObservationError(
-            f"the observation has shape {array.shape}, its space {space} has shape {space.shape}; it was {value!r}"
+            f"the observation has shape {array.shape}, its space {shown(space)} has shape {space.shape}; it was"
+            f" {shown(value)}"
         )
     if array.dtype.kind not in "biuf":
-        raise ObservationError(f"the observation {value!r} has dtype {array.dtype}, which is no number")
+        raise ObservationError(f"the observation {shown(value)} has dtype {array.dtype}, which is no number")
     assert space.dtype is not None
     if space.dtype.kind in "iu" and array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ObservationError(f"the observation {value!r} is not finite, which {space.dtype} cannot hold")
+        raise ObservationError(f"the observation {shown(value)} is not finite, which {space.dtype} cannot hold")
     if space.dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, space.dtype):
         limits = np.iinfo(space.dtype)
         if array.min() < limits.min or array.max() > limits.max:
-            raise ObservationError(f"the observation {value!r} has numbers that {space.dtype} cannot hold")
+            raise ObservationError(f"the observation {shown(value)} has numbers that {space.dtype} cannot hold")
     return array.astype(space.dtype, copy=True)
 
 
@@ -100,7 +101,7 @@ def _discrete_cast(space: spaces.Discrete) -> Cast:
                     return number
             except (TypeError, ValueError, OverflowError):
                 pass
-        raise ObservationError(f"the observation {value!r} is no integer for {space}")
+        raise ObservationError(f"the observation {shown(value)} is no integer for {shown(space)}")
 
     return cast
 
@@ -114,7 +115,9 @@ def _dict_cast(space: spaces.Dict) -> Cast:
                 return {key: part(value[key]) for key, part in casts.items()}
         except (TypeError, KeyError):
             pass
-        raise ObservationError(f"the observation {value!r} has not just the keys {sorted(casts)} of {space}")
+        raise ObservationError(
+            f"the observation {shown(value)} has not just the keys {shown(sorted(casts))} of {shown(space)}"
+        )
 
     return cast
 
@@ -124,7 +127,7 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
 
     def cast(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (tuple, list)) or len(value) != len(casts):
-            raise ObservationError(f"the observation {value!r} has not the {len(casts)} parts of {space}")
+            raise ObservationError(f"the observation {shown(value)} has not the {len(casts)} parts of {shown(space)}")
         return tuple(part(item) for part, item in zip(casts, value, strict=True))
 
     return cast
@@ -156,7 +159,9 @@ def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
 
     def check_numbers(observation: NDArray[Any]) -> None:
         if not np.isfinite(observation[bounded]).all():
-            raise ObservationError(f"the observation {observation!r} is not finite, where its space {space} is bounded")
+            raise ObservationError(
+                f"the observation {shown(observation)} is not finite, where its space {shown(space)} is bounded"
+            )
 
     return check_numbers
 

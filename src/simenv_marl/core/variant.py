@@ -14,7 +14,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from ..errors import OptionValueError, SimulationError
+from ..errors import OptionValueError, SimulationError, shown
 from .points import portable
 
 
@@ -46,7 +46,7 @@ class Variant:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise OptionValueError(f"a variant needs a name, not {self.name!r}")
+            raise OptionValueError(f"a variant needs a name, not {shown(self.name)}")
         if isinstance(self.simulation, Variant):
             raise SimulationError(
                 f"the variant {self.name!r} is one of a simulation, not of {self.simulation.name!r}; derive variants"
@@ -55,7 +55,7 @@ class Variant:
         for name in ("parameters", "policies", "options"):
             value = getattr(self, name)
             if not isinstance(value, Mapping):
-                raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {value!r}")
+                raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {shown(value)}")
             # It cannot be changed from outside: what is frozen is the variant and all that it names.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         twice = [name for name in ("plugins", "policies") if name in self.options]
@@ -71,14 +71,14 @@ class Variant:
         if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
             raise SimulationError(
                 f"the variant {self.name!r} has parameters, for which its simulation must be a class or a factory, not"
-                f" {source!r}"
+                f" {shown(source)}"
             )
         try:
             inspect.signature(source).bind(**self.parameters)
         except TypeError as error:
             raise SimulationError(
-                f"{getattr(source, '__qualname__', source)} cannot be called with the parameters of the variant"
-                f" {self.name!r}: {error}"
+                f"{getattr(source, '__qualname__', None) or shown(source)} cannot be called with the parameters of the"
+                f" variant {self.name!r}: {error}"
             ) from error
         except ValueError:  # a builtin, which cannot say what it takes
             pass

@@ -8,7 +8,7 @@ from typing import Any, Final
 from gymnasium.vector import AutoresetMode
 
 from ..core.plan import Plan
-from ..errors import OptionValueError
+from ..errors import OptionValueError, shown
 from .aec import SimulationAECEnv
 from .base import View
 from .joint import SimulationJointEnv
@@ -53,7 +53,7 @@ def view_class(plan: Plan, view: str | None) -> Any:
         return single_view(plan)
     found: dict[Any, Any] = {"aec": SimulationAECEnv, "parallel": SimulationParallelEnv, "joint": SimulationJointEnv}
     if not isinstance(view, str) or view not in found:
-        raise OptionValueError(f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {view!r}")
+        raise OptionValueError(f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {shown(view)}")
     found[view].check(plan)
     return found[view]
 

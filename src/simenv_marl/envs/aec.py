@@ -10,7 +10,7 @@ from pettingzoo import AECEnv
 from ..core.agent import Agent
 from ..core.episode import Episode, When
 from ..core.plan import Plan
-from ..errors import InvalidActionError
+from ..errors import InvalidActionError, shown
 from ..simulation import RULE
 from .base import View
 from .padded import presence
@@ -250,7 +250,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             raise episode.refusal()
         if action is not None and action is not RULE:
             raise InvalidActionError(
-                f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {action!r}"
+                f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {shown(action)}"
             )
         self._take_back_rewards()
         name = self._leaving.pop()

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, iterate
 
 from ..core.bound import BoundPoint
-from ..errors import InvalidActionError
+from ..errors import InvalidActionError, shown
 from ..simulation import RULE
 
 IGNORED: Final = None
@@ -93,9 +93,11 @@ class Actions:
         try:
             apart = list(iterate(self._batch, actions))
         except Exception as error:
-            raise InvalidActionError(f"{actions!r} is no batch of {self._number} actions of {self._space}") from error
+            raise InvalidActionError(
+                f"{shown(actions)} is no batch of {self._number} actions of {shown(self._space)}"
+            ) from error
         if len(apart) != self._number:
-            raise InvalidActionError(f"there are {len(apart)} actions for {self._number} simulations: {actions!r}")
+            raise InvalidActionError(f"there are {len(apart)} actions for {self._number} simulations: {shown(actions)}")
         return apart
 
 

@@ -14,7 +14,7 @@ from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.session import Session
 from ..core.spaces import duplicate
-from ..errors import InvalidActionError, ViewError
+from ..errors import InvalidActionError, ViewError, shown
 from ..simulation import RULE
 from .gymnasium_base import OneAgentView
 
@@ -58,12 +58,12 @@ class Joint:
             actions = dict.fromkeys(self.roster, RULE)
         elif self._flatten:
             if not isinstance(action, np.ndarray) or action.shape != self.action_space.shape:
-                raise InvalidActionError(f"the joint action {action!r} is not in {self.action_space}")
+                raise InvalidActionError(f"the joint action {shown(action)} is not in {shown(self.action_space)}")
             actions = {name: action[place] for name, place in self._places.items()}
         elif not isinstance(action, Mapping) or set(action) != set(self.roster):
             given = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
-                f"a joint action is a dict with an action for each of {', '.join(self.roster)}; given: {given!r}"
+                f"a joint action is a dict with an action for each of {', '.join(self.roster)}; given: {shown(given)}"
             )
         else:
             actions = action

@@ -20,7 +20,7 @@ from ..core.events import WAIT
 from ..core.plan import Plan
 from ..core.session import Session
 from ..core.stacking import stacker
-from ..errors import InvalidActionError, OptionValueError, annotate
+from ..errors import InvalidActionError, OptionValueError, annotate, shown
 from ..hooks.stacks import EVALUATING
 from .batches import IGNORED, Batch, of_one
 from .gymnasium_base import OneAgentView
@@ -54,7 +54,7 @@ class SubEnvironments:
         if view is None:
             view = "joint" if plan.one_agent is None else "single"
         if view not in ("single", "joint"):
-            raise OptionValueError(f'view must be None, "single" or "joint", not {view!r}')
+            raise OptionValueError(f'view must be None, "single" or "joint", not {shown(view)}')
         self.joint: Joint | None = None
         self._view: type[OneAgentView]
         if view == "single":
@@ -400,7 +400,7 @@ class Row:
                 if raised is None:
                     raised = error
                 else:
-                    annotate(raised, f"simenv_marl: and in sub-environment {self._offset + number}: {error!r}")
+                    annotate(raised, f"simenv_marl: and in sub-environment {self._offset + number}: {shown(error)}")
         if raised is not None:
             raise raised
 
@@ -411,8 +411,8 @@ class Row:
 
     @property
     def suspended(self) -> bool:
-        """Whether a simulation still waits for an action."""
-        return any(map(self._waits, self.sessions))
+        """Whether a simulation still waits for an action, or something is still to be put back."""
+        return not all(session.idle for session in self.sessions)
 
     @staticmethod
     def _waits(session: Session) -> bool:

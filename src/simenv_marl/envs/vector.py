@@ -21,6 +21,7 @@ from ..errors import (
     NotResetError,
     OptionValueError,
     ReentrancyError,
+    shown,
 )
 from .batches import Actions, Batch
 from .gymnasium_base import OneAgentView
@@ -191,7 +192,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             return numbers, options
         mask = options["reset_mask"]
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
-            raise OptionValueError(f"reset_mask must be a bool array of shape ({self.num_envs},), not {mask!r}")
+            raise OptionValueError(f"reset_mask must be a bool array of shape ({self.num_envs},), not {shown(mask)}")
         chosen: list[int] = np.flatnonzero(mask).tolist()
         if not chosen:
             raise OptionValueError("reset_mask names no simulation that is to be reset")
@@ -328,7 +329,7 @@ def _column(key: str, indices: list[int], values: list[Any], number: int) -> Any
 
 def _count(value: Any, name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise OptionValueError(f"{name} must be an integer of at least {least}, not {value!r}")
+        raise OptionValueError(f"{name} must be an integer of at least {least}, not {shown(value)}")
     return int(value)
 
 
@@ -337,5 +338,6 @@ def _mode(mode: Any) -> AutoresetMode:
         return AutoresetMode(mode)
     except ValueError:
         raise OptionValueError(
-            f"autoreset_mode must be one of {', '.join(repr(known.value) for known in AutoresetMode)}, not {mode!r}"
+            f"autoreset_mode must be one of {', '.join(repr(known.value) for known in AutoresetMode)}, not"
+            f" {shown(mode)}"
         ) from None

@@ -21,7 +21,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate
 
 from ..core.processes import pack_plainly, unpack_error
-from ..errors import OptionValueError, WorkerError, annotate, warn_user
+from ..errors import OptionValueError, WorkerError, annotate, shown, told, warn_user
 from .rows import SubEnvironments, Told
 from .worker import EXIT, Recipe, is_shareable, share_memory, shared_batch, work
 
@@ -175,7 +175,7 @@ class Workers:
             self._recipe = pack_plainly(recipe.spelt_out(common))
         except Exception as error:
             raise OptionValueError(
-                f"what the simulations are made of cannot be sent to another process ({type(error).__name__}: {error});"
+                f"what the simulations are made of cannot be sent to another process ({told(error)});"
                 " give a class or a factory that a module holds, or workers=0"
             ) from error
         self._memory = share_memory(self._space, number, self._context)
@@ -360,7 +360,7 @@ class Workers:
 
     @property
     def suspended(self) -> bool:
-        """Whether a simulation still waits for an action here: none does."""
+        """Whether something is still to be ended here: nothing is."""
         return False
 
     def abandon(self) -> None:
@@ -385,8 +385,8 @@ def _context(context: Any) -> Any:
         except ValueError:
             raise OptionValueError(
                 f"context must be one of {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
-                f" of multiprocessing, not {context!r}"
+                f" of multiprocessing, not {shown(context)}"
             ) from None
     if not hasattr(context, "Process"):
-        raise OptionValueError(f"context must be a name or a context of multiprocessing, not {context!r}")
+        raise OptionValueError(f"context must be a name or a context of multiprocessing, not {shown(context)}")
     return context

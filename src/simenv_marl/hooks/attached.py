@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import inspect
-import reprlib
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from ..errors import HandlerError, annotate
+from ..errors import HandlerError, annotate, notes_of, shown
 from ..simulation import takes
 
 CALLS: Final = ("before", "after", "instead")
@@ -18,18 +17,10 @@ _MOST: Final = 12
 
 _NOTHING: Final = object()
 
-_repr = reprlib.Repr()
-_repr.maxother = _repr.maxstring = 60
-
-
-def short(value: Any) -> str:
-    """What a value looks like, in short."""
-    return _repr.repr(value)
-
 
 def title(key: Any) -> str:
     """What to call what a user has named."""
-    return key if isinstance(key, str) else getattr(key, "__qualname__", repr(key))
+    return key if isinstance(key, str) else getattr(key, "__qualname__", None) or shown(key)
 
 
 class ChangedArgs:
@@ -73,7 +64,7 @@ class Call:
     @classmethod
     def of(cls, target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
         """The entry of a call that begins."""
-        given = [short(value) for value in args] + [f"{name}={short(value)}" for name, value in kwargs.items()]
+        given = [shown(value, 60) for value in args] + [f"{name}={shown(value, 60)}" for name, value in kwargs.items()]
         return cls(target, ", ".join(given))
 
 
@@ -98,11 +89,11 @@ class Attached:
             known = position in CALLS + ITEMS
             why = f"{target.name} {target.nature}" if known else "there is no such position"
             raise HandlerError(
-                f"no handler can be attached {position!r} {target.name}: {why}; its positions are"
+                f"no handler can be attached {shown(position)} {target.name}: {why}; its positions are"
                 f" {', '.join(target.positions)}"
             )
         if not callable(handler):
-            raise HandlerError(f"the handler of {target.name} must be callable, not {handler!r}")
+            raise HandlerError(f"the handler of {target.name} must be callable, not {shown(handler)}")
         self.handler, self.target, self.position = handler, target, position
         self._wants_result = position.startswith("after") and takes(handler, "_result")
         self._moved = self._fit(target.signature)
@@ -172,7 +163,7 @@ class Attached:
         if isinstance(error, StopIteration) and self.position == "instead_next":
             return  # that is how items end
         note = f"simenv_marl: in the handler {title(self.handler)}, attached {self.position} {self.target.name}"
-        if note not in getattr(error, "__notes__", ()):
+        if note not in notes_of(error):
             annotate(error, note)
 
 

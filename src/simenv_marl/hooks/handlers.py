@@ -15,7 +15,8 @@ from itertools import count
 from typing import Any, Final
 from weakref import WeakSet
 
-from .attached import CALLS, ITEMS, Attached, Call, ChangedArgs, ChangedResult, short
+from ..errors import shown
+from .attached import CALLS, ITEMS, Attached, Call, ChangedArgs, ChangedResult
 from .stacks import Taker, plugins_at_work
 
 Slot = dict[Any, "Handlers"]
@@ -126,7 +127,7 @@ class _Recording:
         return self._results
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        result = short(self._results[0]) if error is None else f"raised {short(error)}"
+        result = shown(self._results[0], 60) if error is None else f"raised {shown(error, 60)}"
         for call in self._calls:
             call.result = result
 
@@ -269,15 +270,15 @@ class Target:
         """Whether something else has been set in its place, while nothing was set there for it."""
         return False
 
-    def hold(self) -> None:
-        """Be set where it has to be, until as many calls of ``let_go``.
+    def hold(self, holder: object) -> None:
+        """Be set where it has to be until ``let_go``, by all who hold it.
 
         Raises:
             PatchError: A place refuses.
         """
 
-    def let_go(self) -> None:
-        """Undo one ``hold``."""
+    def let_go(self, holder: object) -> None:
+        """Undo ``hold``. After an interrupt it is to be called again."""
 
     def add(self, attached: Attached | Record, plugins: Any = None) -> None:
         """Attach a handler, for the whole process or for an environment's plugins; or have all calls recorded.
@@ -285,27 +286,30 @@ class Target:
         Raises:
             PatchError: What it has to be set in front of cannot be patched.
         """
-        self.hold()
-        if not isinstance(attached, Attached):
-            self._recorders.append(attached)
-        elif plugins is None:
-            self.attached.append(attached)
-        else:
-            self._of_environments.setdefault(plugins, []).append(attached)
-        self._make_ready()
+        try:
+            self.hold(attached)
+            if not isinstance(attached, Attached):
+                self._recorders.append(attached)
+            elif plugins is None:
+                self.attached.append(attached)
+            else:
+                self._of_environments.setdefault(plugins, []).append(attached)
+            self._make_ready()
+        except BaseException:
+            self.remove(attached, plugins)
+            raise
 
     def remove(self, attached: Attached | Record, plugins: Any = None) -> None:
-        """Undo one ``add``."""
-        if not isinstance(attached, Attached):
-            self._recorders.remove(attached)
-        elif plugins is None:
-            self.attached = [other for other in self.attached if other is not attached]
+        """Undo ``add``. After an interrupt it is to be called again."""
+        self._recorders = [other for other in self._recorders if other is not attached]
+        self.attached = [other for other in self.attached if other is not attached]
+        left = [other for other in self._of_environments.get(plugins, ()) if other is not attached]
+        if left:
+            self._of_environments[plugins] = left
         else:
-            left = [other for other in self._of_environments.pop(plugins) if other is not attached]
-            if left:
-                self._of_environments[plugins] = left
+            self._of_environments.pop(plugins, None)
         self._make_ready()
-        self.let_go()
+        self.let_go(attached)
 
     def _make_ready(self) -> None:
         self._changes += 1

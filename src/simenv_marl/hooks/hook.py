@@ -274,7 +274,8 @@ class Hook(Target):
         self.place = place
         self.for_good = place is None
         self.point: Any = None
-        self._users = 0
+        self._holders: set[object] = set()
+        self._stands = False
         self._set: FunctionType | None = None  # the stand-in that is set for a while
         iterates = self.kind == "generator"
         super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is no generator function", signature)
@@ -311,38 +312,35 @@ class Hook(Target):
     @property
     def stale(self) -> bool:
         """Whether something else has been set in its place, while nothing was set there for it."""
-        return self.place is not None and self._users == 0 and not self.place.is_free(self)
+        return self.place is not None and not self._holders and not self.place.is_free(self)
 
-    def hold(self) -> None:
-        """Have a stand-in set in its place until as many calls of ``let_go``.
+    def hold(self, holder: object) -> None:
+        """Have a stand-in set in its place until ``let_go``, by all who hold it.
 
         Raises:
             PatchError: The place refuses, or something else has been set there meanwhile.
         """
         with LOCK:
-            # Counted at once: the collector may come in between and close an environment that holds it, too.
-            self._users += 1
-            if self._users > 1 or self.place is None:
+            # Noted at once: the collector may come in between and close an environment that holds it, too.
+            self._holders.add(holder)
+            if self._stands or self.place is None:
                 return
             try:
                 if self._set is None:
                     self._set = self.stand_in()
                 self.place.put(self, self._set)
+                self._stands = True
             except BaseException:
-                self.let_go()
+                self.let_go(holder)
                 raise
 
-    def let_go(self) -> None:
-        """Undo one ``hold``; the last one puts back what stood there."""
+    def let_go(self, holder: object) -> None:
+        """Undo ``hold``; the last one puts back what stood there. After an interrupt it is to be called again."""
         with LOCK:
-            self._users -= 1
-            if self._users or self.place is None or self._set is None:
-                return
-            try:
+            self._holders.discard(holder)
+            if not self._holders and self.place is not None and self._set is not None:
+                self._stands = False
                 self.place.put_back(self._set)
-            except BaseException:  # an interrupt has come in between
-                self.place.put_back(self._set)
-                raise
 
     # -- who takes part ---------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -17,7 +17,7 @@ from types import FunctionType, MethodType, ModuleType
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
-from ..errors import PatchError
+from ..errors import PatchError, shown
 from .attached import title
 from .hook import Hook, beneath, hook_of
 from .stacks import LOCK
@@ -110,7 +110,7 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
         if isinstance(function.__self__, type) and isinstance(function.__func__, FunctionType):
             return function.__func__, classmethod
         raise PatchError(
-            f"{function!r} is bound to one object; name the function of its class,"
+            f"{shown(function)} is bound to one object; name the function of its class,"
             f" {type(function.__self__).__name__}.{function.__name__}"
         )
     elif isinstance(function, FunctionType):
@@ -123,7 +123,7 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
         if isinstance(held, staticmethod) and held.__func__ is function:
             return function, staticmethod
         return function, None
-    raise PatchError(f"{function!r} is no function written in Python")
+    raise PatchError(f"{shown(function)} is no function written in Python")
 
 
 def leads_there(name: str) -> bool:
@@ -314,6 +314,45 @@ def hook_at(name: str, owner: Any, attribute: str, purpose: Purpose) -> Hook:
                 place.rule, name, bound=place.binding is not staticmethod, like=plain(held), place=place
             )
         return hook
+
+
+class Held:
+    """What is set in a model: until ``let_go``, and no longer than this object lives.
+
+    Attributes:
+        whole: Whether nothing of it was put back.
+    """
+
+    _patches: Any = ()  # until it is made
+
+    def __init__(self, patches: Iterable[Any]) -> None:
+        """Set it.
+
+        Args:
+            patches: Each with ``hold`` and ``let_go``.
+
+        Raises:
+            PatchError: A place refuses, and nothing is set.
+        """
+        self._holder, self._patches = object(), list(patches)
+        self.whole = True
+        try:
+            for patch in self._patches:
+                patch.hold(self._holder)
+        except BaseException:
+            self.let_go()
+            raise
+
+    def let_go(self) -> None:
+        """Put back what stood there. After an interrupt it is to be called again, or does so itself when it is gone."""
+        self.whole = False
+        while self._patches:
+            self._patches[-1].let_go(self._holder)
+            self._patches.pop()
+
+    def __del__(self) -> None:
+        if self._patches:
+            self.let_go()
 
 
 def stays(hook: Hook) -> None:

@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
-from ..errors import HandlerError, SimEnvError
+from ..errors import HandlerError, SimEnvError, shown
 from .attached import Attached, Call, title
 from .handlers import Target
 from .hook import Hook
-from .places import leads_there
+from .places import Held, leads_there
 from .stacks import LOCK
 from .targets import at_hand, expose, find_target
 
@@ -85,14 +85,8 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed, and cannot be patched.
     """
     with LOCK:
-        _attach(handler, target, position)
-
-
-def _attach(handler: Any, target: Any, position: str) -> Attached:
-    found = find_target(target)
-    attached = Attached(handler, found, position)
-    found.add(attached)
-    return attached
+        attached = _attachable((handler, target, position))
+        attached.target.add(attached)
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
@@ -113,7 +107,7 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
         if not there:
             what = "no handler" if handler is None else f"{title(handler)} not"
             at = ", ".join(sorted({a.position for a in found.attached})) or "nowhere"
-            raise HandlerError(f"{what} attached {position!r} {found.name}; handlers are attached: {at}")
+            raise HandlerError(f"{what} attached {shown(position)} {found.name}; handlers are attached: {at}")
         for attached in there if handler is None else there[-1:]:
             found.remove(attached)
 
@@ -128,35 +122,68 @@ def handlers(*entries: Entry) -> Iterator[None]:
     Raises:
         SimEnvError: As ``attach_handler``; none is attached then.
     """
-    done: list[Attached] = []
+    with LOCK:
+        attached = [_attachable(entry) for entry in entries]
+        held = Held([_Added([(own.target, own) for own in attached])])
     try:
-        with LOCK:
-            for entry in entries:
-                done.append(_attach(*checked_entry(entry)))
         yield
     finally:
-        with LOCK:
-            for attached in reversed(done):
-                if any(own is attached for own in attached.target.attached):  # not removed meanwhile
-                    attached.target.remove(attached)
+        held.let_go()
 
 
-def checked_entry(entry: Any) -> Entry:
-    """What is to be attached where, if it is of that form.
+def _attachable(entry: Any) -> Attached:
+    """A handler that fits its target.
 
     Raises:
-        HandlerError: It is not.
+        SimEnvError: As ``attach_handler``.
     """
     if not isinstance(entry, (tuple, list)) or len(entry) != 3:
-        raise HandlerError(f"handlers are given as (handler, target, position), not {entry!r}")
+        raise HandlerError(f"handlers are given as (handler, target, position), not {shown(entry)}")
     handler, target, position = entry
-    return handler, target, position
+    return Attached(handler, find_target(target), position)
 
 
 # -- of one environment ---------------------------------------------------------------------------
 
 
-class Plugins:
+class _Added:
+    """What is added to targets for as long as it is held."""
+
+    _key: Any = None
+    """Under which targets know it; None: it is for the whole process."""
+
+    def __init__(self, added: list[tuple[Target, Any]]) -> None:
+        self._added, self._holders, self._stands = added, set[object](), False
+
+    def hold(self, holder: object) -> None:
+        """Have it added until ``let_go``, by all who hold it.
+
+        Raises:
+            PatchError: A target cannot be patched.
+        """
+        with LOCK:
+            self._holders.add(holder)
+            if self._stands:
+                return
+            try:
+                for target, added in self._added:
+                    target.add(added, self._key)
+                self._stands = True
+            except BaseException:
+                self.let_go(holder)
+                raise
+
+    def let_go(self, holder: object) -> None:
+        """Undo ``hold``. After an interrupt it is to be called again."""
+        with LOCK:
+            self._holders.discard(holder)
+            if not self._holders:
+                self._stands = False
+                for target, added in reversed(self._added):
+                    target.remove(added, self._key)
+
+
+class Plugins(_Added):
     """The handlers of the environments of one plan. Also the key under which targets know them, and an ``Evaluation``.
 
     Attributes:
@@ -171,14 +198,17 @@ class Plugins:
         Raises:
             SimEnvError: As ``attach_handler``.
         """
-        self._attached: list[Attached] = []
         self._given: list[Any] = []
-        self._users = 0
+        self._attached: list[Attached] = []
         with LOCK:
             for entry in entries:
-                handler, target, position = checked_entry(entry)
-                self._given.append(target)
-                self._attached.append(Attached(handler, find_target(target), position))
+                self._attached.append(_attachable(entry))
+                self._given.append(entry[1])
+        super().__init__([(attached.target, attached) for attached in self._attached])
+
+    @property
+    def _key(self) -> Plugins:
+        return self
 
     @property
     def plugins(self) -> Plugins:
@@ -208,35 +238,6 @@ class Plugins:
         """The hooks of functions that have handlers."""
         return list({id(a.target): a.target for a in self._attached if isinstance(a.target, Hook)}.values())
 
-    def hold(self) -> None:
-        """Have the handlers attached until as many calls of ``let_go``.
-
-        Raises:
-            PatchError: A target cannot be patched.
-        """
-        with LOCK:
-            self._users += 1
-            if self._users > 1:
-                return
-            done = []
-            try:
-                for attached in self._attached:
-                    attached.target.add(attached, self)
-                    done.append(attached)
-            except BaseException:
-                self._users = 0
-                for attached in done:
-                    attached.target.remove(attached, self)
-                raise
-
-    def let_go(self) -> None:
-        """Undo one ``hold``."""
-        with LOCK:
-            self._users -= 1
-            if self._users == 0:
-                for attached in reversed(self._attached):
-                    attached.target.remove(attached, self)
-
 
 # -- seeing what happens --------------------------------------------------------------------------
 
@@ -263,19 +264,13 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
         calls.append(call)
         return call
 
-    done: list[Target] = []
+    with LOCK:
+        found = dict.fromkeys(map(find_target, targets) if targets else _everything())
+        held = Held([_Added([(target, record) for target in found if isinstance(target, Hook)])])
     try:
-        with LOCK:
-            for target in dict.fromkeys(map(find_target, targets) if targets else _everything()):
-                if not isinstance(target, Hook):
-                    continue
-                target.add(record)
-                done.append(target)
         yield calls
     finally:
-        with LOCK:
-            for target in done:
-                target.remove(record)
+        held.let_go()
 
 
 def _everything() -> Iterator[Target]:

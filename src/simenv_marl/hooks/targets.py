@@ -11,7 +11,7 @@ from types import FunctionType, MethodType
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
-from ..errors import PatchError, SimEnvError, UnknownTargetError
+from ..errors import PatchError, SimEnvError, UnknownTargetError, shown
 from .attached import ITEMS, title
 from .handlers import Items, Target, next_item
 from .hook import Hook, beneath, hook_of
@@ -56,18 +56,18 @@ class NamedIterable(IterableTarget):
 
         super().__init__(name)
         self._owner, self._attribute, self._iterable = owner, attribute, iterable
-        self._proxy, self._users = proxy(iterable, self), 0
+        self._proxy, self._holders = proxy(iterable, self), set[object]()
 
-    def hold(self) -> None:
-        """Have the proxy set until as many calls of ``let_go``."""
-        if self._users == 0:
+    def hold(self, holder: object) -> None:
+        """Have the proxy set until ``let_go``, by all who hold it."""
+        self._holders.add(holder)
+        if len(self._holders) == 1:
             setattr(self._owner, self._attribute, self._proxy)
-        self._users += 1
 
-    def let_go(self) -> None:
-        """Undo one ``hold``."""
-        self._users -= 1
-        if self._users == 0 and vars(self._owner).get(self._attribute) is self._proxy:
+    def let_go(self, holder: object) -> None:
+        """Undo ``hold``. After an interrupt it is to be called again."""
+        self._holders.discard(holder)
+        if not self._holders and vars(self._owner).get(self._attribute) is self._proxy:
             setattr(self._owner, self._attribute, self._iterable)
 
 
@@ -91,22 +91,19 @@ class ClassTarget(IterableTarget):
         """Whether something else has been set in its place, while nothing was set there for it."""
         return any(hook.stale for hook, _ in self._hooks)
 
-    def hold(self) -> None:
-        """Be set where it has to be, until as many calls of ``let_go``."""
-        done: list[Hook] = []
+    def hold(self, holder: object) -> None:
+        """Be set where it has to be until ``let_go``, by all who hold it."""
         try:
             for hook, _ in self._hooks:
-                hook.hold()
-                done.append(hook)
+                hook.hold(holder)
         except BaseException:
-            for hook in done:
-                hook.let_go()
+            self.let_go(holder)
             raise
 
-    def let_go(self) -> None:
-        """Undo one ``hold``."""
+    def let_go(self, holder: object) -> None:
+        """Undo ``hold``. After an interrupt it is to be called again."""
         for hook, _ in self._hooks:
-            hook.let_go()
+            hook.let_go(holder)
 
     def _changed(self) -> None:
         for hook, wrap in self._hooks:
@@ -162,7 +159,7 @@ def expose(thing: Any) -> Any:
         target = _class_target(thing)
         if not target.exposed:
             target.exposed = True
-            target.hold()
+            target.hold(target)
             target._changed()
             thing.__simenv_marl_items__ = target  # type: ignore[attr-defined]
         return thing
@@ -178,7 +175,7 @@ def expose(thing: Any) -> Any:
         hook = Hook(thing, f"{getattr(thing, '__module__', None) or '?'}.{title(thing)}")
         hook.exposed = True
         return hook.stand_in()
-    raise PatchError(f"{thing!r} cannot be exposed to plugins: it is neither a function nor an iterable")
+    raise PatchError(f"{shown(thing)} cannot be exposed to plugins: it is neither a function nor an iterable")
 
 
 def _expose_function(thing: Any) -> Any:
@@ -239,8 +236,8 @@ def find_target(target: Any) -> Target:
         return found
     if not isinstance(target, (staticmethod, classmethod, FunctionType, MethodType)):
         raise PatchError(
-            f"no handlers can be attached to {target!r}: expose it to plugins, and name what that returns; or give its"
-            " dotted name"
+            f"no handlers can be attached to {shown(target)}: expose it to plugins, and name what that returns; or give"
+            " its dotted name"
         )
     function, _ = unbind(target)
     hook = hook_of(function)

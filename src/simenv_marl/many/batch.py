@@ -21,7 +21,7 @@ from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.stacking import rows, stacker
 from ..decision import DecisionPoint
-from ..errors import InvalidActionError, annotate
+from ..errors import InvalidActionError, annotate, shown
 from ..hooks.stacks import outside_simulation
 from ..simulation import RULE, positional
 
@@ -170,7 +170,7 @@ class Group:
                 answers, extras = answers
             actions = [RULE] * len(waiting) if answers is RULE else rows(answers, integers=self._discrete)
             if actions is None or len(actions) != len(waiting):
-                returned = repr(answers) if actions is None else f"{len(actions)} actions"
+                returned = shown(answers) if actions is None else f"{len(actions)} actions"
                 raise InvalidActionError(
                     f"{asked!r} was asked for {len(waiting)} decisions at once and has returned {returned}; it is to"
                     " return as many actions, in their order, for observations whose first axis counts the decisions"
@@ -348,6 +348,6 @@ class _Batches:
                 annotate(
                     error,
                     f"simenv_marl: and the simulation of seed {self._seeds[place]}, when it was unwound, raised"
-                    f" {problem!r}",
+                    f" {shown(problem)}",
                 )
         self._sessions.clear()

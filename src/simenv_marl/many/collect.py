@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.plan import Plan
 from ..core.session import checked_seed
-from ..errors import OptionValueError
+from ..errors import OptionValueError, shown
 from ..simulation import RULE
 from .batch import PolicyKey, Watcher, policy_keys, run
 from .spread import progress_bar, spread
@@ -234,7 +234,7 @@ def _collect(
 
 def _checked_seeds(seeds: Any) -> list[int]:
     if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
-        raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {seeds!r}")
+        raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {shown(seeds)}")
     checked = []
     for seed in seeds:
         if seed is None:
@@ -245,17 +245,17 @@ def _checked_seeds(seeds: Any) -> list[int]:
 
 def _checked_policies(policies: Any) -> Mapping[Any, Any]:
     if policies is not None and not isinstance(policies, Mapping):
-        raise OptionValueError(f"policies must be a dict from agents or points to callables, not {policies!r}")
+        raise OptionValueError(f"policies must be a dict from agents or points to callables, not {shown(policies)}")
     return policies or {}
 
 
 def _check_collect(collect: Any) -> None:
     if collect is not None and not callable(collect):
-        raise OptionValueError(f"collect must be a callable of a simulation, or None, not {collect!r}")
+        raise OptionValueError(f"collect must be a callable of a simulation, or None, not {shown(collect)}")
 
 
 def _check_numbers(batch_size: Any, workers: Any) -> None:
     for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as there are"
-            raise OptionValueError(f"{name} must be {what}, not {value!r}")
+            raise OptionValueError(f"{name} must be {what}, not {shown(value)}")

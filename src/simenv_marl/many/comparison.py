@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.stacking import stacker
-from ..errors import OptionValueError
+from ..errors import OptionValueError, shown
 from ..simulation import RULE
 from .batch import BatchPolicy
 from .collect import collect_episodes
@@ -81,11 +81,11 @@ def compare_with_rule(
         SimEnvError: As ``collect_episodes`` does; so are all other errors.
     """
     if not isinstance(policies, Mapping) or not all(callable(policy) for policy in policies.values()):
-        raise OptionValueError(f"policies must be a dict from agents or points to callables, not {policies!r}")
+        raise OptionValueError(f"policies must be a dict from agents or points to callables, not {shown(policies)}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
-        raise OptionValueError(f"tolerance must be a number that is not negative, not {tolerance!r}")
+        raise OptionValueError(f"tolerance must be a number that is not negative, not {shown(tolerance)}")
     if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
-        raise OptionValueError(f"others must be a dict of policies for those who are not compared, not {others!r}")
+        raise OptionValueError(f"others must be a dict of policies for those who are not compared, not {shown(others)}")
     by_rule = dict.fromkeys(policies, RULE)
     checked = {name: value for name, value in options.items() if name not in PLAYING}
     check_knowable(simulation, {**by_rule, **(others or {})}, by_rule, points, checked)

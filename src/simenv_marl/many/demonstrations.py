@@ -15,7 +15,7 @@ import numpy as np
 
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
-from ..errors import MissingExtraError, OptionValueError
+from ..errors import MissingExtraError, OptionValueError, shown
 from .collect import collect_episodes
 from .mixture import name_of
 from .rule_actions import check_knowable, check_known
@@ -58,7 +58,8 @@ def record_dataset(
         **options: As ``aec_env`` takes them.
 
     Returns:
-        The ``minari.MinariDataset``; where ``dataset_id`` is a dict, a dict of these.
+        The ``minari.MinariDataset``; where ``dataset_id`` is a dict, a dict of these. An error or an interrupt leaves
+        none of them behind.
 
     Raises:
         OptionValueError: There is such a data set already, or an argument cannot have its value.
@@ -67,7 +68,7 @@ def record_dataset(
         SimEnvError: As ``collect_episodes`` does; so are all other errors.
     """
     if not isinstance(policies, Mapping) or not policies:
-        raise OptionValueError(f"policies must be a dict from agents or points to policies, not {policies!r}")
+        raise OptionValueError(f"policies must be a dict from agents or points to policies, not {shown(policies)}")
     names = _dataset_ids(dataset_id, policies)
     _check_free(names.values())
     check_knowable(simulation, policies, names, points, options)
@@ -76,11 +77,17 @@ def record_dataset(
     for key, name in names.items():
         _check_writable(name, collected[key])
     origin = provenance(simulation, points, **options)
-    written = {}
-    for key, name in names.items():
-        given = {"algorithm_name": name_of(policies[key]), **(metadata or {})}
-        written[key] = save_dataset(name, collected[key], **given)
-        written[key].storage.update_metadata({"provenance": origin})
+    written, begun = {}, list[Any]()
+    try:
+        for key, name in names.items():
+            begun += _check_free([name])
+            given = {"algorithm_name": name_of(policies[key]), **(metadata or {})}
+            written[key] = save_dataset(name, collected[key], **given)
+            written[key].storage.update_metadata({"provenance": origin})
+    except BaseException:
+        for path in begun:
+            shutil.rmtree(path, ignore_errors=True)  # all of them or none
+        raise
     return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
 
 
@@ -97,12 +104,12 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]
         or not dataset_id
         or not all(isinstance(n, str) for n in dataset_id.values())
     ):
-        raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {dataset_id!r}")
+        raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {shown(dataset_id)}")
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
-        raise OptionValueError(f"dataset_id names {unknown[0]!r}, for whom there is no policy")
+        raise OptionValueError(f"dataset_id names {shown(unknown[0])}, for whom there is no policy")
     if len(set(dataset_id.values())) < len(dataset_id):
-        raise OptionValueError(f"each policy needs a data set of its own: {dict(dataset_id)!r}")
+        raise OptionValueError(f"each policy needs a data set of its own: {shown(dict(dataset_id))}")
     return dict(dataset_id)
 
 
@@ -132,7 +139,8 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
     """
     if not isinstance(trajectories, Trajectories):
         raise OptionValueError(
-            f"{dataset_id!r} is to be made of what collect_episodes has returned under one key, not of {trajectories!r}"
+            f"{shown(dataset_id)} is to be made of what collect_episodes has returned under one key, not of"
+            f" {shown(trajectories)}"
         )
     (path,) = _check_free([dataset_id])
     _check_writable(dataset_id, trajectories)
@@ -169,11 +177,11 @@ def _check_free(names: Iterable[str]) -> list[Any]:
         try:
             parse_dataset_id(name)
         except (TypeError, ValueError):
-            raise OptionValueError(f'{name!r} is no name of a data set; "namespace/name-v0" is one') from None
+            raise OptionValueError(f'{shown(name)} is no name of a data set; "namespace/name-v0" is one') from None
         paths.append(get_dataset_path(name))
         if paths[-1].exists():
             raise OptionValueError(
-                f"there is a data set {name!r} already, in {paths[-1]}; take another name or version, or delete it"
+                f"there is a data set {shown(name)} already, in {paths[-1]}; take another name or version, or delete it"
                 " with minari.delete_dataset"
             )
     return paths
@@ -181,7 +189,7 @@ def _check_free(names: Iterable[str]) -> list[Any]:
 
 def _check_writable(name: str, found: Trajectories) -> None:
     if not len(found):
-        raise OptionValueError(f"there is nothing to write to {name!r}: no agent has decided in any episode")
+        raise OptionValueError(f"there is nothing to write to {shown(name)}: no agent has decided in any episode")
     check_known(found)
 
 

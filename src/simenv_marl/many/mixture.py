@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.stacking import rows, taken
-from ..errors import InvalidActionError, OptionValueError
+from ..errors import InvalidActionError, OptionValueError, shown
 from ..simulation import RULE
 from .batch import BatchPolicy
 
@@ -38,17 +38,19 @@ class Mixture:
         """
         pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
         if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
-            raise OptionValueError(f"a mixture is a dict from policies to weights, or pairs of these, not {parts!r}")
+            raise OptionValueError(
+                f"a mixture is a dict from policies to weights, or pairs of these, not {shown(parts)}"
+            )
         for policy, weight in pairs:
             if policy is not RULE and not callable(policy):
-                raise OptionValueError(f"a mixture is one of policies, callables or RULE, not of {policy!r}")
+                raise OptionValueError(f"a mixture is one of policies, callables or RULE, not of {shown(policy)}")
             if (
                 isinstance(weight, bool)
                 or not isinstance(weight, (int, float))
                 or not (isfinite(weight) and weight >= 0)
             ):
                 raise OptionValueError(
-                    f"the weight of {policy!r} must be a number that is not negative, not {weight!r}"
+                    f"the weight of {shown(policy)} must be a number that is not negative, not {shown(weight)}"
                 )
         weights = np.array([weight for _, weight in pairs], np.float64)
         if not weights.sum() > 0:
@@ -100,14 +102,14 @@ def actions_of(returned: Any, number: int, policy: Any) -> list[Any]:
         returned = returned[0]
     actions = [RULE] * number if returned is RULE else rows(returned, integers=False)
     if actions is None or len(actions) != number:
-        what = repr(returned) if actions is None else f"{len(actions)} actions"
-        raise InvalidActionError(f"{policy!r} was asked for {number} decisions at once and has returned {what}")
+        what = shown(returned) if actions is None else f"{len(actions)} actions"
+        raise InvalidActionError(f"{shown(policy)} was asked for {number} decisions at once and has returned {what}")
     return actions
 
 
 def name_of(policy: Any) -> str:
     """What a policy is called."""
-    return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or repr(policy))
+    return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or shown(policy))
 
 
 def defers(policy: Any) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionValueError, UnknownAgentError
+from ..errors import OptionValueError, UnknownAgentError, shown
 from .trajectories import Trajectories
 
 CHARTED: Final = 6
@@ -95,7 +95,8 @@ def by_policy(trajectories: Any) -> dict[Any, Trajectories]:
         return {None: trajectories}
     if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):
         raise OptionValueError(
-            f"what is to be drawn is what collect_episodes has returned, a dict of Trajectories, not {trajectories!r}"
+            "what is to be drawn is what collect_episodes has returned, a dict of Trajectories, not"
+            f" {shown(trajectories)}"
         )
     if not trajectories:
         raise OptionValueError("there is nothing to draw: no policy has answered any decision")
@@ -112,7 +113,7 @@ def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
     try:
         place = operator.index(episode)
     except TypeError:
-        raise OptionValueError(f"episode must be the number of an episode, not {episode!r}") from None
+        raise OptionValueError(f"episode must be the number of an episode, not {shown(episode)}") from None
     if not -number <= place < number:
         raise OptionValueError(f"there is no episode {place}, but {number} from 0 on")
     return place % number
@@ -165,13 +166,13 @@ def _rows(key: Any, found: Trajectories, arrays: Sequence[NDArray[Any]], episode
 
 def _chosen(rows: Sequence[Row], agents: Any, episode: int) -> list[Row]:
     if isinstance(agents, str) or not agents:
-        raise OptionValueError(f"agents must be a sequence of names, not {agents!r}")
+        raise OptionValueError(f"agents must be a sequence of names, not {shown(agents)}")
     by_name = {row.name: row for row in rows}
     for name in agents:
         if name not in by_name:
             raise UnknownAgentError(
-                f"{name!r} has not decided in episode {episode}; those who have are {', '.join(list(by_name)[:20])}"
-                f"{' and others' if len(by_name) > 20 else ''}"
+                f"{shown(name)} has not decided in episode {episode}; those who have are"
+                f" {', '.join(list(by_name)[:20])}{' and others' if len(by_name) > 20 else ''}"
             )
     return [by_name[name] for name in dict.fromkeys(agents)]
 
@@ -182,7 +183,7 @@ def _namer(key: Any, action_names: Any) -> Callable[[int], str]:
     if action_names is None:
         return str
     if isinstance(action_names, (str, bytes)) or not isinstance(action_names, (Mapping, Sequence)):
-        raise OptionValueError(f"action_names must be a sequence or a dict of names, not {action_names!r}")
+        raise OptionValueError(f"action_names must be a sequence or a dict of names, not {shown(action_names)}")
     names = action_names if isinstance(action_names, Mapping) else dict(enumerate(action_names))
     return lambda action: str(names.get(action, action))
 
@@ -237,7 +238,7 @@ def coloured_by(panels: Sequence[Panel], component: str | None) -> list[tuple[Le
     ]
     if component is not None and not any(component in own for own in known):
         names = ", ".join(repr(name) for name in dict.fromkeys(name for own in known for name in own))
-        raise OptionValueError(f"no action has a component {component!r}; there are {names}")
+        raise OptionValueError(f"no action has a component {shown(component)}; there are {names}")
     return [own.get(component or "", next(iter(own.values()))) for own in known]
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MissingExtraError, OptionValueError
+from ..errors import MissingExtraError, OptionValueError, shown
 from .plot_data import (
     CHARTED,
     ENDS,
@@ -363,7 +363,7 @@ def plot_returns(
         MissingExtraError: Matplotlib is missing.
     """
     if per not in ("policy", "agent", "team"):
-        raise OptionValueError(f'per must be "policy", "agent" or "team", not {per!r}')
+        raise OptionValueError(f'per must be "policy", "agent" or "team", not {shown(per)}')
     groups = groups_of(collected, per)
     number = sum(len(rows) for rows in groups.values())
     if not number:

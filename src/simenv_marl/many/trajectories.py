@@ -22,7 +22,7 @@ from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.spaces import blank
 from ..core.stacking import empty, joined, stack_masks, stacker, taken
-from ..errors import AgentError, OptionValueError
+from ..errors import AgentError, OptionValueError, shown
 from ..simulation import RULE
 from .batch import Group, PolicyKey
 
@@ -284,8 +284,8 @@ class Ledger:
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(
-                    f"{page.asked!r} has returned {name!r} of shape {array.shape} for {len(actions)} decisions; the"
-                    " first axis is to count them"
+                    f"{page.asked!r} has returned {shown(name)} of shape {array.shape} for {len(actions)} decisions;"
+                    " the first axis is to count them"
                 )
         page.extras.append(arrays)
 
@@ -338,7 +338,7 @@ class Ledger:
             own = [page for page in pages if (page.policies == place).any()]
             if len(own) > 1:
                 raise AgentError(
-                    f"{key!r} has decided at {' and at '.join(page.page.point.point.name for page in own)}, whose"
+                    f"{shown(key)} has decided at {' and at '.join(page.page.point.point.name for page in own)}, whose"
                     " spaces differ; give its policy under the names of the points"
                 )
             tuple_of_seeds = tuple(seeds)

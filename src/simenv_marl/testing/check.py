@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..errors import OptionValueError, SimEnvError
+from ..errors import OptionValueError, SimEnvError, shown
 from .checks import check_plain_runs, check_repeated_run, check_views
 from .conformance import check_conformance, check_timing
 from .episodes import check_early_end, check_episodes
@@ -66,12 +66,12 @@ def check_simulation(
     """
     chosen = tuple(seeds)
     if not chosen or any(isinstance(s, bool) or not isinstance(s, (int, np.integer)) or s < 0 for s in chosen):
-        raise OptionValueError(f"seeds must be non-negative integers, at least one, not {seeds!r}")
+        raise OptionValueError(f"seeds must be non-negative integers, at least one, not {shown(seeds)}")
     for name, number in (("episodes", episodes), ("max_steps", max_steps)):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise OptionValueError(f"{name} must be a positive integer, not {number!r}")
+            raise OptionValueError(f"{name} must be a positive integer, not {shown(number)}")
     if not time_limit > 0:
-        raise OptionValueError(f"time_limit must be a positive number of seconds, not {time_limit!r}")
+        raise OptionValueError(f"time_limit must be a positive number of seconds, not {shown(time_limit)}")
     try:
         with quietly():
             plan = Plan.draw_up(simulation, points, options)

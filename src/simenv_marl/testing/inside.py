@@ -16,6 +16,7 @@ from ..core.rng import GlobalRandom
 from ..core.switch import SimulationExit
 from ..decision import DecisionPoint, Definition
 from ..envs import VIEWS, view_class
+from ..hooks.places import Held
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import make_simulation, resetter
 
@@ -82,7 +83,6 @@ def plain_loop(plan: Plan, *, watched: bool) -> Iterator[tuple[Reset, Main]]:
         A function that resets a simulation with a seed, and one that runs its main loop.
     """
     rng = GlobalRandom() if plan.options.global_rng else None
-    held: list[Any] = []
 
     def reset(simulation: Any, seed: int) -> None:
         if rng is not None:
@@ -98,15 +98,12 @@ def plain_loop(plan: Plan, *, watched: bool) -> Iterator[tuple[Reset, Main]]:
         finally:
             _PLAIN_RUNS.pop()
 
+    held = Held(plan.patches if watched else ())
     try:
-        for patch in plan.patches if watched else ():
-            patch.hold()
-            held.append(patch)
         with at_work(plan.plugins, rng):
             yield reset, main
     finally:
-        for patch in reversed(held):
-            patch.let_go()
+        held.let_go()
 
 
 @contextmanager

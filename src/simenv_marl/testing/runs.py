@@ -22,6 +22,7 @@ from zlib import crc32
 
 import numpy as np
 
+from ..errors import text_of
 from ..simulation import RULE
 from .fingerprint import Fingerprint, alike, brief, shown
 from .inside import MASK, Plan, SimulationExit, make_simulation, outside_simulation, plain_loop, watching_rules
@@ -313,7 +314,7 @@ def random_steps(env: Any, seed: int, salt: int = 0) -> Iterator[Step]:
         if not (told[2] or told[3]):
             if agent not in spaces:
                 spaces[agent] = copy.deepcopy(env.action_space(agent))
-                spaces[agent].seed(crc32(f"{seed} {agent} {salt}".encode()))
+                spaces[agent].seed(crc32(f"{seed} {agent} {salt}".encode(errors="surrogatepass")))
             mask = told[4].get(MASK)
             action = spaces[agent].sample() if mask is None else spaces[agent].sample(mask)
         yield Step(agent, told, action)
@@ -339,7 +340,7 @@ def culprit(error: BaseException) -> str:
 
 def error_in_words(error: BaseException, most: int = 300) -> str:
     """An error with its kind, the first lines of its text, and where it was raised."""
-    text, place = " ".join(str(error).split()), culprit(error)
+    text, place = " ".join(text_of(error).split()), culprit(error)
     text = text if len(text) <= most else f"{text[: most - 4]} ..."
     return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
 

@@ -14,6 +14,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import HumanRendering
 from pettingzoo.test import api_test, parallel_api_test
 
 from simenv_marl import (
@@ -536,3 +537,49 @@ def test_what_is_registered_of_the_joint_view_holds_and_may_be_changed(register,
         envs = gymnasium.make_vec(joint, num_envs=2, **given).unwrapped
         assert isinstance(envs.single_action_space, spaces.Box) is expected
         envs.close()
+
+
+# -- what gymnasium's makers hand on --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("identity", [*SINGLES, JOINT])
+def test_make_vec_limits_episodes(identity):
+    env = gymnasium.make_vec(identity, num_envs=2, max_episode_steps=2)
+    env.reset(seed=1)
+    for truncated in (False, True):
+        *_, truncations, _ = env.step(env.action_space.sample())
+        assert truncations.tolist() == [truncated] * 2
+    env.close()
+    shorter = gymnasium.make_vec(identity, num_envs=1, max_episode_steps=9, max_steps=1)
+    shorter.reset(seed=1)
+    assert shorter.step(shorter.action_space.sample())[3].tolist() == [True]
+    shorter.close()
+
+
+@pytest.mark.parametrize("identity", [*SINGLES, JOINT])
+def test_modes_that_the_simulation_lacks_are_made_up_for(identity):
+    env = gymnasium.make(identity, render_mode="rgb_array_list")
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    frames = env.render()
+    assert [frame.shape for frame in frames] == [(8, 8, 3)] * 2
+    assert env.render() == []
+    again = gymnasium.make(env.spec)
+    again.reset(seed=1)
+    assert len(again.render()) == 1
+    with pytest.raises(OptionValueError, match="depth_array"):
+        made(identity, render_mode="depth_array")
+
+
+def test_pictures_for_people_are_made_of_arrays(register, monkeypatch):
+    class Pictured(Voyage):
+        render_modes = ("rgb_array",)
+
+    shown = []
+    monkeypatch.setattr(HumanRendering, "_render_frame", lambda env: shown.append(env.env.render().shape))
+    ids = register(Pictured, name="pictured")
+    env = gymnasium.make(ids[0], render_mode="human")
+    assert env.render_mode == "human"
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    assert shown == [(8, 8, 3)] * 2

@@ -12,7 +12,7 @@
     |-- AgentError           (ValueError)    names of agents that clash or are none
     |-- UnknownAgentError    (LookupError)   an agent that the environment does not know
     |-- ViewError            (ValueError)    a view that these decision points do not allow
-    |-- CopyError            (TypeError)     an environment that was to be copied in mid-episode
+    |-- CopyError            (TypeError)     a vector environment that was to be copied
     |-- BranchError          (RuntimeError)  a branch of an episode that could not be made, or died
     |-- UnknownOptionError   (TypeError)     an option that does not exist
     |-- OptionValueError     (ValueError)    an option that cannot have this value
@@ -182,7 +182,7 @@ class ViewError(SimEnvError, ValueError):
 
 
 class CopyError(SimEnvError, TypeError):
-    """An environment was to be copied or pickled in mid-episode."""
+    """A vector environment was to be copied or pickled."""
 
 
 class BranchError(SimEnvError, RuntimeError):

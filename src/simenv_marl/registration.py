@@ -10,10 +10,11 @@ from typing import Any
 
 import gymnasium
 import pettingzoo
+from gymnasium.wrappers import HumanRendering, RenderCollection
 
 from .core.plan import Plan
 from .core.variant import Variant
-from .envs import aec_env, joint_env, parallel_env, single_env, vector_env
+from .envs import aec_env, parallel_env, vector_env, view_class
 from .errors import OptionValueError, UnknownPointError, shown
 from .simulation import RULE
 
@@ -123,14 +124,13 @@ def _recipe(recipe: str, module: str) -> _Recipe:
 def make_single(recipe: str, module: str, point: str, **options: Any) -> Any:
     """The entry point of the single views: all points but one run their rule, or the policy they have."""
     known = _recipe(recipe, module)
-    return single_env(known.simulation, known.points, **_single_options(known, point, options))
+    return _make(known, "single", _single_options(known, point, options))
 
 
 def make_single_vector(recipe: str, module: str, point: str, num_envs: int = 1, **options: Any) -> Any:
     """The entry point of the vector view over such single views."""
     known = _recipe(recipe, module)
-    merged = _single_options(known, point, options)
-    return vector_env(known.simulation, known.points, num_envs=num_envs, view="single", **merged)
+    return _make_vector(known, "single", num_envs, _single_options(known, point, options))
 
 
 def _single_options(known: _Recipe, point: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -145,14 +145,37 @@ def _single_options(known: _Recipe, point: str, options: dict[str, Any]) -> dict
 def make_joint(recipe: str, module: str, **options: Any) -> Any:
     """The entry point of the joint view."""
     known = _recipe(recipe, module)
-    return joint_env(known.simulation, known.points, **{**known.options, "flatten": known.flatten, **options})
+    return _make(known, "joint", {**known.options, "flatten": known.flatten, **options})
 
 
 def make_joint_vector(recipe: str, module: str, num_envs: int = 1, **options: Any) -> Any:
     """The entry point of the vector view over joint views."""
     known = _recipe(recipe, module)
-    merged = {**known.options, "flatten": known.flatten, **options}
-    return vector_env(known.simulation, known.points, num_envs=num_envs, view="joint", **merged)
+    return _make_vector(known, "joint", num_envs, {**known.options, "flatten": known.flatten, **options})
+
+
+def _make(known: _Recipe, view: str, options: dict[str, Any]) -> Any:
+    """Make a Gymnasium view; where the simulation lacks the render mode, with the wrapper that makes up for it.
+
+    Gymnasium itself looks for this in the metadata of classes, which entry points of many simulations cannot have.
+    """
+    mode = options.pop("render_mode", None)
+    plan = Plan.draw_up(known.simulation, known.points, options)
+    wrapper: Any = None
+    if mode not in plan.render_modes and isinstance(mode, str):
+        if mode.endswith("_list") and mode.removesuffix("_list") in plan.render_modes:
+            mode, wrapper = mode.removesuffix("_list"), RenderCollection
+        elif mode == "human" and "rgb_array" in plan.render_modes:
+            mode, wrapper = "rgb_array", HumanRendering
+    env = view_class(plan, view)(plan.amended({"render_mode": mode}))
+    return env if wrapper is None else wrapper(env)
+
+
+def _make_vector(known: _Recipe, view: str, num_envs: int, options: dict[str, Any]) -> Any:
+    """Make a vector view; ``max_episode_steps``, which ``make_vec`` hands on, is what ``max_steps`` is here."""
+    limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
+    options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
+    return vector_env(known.simulation, known.points, num_envs=num_envs, view=view, **options)
 
 
 def make_aec(recipe: str, module: str, **options: Any) -> Any:

@@ -27,6 +27,7 @@ from simenv_marl import (
     trace,
     vector_env,
 )
+from simenv_marl.hooks.stacks import EVALUATING
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play
 
@@ -226,6 +227,7 @@ def cut_short(env, view):
 def nothing_is_left():
     """In this thread nothing runs, and what was patched is as it was."""
     assert nobody_is_asked()
+    assert EVALUATING == {}
     for owner in (Farm, Beast):
         for name, original in ORIGINALS.items():
             if name in vars(owner):

@@ -1,4 +1,4 @@
-"""Environments are copied and pickled between episodes."""
+"""Environments are copied and pickled at any time; what comes out is to be reset."""
 
 import copy
 import pickle
@@ -17,7 +17,8 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from simenv_marl import (
     RULE,
-    CopyError,
+    ClosedError,
+    NotResetError,
     Variant,
     aec_env,
     difference,
@@ -26,7 +27,7 @@ from simenv_marl import (
     parallel_env,
     single_env,
 )
-from tests.worlds.copied import Walk, WalkEnv, blow, define
+from tests.worlds.copied import Walk, WalkEnv, blow, define, learned
 from tests.worlds.many_worlds import beings
 
 ROOT = Path(__file__).parents[2]
@@ -81,24 +82,61 @@ def test_a_copy_goes_on_as_the_original_would(make, copied):
 
 @VIEWS
 @COPIES
-def test_in_mid_episode_it_is_a_clear_error(make, copied):
+def test_a_copy_in_mid_episode_needs_a_reset(make, copied):
     env = make(Walk, Walk.choose)
     env.reset(seed=1)
-    with pytest.raises(CopyError, match=r"between episodes.*branch"):
-        copied(env)
     env.step(RULE)
+    twin = copied(env)
+    assert getattr(twin, "agents", []) == []
+    for _ in range(2):
+        with pytest.raises(NotResetError, match=r"copy.*reset\(\).*branch\(\)"):
+            twin.step(RULE)
+    env.step(RULE)  # where it stood
+    assert twin.simulation is not env.simulation
+    twin.reset(seed=5)
+    twin.step(RULE)
     env.close()
-    copied(env).reset()
+    twin.close()
+    with pytest.raises(ClosedError):
+        twin.step(RULE)
+    assert episode(copied(env), seed=3) == episode(make(Walk, Walk.choose), seed=3)
 
 
-def test_agents_that_have_yet_to_take_leave_are_of_the_episode():
+@VIEWS
+@COPIES
+def test_generators_are_copied_as_they_stand(make, copied):
+    env = make(Walk, Walk.choose)
+    env.reset(seed=1)
+    env.np_random.random(3)
+    twin = copied(env)
+    assert twin.np_random.bit_generator.state == env.np_random.bit_generator.state
+    assert episode(twin) == episode(env)
+
+
+@COPIES
+def test_agents_that_have_yet_to_take_leave_do_not_come_along(copied):
     env = aec_env(Walk(1), Walk.choose)
     env.reset()
     env.step(1)
-    with pytest.raises(CopyError, match="afterwards, or see branch"):
-        copy.deepcopy(env)
+    twin = copied(env)
+    assert twin.agents == []
+    assert env.agents == ["walker_0"]
     env.step(None)
-    copy.deepcopy(env).reset()
+    twin.reset()
+    assert twin.agents == ["walker_0"]
+
+
+@COPIES
+def test_what_learns_from_the_rule_comes_along(copied):
+    """Mappings that are made ready: dicts and callables, of the action and of the rule's decision."""
+    for mapping in (learned, {-1: 0, 1: 2}):
+        point = {Walk.choose: define(agent="walker_0", rule_action_mapping=mapping)}
+        env = single_env(Walk, point)
+        env.reset(seed=1)
+        told = env.step(RULE)[-1]["rule_action"]
+        twin = copied(env)
+        twin.reset(seed=1)
+        assert twin.step(RULE)[-1]["rule_action"] == told
 
 
 @COPIES
@@ -216,6 +254,49 @@ def test_in_another_process_with_all_that_only_this_one_knows():
     second = [sys.executable, "-c", textwrap.dedent(code)]
     ran = subprocess.run(second, input=pickled, capture_output=True, timeout=120, check=False, cwd=ROOT)
     assert ran.stdout.decode().strip() == "one_0 [0.0, 7.0, 7.0, 7.0] 21 10", ran.stderr.decode()
+
+
+def test_plain_pickle_of_a_simulation_of_the_main_module():
+    """As in a script that gives its environments to processes which it has forked, or keeps them in a file."""
+    code = """
+    import pickle
+    from gymnasium import spaces
+    from simenv_marl import aec_env, make_step, single_env
+    from tests.worlds.copied import define, observe, reward, to_step
+
+    class Walk:
+        def reset(self, seed=None):
+            self.place = 0
+        def run(self):
+            for _ in range(3):
+                self.place += self.choose() + self.drift()
+        @define(agent="walker_0")
+        def choose(self):
+            return 1
+        def drift(self):
+            return 0
+
+    for made in (
+        single_env(Walk, Walk.choose),
+        single_env(Walk, "__main__.Walk.choose"),
+        single_env(Walk(), {"__main__.Walk.drift": define(agent="wind_0")}),
+        aec_env(Walk, [Walk.choose]),
+    ):
+        twin = pickle.loads(pickle.dumps(made))
+        twin.reset(seed=1)
+        for _ in range(3):
+            twin.step(2)
+        print(type(twin.unwrapped.simulation) is Walk, twin.unwrapped.simulation.place)
+    """
+    ran = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        capture_output=True,
+        timeout=120,
+        check=False,
+        cwd=ROOT,
+        text=True,
+    )
+    assert ran.stdout.split() == ["True", "3"] * 2 + ["True", "6"] + ["True", "3"], ran.stderr
 
 
 def test_differences_and_spaces_survive():

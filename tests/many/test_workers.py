@@ -338,5 +338,5 @@ def test_a_worker_that_cannot_work_leaves_no_descriptors(what, monkeypatch):
 
     if what == "it cannot be started":
         monkeypatch.setattr(loky.backend.process.LokyProcess, "start", refuse)
-    first = run()  # joblib keeps some for the next time
+    first = max(run(), run())  # joblib keeps some for the next time
     assert min(run(), run()) <= first  # some of it goes a little later

@@ -31,6 +31,11 @@ MANY_ROUNDS: Final = 100
 
 REFUSALS: Final[Mapping[str, tuple[type[Exception], str]]] = {
     "new": (NotResetError, "there is no episode yet; call reset() first"),
+    "copied": (
+        NotResetError,
+        "this is a copy of an environment in mid-episode, and has no episode of its own yet; call reset() first, or see"
+        " branch() for copies that go on from where an environment stands",
+    ),
     "resetting": (
         ReentrancyError,
         "the environment was used from inside its own reset or its simulation's close, or while another thread was"

@@ -66,7 +66,24 @@ def portable(key: Any, name: str | None = None) -> Any:
     if not isinstance(function, FunctionType):
         return key
     name = name or f"{function.__module__}.{function.__qualname__}"
-    return name if leads_there(name) else function
+    if leads_there(name):
+        return name
+    owner, _, attribute = name.removeprefix("__main__.").rpartition(".")
+    found = getattr(modules.get("__main__"), owner, None) if owner.isidentifier() else None
+    return Member(found, attribute) if isinstance(found, type) else function
+
+
+class Member:
+    """Stands for a function of a class of the main module where that is pickled: by the class, in whatever way that is.
+
+    A decision function cannot be pickled for its rule, which is not what is found under its name.
+    """
+
+    def __init__(self, owner: type, name: str) -> None:
+        self._owner, self._name = owner, name
+
+    def __reduce__(self) -> Any:
+        return getattr, (self._owner, self._name)
 
 
 def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[NamedPoint]:

@@ -58,7 +58,7 @@ class Session:
         self.episode: Episode | None = None
         self.np_random_seed: int | None = None
         self._np_random: np.random.Generator | None = None
-        self._closed = False
+        self._closed = self._copied = False
         self._starting = False
         self._open = False  # whether the simulation was reset and not closed since
         self._worn = False  # whether it was given up: what then may still use it is to meet no other episode
@@ -269,14 +269,19 @@ class Session:
         return list(found.values()), loops
 
     def kept(self) -> dict[str, Any]:
-        """What a copy takes over: the latest seed, and the generator."""
-        return {"seed": self.seed, "np_random_seed": self.np_random_seed, "_np_random": self._np_random}
+        """What a copy takes over: the latest seed, the generator, and whether the copy is one in mid-episode."""
+        return {
+            "seed": self.seed,
+            "np_random_seed": self.np_random_seed,
+            "_np_random": self._np_random,
+            "_copied": self.episode is not None and self.episode.pending is not None,
+        }
 
     def refusal(self) -> Exception:
         """The error that says why no action can be taken now."""
         if self.episode is not None:
             return self.episode.refusal()
-        return refusal("closed" if self._closed else "new")
+        return refusal("closed" if self._closed else "copied" if self._copied else "new")
 
     def end(self) -> None:
         """End the episode that runs, if one does.

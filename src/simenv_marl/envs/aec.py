@@ -162,9 +162,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         episode = self._running()
         episode.just_ended = []  # they are in the books already
 
-    def _in_mid_episode(self) -> bool:
-        return super()._in_mid_episode() or bool(self._leaving)  # ended agents are yet to take their None steps
-
     def _clear(self) -> None:
         super()._clear()
         self.agents = []

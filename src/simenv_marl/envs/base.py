@@ -16,7 +16,7 @@ from ..core.plan import Plan
 from ..core.provenance import describe
 from ..core.session import Session
 from ..core.spaces import observation_cast
-from ..errors import CopyError, UnknownOptionError, ViewError
+from ..errors import UnknownOptionError, ViewError
 from ..hooks.plugins import Entry
 
 
@@ -196,42 +196,31 @@ class View:
                 self._clear()
 
     def __deepcopy__(self, memory: dict[int, Any]) -> Any:
-        """Copy it, between episodes: an environment like this one, with a simulation of its own."""
+        """Make an environment like this one, with a simulation of its own, that is to be reset."""
         made = memory[id(self)] = _made_again(type(self), self._made_of)
-        made.__setstate__(copy.deepcopy(self._kept(), memory))
+        made.__setstate__(copy.deepcopy(self._state(), memory))
+        made._clear()
         return made
 
     def __copy__(self) -> Any:
         return copy.deepcopy(self)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Be pickled, between episodes: to an environment like this one, with a simulation of its own."""
+        """Be pickled: to an environment like this one, with a simulation of its own, that is to be reset."""
         made: Any = type(self)
         found: Any = modules.get(made.__module__)
         for name in made.__qualname__.split("."):
             found = getattr(found, name, None)
         if found is not made:  # a class that generate_env has made, and which is not found by its name
             made = next(base for base in made.__mro__ if base.__module__.startswith(__package__))
-        return _made_again, (made, self._made_of), self._kept()
+        return _made_again, (made, self._made_of), self._state(), None, None, _unpickled
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         vars(self._session).update(kept.pop("session"))
         vars(self).update(kept)
 
-    def _kept(self) -> dict[str, Any]:
-        """What a copy takes over.
-
-        Raises:
-            CopyError: An episode is going on, and the stack of a simulation cannot be copied.
-        """
-        if self._in_mid_episode():
-            raise CopyError(
-                f"{type(self).__name__} can be copied and pickled between episodes, and not in mid-episode: close() or"
-                " reset it afterwards, or see branch() for copies of a running simulation"
-            )
-        return self._state()
-
     def _state(self) -> dict[str, Any]:
+        """What a copy takes over."""
         kept = {name: value for name, value in vars(self).items() if name not in _OWN}
         return kept | {"session": self._session.kept()}
 
@@ -281,9 +270,6 @@ class View:
     def _resume_from_replay(self) -> None:
         """Take over the session's episode in the midst of it."""
 
-    def _in_mid_episode(self) -> bool:
-        return self._session.episode is not None and not self._session.episode.over
-
     def _clear(self) -> None:
         """Forget what was noted of the episode."""
 
@@ -294,6 +280,12 @@ def _made_again(view: type[View], plan: Plan) -> View:
     base: Any = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
     base.__init__(made, plan)
     return made
+
+
+def _unpickled(view: View, state: dict[str, Any]) -> None:
+    """Have a view that was pickled take over what it is to take over."""
+    view.__setstate__(state)
+    view._clear()
 
 
 _OWN = frozenset(("_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))

@@ -161,6 +161,11 @@ class outside_simulation:  # noqa: N801 - it is used like a function
             STACKS[here] = OUTSIDE
         self._put(EVALUATING, self._evaluation)
 
+    def __del__(self) -> None:
+        # An interrupt at the entry of ``__exit__`` has kept it from running.
+        if hasattr(self, "_mask") and EVALUATING.get(self._here) is self._evaluation:
+            outside_simulation.__exit__(self)
+
     def __exit__(self, *error: object) -> None:
         self._put(EVALUATING, self._before)
         if self._hidden is not None:

@@ -150,7 +150,7 @@ class DefinitionError(SimEnvError, ValueError):
 
 
 class SimulationError(SimEnvError, TypeError):
-    """What was given as a simulation is none."""
+    """What was given as a simulation is none, or does what none may do."""
 
 
 class UnknownPointError(SimEnvError, LookupError):

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from simenv_marl import SimulationInterface, single_env
+from simenv_marl import SimulationError, SimulationInterface, single_env
 from tests.conftest import DRIVERS
 from tests.worlds.models import decision, script
 
@@ -420,3 +420,37 @@ def test_one_model_of_trio_runs_on_a_greenlet_and_a_second_one_is_refused_by_tri
         assert env.simulation.log == [0, 1]
     other.reset()
     other.close()
+
+
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_the_exit_of_an_earlier_episode_is_an_error_of_the_simulations() -> None:
+    """A loop that outlives its episodes keeps their tasks, which pass their exit on when it runs again."""
+    decide = decision()
+
+    class Model:
+        def __init__(self):
+            self.loop = asyncio.new_event_loop()
+
+        def reset(self, seed=None):
+            pass
+
+        def run(self):
+            self.loop.run_until_complete(self.all())
+
+        async def all(self):
+            await asyncio.gather(*[self.one() for _ in range(3)])
+
+        async def one(self):
+            await asyncio.sleep(0)
+            decide()
+
+    env = single_env(Model, decide)
+    raised = None
+    for _ in range(10):
+        try:
+            env.reset()
+        except SimulationError as error:
+            raised = error
+    assert "of an earlier episode" in str(raised)
+    env.close()
+    env.simulation.loop.close()

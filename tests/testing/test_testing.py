@@ -980,3 +980,29 @@ def test_plugins_are_part_of_the_plain_run_too():
 
     report = clean(checked(Walk, plugins=[(doubled, Walk.choose, "after")]))
     assert "plain runs against RULE" in report.checked[0]
+
+
+def test_objects_that_share_one_agent():
+    """Nothing was said of agents, and several objects decide."""
+
+    class Pair:
+        def reset(self, seed=None):
+            self.walks = [Walk(), Walk()]
+            for number, walk in enumerate(self.walks):
+                walk.reset(seed if seed is None else seed + number)
+
+        def run(self):
+            for _ in range(5):
+                for walk in self.walks:
+                    walk.place += walk.choose()
+
+    found = finding(check_simulation(Pair, points(Walk, agent=None), episodes=2), "decide as one agent")
+    assert found.severity == "warning"
+    assert "choose_0" in found.evidence
+    one = check_simulation(Pair, points(Walk, agent="walkers"), episodes=2)
+    assert not [title for title in titles(one) if "as one agent" in title]
+
+
+def test_agents_that_options_name_and_that_never_come():
+    report = checked(Walk, {"agent": lambda walk: "walker"}, policies={"wlaker": lambda observation: 0})
+    assert "wlaker" in finding(report, "did not appear").evidence

@@ -156,6 +156,7 @@ class GreenletDriver(BaseDriver):
         if self._idle or not self._body:  # the job has ended, or was interrupted before it began
             self._job = None
             return nothing_to_end()
+        self._exiting = True
         event: Event = (self._asker or self._body).throw(SimulationExit())
         return event
 

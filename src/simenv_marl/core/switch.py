@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol
 
 from greenlet import getcurrent, greenlet
 
-from ..errors import WrongThreadError, annotate
+from ..errors import SimulationError, WrongThreadError, annotate
 from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Taker, stack_of
 from ..simulation import Sentinel
@@ -71,6 +71,16 @@ def is_exit(error: BaseException | None) -> bool:
     return isinstance(error, SimulationExit)
 
 
+def _stray(error: SimulationExit) -> SimulationError:
+    """The error in place of an exit that was not raised in this episode."""
+    stray = SimulationError(
+        "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of that"
+        " episode has kept; let nothing that belongs to an episode outlive it (cancel it in stop or in a finally)"
+    )
+    stray.__cause__ = error
+    return stray
+
+
 def nothing_to_end() -> Event:
     """What ``throw`` returns where no job is under way."""
     return FINISHED, [None], None
@@ -89,8 +99,8 @@ class BaseDriver:
     """
 
     __slots__ = (
-        "__weakref__", "_astray", "_children", "_context", "_ended", "_events", "_idle", "_job", "_refused", "caller",
-        "given_up", "plugins", "stack",
+        "__weakref__", "_astray", "_children", "_context", "_ended", "_events", "_exiting", "_idle", "_job", "_refused",
+        "caller", "given_up", "plugins", "stack",
     )  # fmt: skip
 
     resume: Any
@@ -106,7 +116,7 @@ class BaseDriver:
         self.stack: greenlet | None = None
         self.caller: greenlet | None = None
         self.given_up: str | None = None
-        self._ended, self._idle = False, True
+        self._ended, self._idle, self._exiting = False, True, False
         self._job: Callable[[], Any] | None = None
         self._context: Context | None = None
         self._events: Mapping[Hook, Crossing] = NO_DECISIONS
@@ -221,7 +231,7 @@ class BaseDriver:
     def _work(self) -> Event:
         """On the stack: do a job; return the event that its end is."""
         # No frame here holds the stack, which would refer to itself then, and could not be collected.
-        self._idle = False
+        self._idle = self._exiting = False
         job, self._job = self._job, None
         try:
             self.show()
@@ -243,7 +253,7 @@ class BaseDriver:
                 if isinstance(error, SimulationExit):
                     return FAILED, [self.refusal()], None
                 annotate(error, f"simenv_marl: and before that a decision was refused: {self._refused}")
-            return FAILED, [error], None
+            return FAILED, [error if self._exiting or type(error) is not SimulationExit else _stray(error)], None
         return (FINISHED, [result], None) if self._refused is None else (FAILED, [self.refusal()], None)
 
     def _forget_stack(self) -> None:

@@ -155,6 +155,7 @@ class ThreadDriver(BaseDriver):
         if self._thread is None or (self._idle and self._end is None and self._reply is not _JOB):
             return nothing_to_end()
         patience = monotonic() + SECONDS_TO_UNWIND
+        self._exiting = True
         self._event = None
         if not (self._idle and self._reply is _JOB):  # else the job begins, and is told at its first decision
             self._reply = _EXIT

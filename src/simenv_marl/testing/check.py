@@ -29,6 +29,14 @@ CHECKS: Final[tuple[Callable[[Subject, Report], None], ...]] = (
 """All checks, the more basic first: where the plain run already fails, the others are left out."""
 
 
+TOLD: Final = {
+    "refuses to end": "refusal",
+    "several objects decide at": "shared_agent",
+    "did not appear in the episode": "absent_agents",
+}
+"""What stands in the warnings of environments, and the finding that says the same."""
+
+
 def check_simulation(
     simulation: Any,
     points: Any = None,
@@ -85,10 +93,12 @@ def check_simulation(
     )
     report = Report()
     with quietly() as caught:
-        warnings.filterwarnings("always", ".* refuses to end", ResourceWarning)
+        for pattern in TOLD:
+            warnings.filterwarnings("always", f".*{pattern}")
         _run_checks(subject, report)
-    if caught:
-        report.add("refusal", str(caught[0].message)[:300])
+    for warning in caught:
+        message = str(warning.message)
+        report.add(next(found for pattern, found in TOLD.items() if pattern in message), message[:300])
     if subject.late:
         report.add("out_of_time", seconds=time_limit)
     return report.finished(subject)

@@ -34,6 +34,9 @@ _SAID_OTHERWISE: Final = (
     "different between two agents",
     "all zeros",
     "single number",
+    "several objects decide at",
+    "did not appear in the episode",
+    "draws from the global generator",
     "does not have a render() method",
     "has not defined a render() method",
 )

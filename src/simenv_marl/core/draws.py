@@ -20,7 +20,7 @@ from ..errors import warn_user
 from .switch import BaseDriver, Event
 from .threads import SIMULATION
 
-DECISIONS: Final = 10_000
+DECISIONS: Final = 1_000
 """During so many decisions a kind of simulation is watched."""
 
 _left: Final[WeakKeyDictionary[type, int]] = WeakKeyDictionary()
@@ -82,6 +82,8 @@ def _alone() -> bool:
 
 class WatchedDriver:
     """Stands for a driver in an episode as long as the simulation is watched."""
+
+    __slots__ = ("_driver", "_session")
 
     def __init__(self, driver: BaseDriver, session: Any) -> None:
         """Watch the simulation of a session.

@@ -61,7 +61,7 @@ class Sides:
     def begin(self) -> None:
         """The simulation begins a job, without a loop."""
         before = _surroundings()
-        self._before = before if before[0] is None else NO_LOOP
+        self._before = NO_LOOP if before[0] is not None or before == NO_LOOP else before  # one object for many
         self._own = self._interrupt = None
         self.enter()
 

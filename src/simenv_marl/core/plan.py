@@ -58,6 +58,7 @@ class Plan:
         events: By decision point, what crosses from the simulation when it is called.
         decisions: The same by the point's hook, for drivers.
         policies: By name: the policies of agents that are no agents of the environment.
+        asks: Whether some mapping asks for the simulation.
         wanted: The agents that ``policies`` and ``possible_agents`` name. Those that do not appear in an episode are
             warned of, once, and taken out.
         one_agent: The name of the one agent that the environment's user answers for; None where there may be more.
@@ -104,7 +105,7 @@ class Plan:
         self.hooks: list[Hook] = [point.point.hook for point in self._everything]
         self.plugins = Plugins(options.plugins) if options.plugins else None
         self.wanted = {*self.policies, *declared_agents(options.possible_agents)}
-        self._asks = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
+        self.asks = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
         self._bind_points()
 
     def _bind_points(self) -> None:
@@ -147,8 +148,6 @@ class Plan:
 
     def with_simulation(self, simulation: Any) -> Plan:
         """The same plan, with a simulation given to those mappings that ask for it."""
-        if not self._asks:
-            return self
         made = Plan.__new__(Plan)
         vars(made).update(vars(self))
         made._everything = [

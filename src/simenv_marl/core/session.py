@@ -6,7 +6,7 @@ is abandoned in mid-episode goes at once and takes its session along.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from contextvars import Context, copy_context
 from functools import partial
@@ -45,6 +45,11 @@ class Session:
         claim: What keeps other threads away while one uses it; None where only one thread can.
     """
 
+    __slots__ = (
+        "__weakref__", "_bound", "_closed", "_copied", "_driver", "_held", "_np_random", "_open", "_reset", "_rng",
+        "_starting", "_worn", "claim", "episode", "np_random_seed", "options", "plan", "seed", "simulation",
+    )  # fmt: skip
+
     def __init__(self, plan: Plan) -> None:
         """Make the simulation, and set the decision functions that the plan asks for.
 
@@ -62,7 +67,7 @@ class Session:
         self._starting = False
         self._open = False  # whether the simulation was reset and not closed since
         self._worn = False  # whether it was given up: what then may still use it is to meet no other episode
-        self._bound: tuple[Any, Any, Plan] | None = None
+        self._bound: tuple[Any, Any, Plan] | None = None  # where mappings ask for the simulation
         self._held: Held | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.claim = Claim() if plan.options.driver == "thread" else None
@@ -172,6 +177,8 @@ class Session:
 
     def _plan_of_simulation(self) -> Plan:
         """The plan, with the simulation given to those mappings that ask for it."""
+        if not self.plan.asks:
+            return self.plan
         if self._bound is None or self._bound[0] is not self.plan or self._bound[1] is not self.simulation:
             self._bound = self.plan, self.simulation, self.plan.with_simulation(self.simulation)
         return self._bound[2]
@@ -242,7 +249,7 @@ class Session:
             )
         generator = self.kept()
         again = self.start(other.seed, other.options, episode.when, episode.tape)
-        vars(self).update(generator)  # the seed of the episode was given to the other long ago
+        self.take_over(generator)  # the seed of the episode was given to the other long ago
         answer = again.play if again.when is When.RETURN else again.step
         while again.script:
             answer(again.script.popleft())
@@ -276,6 +283,11 @@ class Session:
             "_np_random": self._np_random,
             "_copied": self.episode is not None and self.episode.pending is not None,
         }
+
+    def take_over(self, kept: Mapping[str, Any]) -> None:
+        """Take over what another session has ``kept``."""
+        for name, value in kept.items():
+            setattr(self, name, value)
 
     def refusal(self) -> Exception:
         """The error that says why no action can be taken now."""

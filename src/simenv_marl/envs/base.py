@@ -216,7 +216,7 @@ class View:
         return _made_again, (made, self._made_of), self._state(), None, None, _unpickled
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        vars(self._session).update(kept.pop("session"))
+        self._session.take_over(kept.pop("session"))
         vars(self).update(kept)
 
     def _state(self) -> dict[str, Any]:

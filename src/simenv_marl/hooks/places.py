@@ -323,7 +323,7 @@ class Held:
         whole: Whether nothing of it was put back.
     """
 
-    _patches: Any = ()  # until it is made
+    __slots__ = ("_holder", "_patches", "whole")
 
     def __init__(self, patches: Iterable[Any]) -> None:
         """Set it.
@@ -334,8 +334,8 @@ class Held:
         Raises:
             PatchError: A place refuses, and nothing is set.
         """
-        self._holder, self._patches = object(), list(patches)
-        self.whole = True
+        self._holder, self.whole = object(), True
+        self._patches = list(patches)
         try:
             for patch in self._patches:
                 patch.hold(self._holder)
@@ -351,7 +351,7 @@ class Held:
             self._patches.pop()
 
     def __del__(self) -> None:
-        if self._patches:
+        if getattr(self, "_patches", ()):  # else an interrupt came before it was made
             self.let_go()
 
 

@@ -229,6 +229,19 @@ def test_environments_of_many_hands(processes):
     assert alike(ours, theirs)
 
 
+@pytest.mark.parametrize("processes", [0, 2])
+def test_environments_that_were_reset_before_they_are_copied(processes):
+    """As PettingZoo's tutorial does it."""
+
+    def begun():
+        env = hands(parallel_env)
+        env.reset(seed=7)
+        return env
+
+    ours, theirs = (story_of(vectors_of(env, processes), 6) for env in (begun(), hands(parallel_env)))
+    assert alike(ours, theirs)
+
+
 @pytest.mark.parametrize("options", [{"padded": True}, {}])
 def test_environments_in_which_agents_are_born_and_die(options):
     env = parallel_env(HerdSim, possible_agents=FORAGERS, **options)

@@ -31,6 +31,7 @@ from simenv_marl import (
     simulate,
     single_env,
     trace,
+    vector_env,
 )
 from simenv_marl.hooks.hook import hook_of
 from simenv_marl.hooks.stacks import EVALUATING
@@ -892,3 +893,26 @@ def test_if_one_place_cannot_be_set_none_is(points):
     del env
     gc.collect()
     assert vars(Vault)["open"] is before
+
+
+def test_mappings_of_vector_environments_see_the_plugins_too():
+    class Meter:
+        def level(self):
+            return 1.0
+
+        def read(self):
+            return 0
+
+    meter = Meter()
+    read = define(
+        agent="reader",
+        observation_space_mapping=lambda meter: [meter.level(), 0],
+        reward_mapping=lambda meter: meter.level(),
+    )
+    plugins = [(lambda meter, _result: ChangedResult(_result + 41), Meter.level, "after")]
+    env = vector_env(calling(*[lambda: meter.read()] * 3), {Meter.read: read}, num_envs=2, plugins=plugins)
+    assert env.reset()[0].tolist() == [[42, 0]] * 2
+    observations, rewards, *_ = env.step(np.zeros(2, np.int64))
+    assert observations.tolist() == [[42, 0]] * 2
+    assert rewards.tolist() == [42] * 2
+    env.close()

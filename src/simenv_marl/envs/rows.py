@@ -110,7 +110,7 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
         else:
             blame(episodes.index(episode), error := episode.refusal())
             raise error
-        if episode.driver.caller is not here:
+        if episode.driver.caller is not here or episode.plugins is not None:
             together = False
     event: Any = None
     events: Any = []

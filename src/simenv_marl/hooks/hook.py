@@ -31,7 +31,7 @@ _FILE: Final = "<stand-in for "
 
 _ASK: Final = "TAKERS.get(getcurrent(), elsewhere)({}, {})".format
 
-_SPAWNED: Final = "a greenlet that the simulation has spawned on a hub of others"
+_SPAWNED: Final = 'a greenlet that the simulation has spawned on a hub of others (with driver="thread" it could be)'
 
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 

@@ -2,6 +2,7 @@
 
 import gc
 import sys
+import threading
 import types
 import weakref
 from textwrap import dedent
@@ -10,7 +11,16 @@ from unittest import mock
 import pytest
 from greenlet import getcurrent
 
-from simenv_marl import PatchError, UnknownTargetError, aec_env, attach_handler, handlers, remove_handler
+from simenv_marl import (
+    PatchError,
+    UnknownTargetError,
+    aec_env,
+    attach_handler,
+    expose_to_plugins,
+    handlers,
+    remove_handler,
+    trace,
+)
 from simenv_marl.hooks.hook import hook_of
 from simenv_marl.hooks.places import hook_at, places_of, resolve
 from simenv_marl.hooks.targets import TARGET
@@ -242,9 +252,72 @@ def test_a_function_that_is_decorated_while_an_environment_uses_it_stays_decorat
     env.close()
 
 
-def test_setting_and_putting_back_in_many_threads_at_once():
-    import threading
+@pytest.mark.parametrize("make", [define(), expose_to_plugins])
+def test_what_is_decorated_while_an_environment_uses_it_has_handlers_of_its_own(make):
+    class Model:
+        def decide(self):
+            return "rule"
 
+    env = aec_env(calling(lambda: Model().decide()), {Model.decide: define()})
+    env.reset()
+    Model.decorated = make(Model.decide)
+    env.close()
+    with trace() as calls:
+        Model().decorated()
+    assert len(calls) == 1
+    log = []
+    attach_handler(log.append, Model.decide, "before")
+    try:
+        Model().decorated()
+        assert log == []
+        Model().decide()
+        assert len(log) == 1
+    finally:
+        remove_handler(Model.decide, "before")
+
+
+def test_modules_may_be_imported_while_names_are_looked_for(monkeypatch):
+    class Lazy:
+        """Stands in for a module that is imported as soon as something is asked of it."""
+
+        @property
+        def __class__(self):
+            sys.modules.setdefault("late_module", types.ModuleType("late_module"))
+            return types.ModuleType
+
+    monkeypatch.setitem(sys.modules, "lazy_module", Lazy())
+    try:
+        assert places_of(function) == [(sys.modules[HERE], "function")]
+    finally:
+        del sys.modules["late_module"]
+
+
+def test_modules_may_change_in_other_threads_while_names_are_looked_for():
+    module, ended = types.ModuleType("changing_module"), threading.Event()
+    vars(module).update({f"name_{number}": number for number in range(3000)})
+
+    def work():
+        while not ended.is_set():
+            for number in range(50):
+                setattr(module, f"more_{number}", number)
+            for number in range(50):
+                delattr(module, f"more_{number}")
+
+    thread, interval = threading.Thread(target=work), sys.getswitchinterval()
+    sys.modules["changing_module"] = module
+    sys.setswitchinterval(1e-6)
+    thread.start()
+    try:
+        for _ in range(30):
+            assert places_of(function) == [(sys.modules[HERE], "function")]
+    finally:
+        sys.setswitchinterval(interval)
+        ended.set()
+        thread.join()
+        del sys.modules["changing_module"]
+
+
+def test_setting_and_putting_back_in_many_threads_at_once():
     class Model:
         def decide(self):
             return "rule"

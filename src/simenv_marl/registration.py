@@ -121,7 +121,7 @@ def make_single(recipe: str, module: str, point: str, **options: Any) -> Any:
     return single_env(known.simulation, known.points, **_single_options(known, point, options))
 
 
-def make_single_vector(recipe: str, module: str, point: str, num_envs: int = 1, **options: Any) -> Any:
+def make_single_vector(recipe: str, module: str, point: str, num_envs: int, **options: Any) -> Any:
     """The entry point of the vector view over such single views."""
     known = _recipe(recipe, module)
     merged = _single_options(known, point, options)
@@ -142,7 +142,7 @@ def make_joint(recipe: str, module: str, **options: Any) -> Any:
     return joint_env(known.simulation, known.points, **{**known.options, "flatten": known.flatten, **options})
 
 
-def make_joint_vector(recipe: str, module: str, num_envs: int = 1, **options: Any) -> Any:
+def make_joint_vector(recipe: str, module: str, num_envs: int, **options: Any) -> Any:
     """The entry point of the vector view over joint views."""
     known = _recipe(recipe, module)
     merged = {**known.options, "flatten": known.flatten, **options}

@@ -14,7 +14,7 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import RULE, ResetNeededError, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import RULE, ResetNeededError, aec_env, difference, joint_env, parallel_env, single_env
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play
 
@@ -410,7 +410,9 @@ def deep_down(function, room):
 @pytest.mark.usefixtures("_collected")
 @VIEWS
 def test_an_environment_survives_the_end_of_its_users_stack(view):
-    decide = decision()
+    numbers = count()
+    change = difference(lambda: next(numbers))
+    decide = decision(reward_mapping=change)
 
     class Model(Script):
         def expected_calls(self, point):
@@ -445,6 +447,7 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
             step()
         assert env.unwrapped.simulation.log == [3, 3, 3, "unwound"]
         assert nobody_is_asked()
+        assert change() == change() == 0.0
     assert ends >= {"went well", "came to the end"}
 
 

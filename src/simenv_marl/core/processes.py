@@ -73,7 +73,7 @@ def pack_error(error: BaseException) -> bytes:
     with suppress(Exception):
         parts = pack_plainly((type(error), error.args, vars(error)))
         _rebuilt(parts)
-    return pickle.dumps((parts, f"{type(error).__name__}: {error}", list(getattr(error, "__notes__", ())), text), 5)
+    return pickle.dumps((parts, f"{type(error).__name__}: {error}", getattr(error, "__notes__", ()), text), 5)
 
 
 def unpack_error(parcel: bytes) -> BaseException:

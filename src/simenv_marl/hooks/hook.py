@@ -107,7 +107,7 @@ def generate(
         alone: As ``is_alone`` has it.
         namespace: What the names mean of which ``_ASK`` is made.
     """
-    parameters = list(signature.parameters.values()) if signature is not None else []
+    parameters = signature.parameters.values() if signature is not None else ()
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
     # Under its own name, by which it may be passed all the same where a staticmethod looks like a method.
@@ -403,7 +403,7 @@ class Hook(Target):
 
     def _changed(self) -> None:
         takers, slot = self.takers, self.slot
-        for plugins in list(slot) if self.rule is self.function else [None, *slot]:
+        for plugins in slot if self.rule is self.function else [None, *slot]:
             takers[plugins] = self.around(self.run_rule, plugins)
         for key, taker in list(takers.items()):
             if not isinstance(key, greenlet):

@@ -89,7 +89,7 @@ class Panel:
     leaves: list[Leaf]
 
 
-def by_policy(trajectories: Any) -> dict[Any, Trajectories]:
+def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
     """What was given to be drawn, by the keys of the policies."""
     if isinstance(trajectories, Trajectories):
         return {None: trajectories}
@@ -99,7 +99,7 @@ def by_policy(trajectories: Any) -> dict[Any, Trajectories]:
         )
     if not trajectories:
         raise OptionValueError("there is nothing to draw: no policy has answered any decision")
-    return dict(trajectories)
+    return trajectories
 
 
 def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
@@ -260,7 +260,7 @@ def cells_of(rows: Sequence[Row], *, slim: bool) -> NDArray[np.float64]:
 # -- many episodes --------------------------------------------------------------------------------
 
 
-def _collections(collected: Any) -> dict[str, dict[Any, Trajectories]]:
+def _collections(collected: Any) -> dict[str, Mapping[Any, Trajectories]]:
     """What was given to be drawn, by what it is called."""
     if isinstance(collected, Mapping) and any(isinstance(value, Mapping) for value in collected.values()):
         return {str(label): by_policy(value) for label, value in collected.items()}

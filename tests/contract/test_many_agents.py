@@ -935,6 +935,21 @@ class Old(Leaver):
     pass
 
 
+def test_the_last_observation_is_of_the_last_arguments():
+    class Walker:
+        def walk(self, place):
+            return "rule"
+
+    def main(simulation):
+        simulation.walker = Walker()
+        simulation.walker.walk(1)
+        simulation.walker.walk(2)
+
+    point = define(agent=lambda walker, place: "walker_0", observation_space_mapping=lambda walker, place: [place, 0])
+    turns = play(aec_env(script(main), {Walker.walk: point}), 1)
+    assert [turn.observation[0] for turn in turns] == [1, 2, 2]
+
+
 def test_one_removal_ends_the_agents_of_several_points():
     leave = f"{__name__}.Leaver.leave"
     points = {

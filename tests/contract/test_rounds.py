@@ -46,13 +46,14 @@ from tests.worlds.many_worlds import (
     Colony,
     Design,
     answer,
+    being_of,
     beings,
     colony,
     colony_points,
     designs,
     seeds,
 )
-from tests.worlds.models import calling, decision, define, notes, script
+from tests.worlds.models import Script, calling, decision, define, notes, script
 
 
 def points(number=2, **changes):
@@ -1543,3 +1544,27 @@ def test_what_cannot_be_observed_anew_is_never_the_same_object():
         observations, *_ = env.step({"being_0": 1, "being_1": 1})
         assert observations["being_0"].tolist() == [0, 0]
         observations["being_0"][:] = 99
+
+
+def test_one_that_was_announced_can_be_removed_when_its_agent_has_no_name_any_more():
+    class Crowd(Script):
+        def reset(self, seed=None):
+            super().reset(seed)
+            self.beings = [Being(0), Being(1)]
+
+        def expected_calls(self, point):
+            return [(being,) for being in self.beings]
+
+    def main(simulation):
+        one, other = simulation.beings
+        one.act()
+        other.health = 1
+        other.leave()
+        one.act()
+
+    named = beings(agent=lambda being: being_of(being) if being.health == 0 else None)
+    env = parallel_env(lambda: Crowd(main), named)
+    env.reset()
+    assert env.agents == ["being_0", "being_1"]
+    _, _, terminations, *_ = env.step({"being_0": 1, "being_1": 1})
+    assert terminations == {"being_0": False, "being_1": True}

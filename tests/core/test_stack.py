@@ -116,6 +116,29 @@ def test_a_connection_that_was_opened_in_reset_is_used_in_run_and_over_episodes(
 
 
 @DRIVERS
+def test_an_event_loop_is_the_simulations_own_while_that_is_unwound(driver):
+    async def work(simulation):
+        try:
+            decide()
+        finally:
+            simulation.log.append(asyncio.get_running_loop() is not here)
+            await asyncio.sleep(0)
+            simulation.log.append("unwound")
+
+    async def use(env):
+        nonlocal here
+        here = asyncio.get_running_loop()
+        env.reset()
+        env.close()
+        return asyncio.get_running_loop()
+
+    decide, here = decision(), None
+    env = single_env(script(lambda simulation: asyncio.run(work(simulation))), decide, driver=driver)
+    assert asyncio.run(use(env)) is here
+    assert env.simulation.log == [True, "unwound"]
+
+
+@DRIVERS
 def test_an_event_loop_that_was_made_in_reset_is_used_in_run(driver):
     class Office(Script):
         def __init__(self):

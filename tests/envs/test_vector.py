@@ -6,6 +6,7 @@ import copy
 import gc
 import pickle
 import threading
+import weakref
 from typing import Any
 
 import gymnasium
@@ -39,7 +40,7 @@ from simenv_marl import (
 )
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import notes, stacks
+from tests.worlds.models import decision, notes, script, stacks
 from tests.worlds.worlds import FuseError, designs, seeds
 
 pytestmark = FORKS
@@ -724,4 +725,33 @@ def test_what_is_reset_to_ask_for_the_agents_is_unwound():
     point = definition(agent=lambda self: "counter_0")
     envs = vector_env(Announcing, {f"{__name__}.Counter.decide": point}, num_envs=2)
     assert len(ended) == 1
+    envs.close()
+
+
+def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
+    """Neither the answers nor what comes from the simulations is held any longer than it is used."""
+
+    class Answer:
+        pass
+
+    answers, there = weakref.WeakSet(), []
+
+    def answer(action):
+        made = Answer()
+        answers.add(made)
+        return made
+
+    decide = decision(
+        agent="a_0", action_space_mapping=answer, reward_mapping=lambda: there.append(len(answers)) or 0.0
+    )
+
+    def main(simulation):
+        for _ in range(3):
+            decide()
+
+    envs = vector_env(script(main), decide, num_envs=4)
+    envs.reset(seed=0)
+    there.clear()
+    envs.step(np.ones(4, np.int64))
+    assert there == [0] * 4
     envs.close()

@@ -16,6 +16,7 @@ from simenv_marl import (
     UnknownTargetError,
     aec_env,
     attach_handler,
+    attached_handlers,
     expose_to_plugins,
     handlers,
     remove_handler,
@@ -139,6 +140,25 @@ def test_a_function_of_a_module_is_set_under_all_its_names():
         assert {owner.__name__ for owner, _ in places_of(function)} == {HERE, "other_module"}
     finally:
         del sys.modules["other_module"]
+    reference = weakref.ref(other)
+    del other
+    gc.collect()
+    assert reference() is None
+    assert hook.function is original
+
+
+def test_a_function_is_found_by_what_its_module_calls_it():
+    module, log = types.ModuleType("renaming_module"), []
+    exec("def first(): return 1\nsecond = first\ndel first", vars(module))
+    sys.modules["renaming_module"] = module
+    try:
+        attach_handler(lambda: log.append("called"), module.second, "before")
+        assert [entry[1] for entry in attached_handlers()] == ["renaming_module.second"]
+        assert module.second() == 1
+        assert log == ["called"]
+        remove_handler(module.second, "before")
+    finally:
+        del sys.modules["renaming_module"]
 
 
 def test_what_something_else_has_set_is_left_alone_and_usable_afterwards():

@@ -185,6 +185,18 @@ def test_where_nobody_lives_is_shaded():
     assert [line.get_marker() for line in third.lines[1:]] == ["|"]
 
 
+def test_whom_the_model_has_let_go_of_lives_to_the_end():
+    def main(simulation):
+        simulation.log.append(Being(0).act())
+        keeper = Being(1)
+        for _ in range(3):
+            simulation.log.append(keeper.act())
+
+    figure = plot_timeline(collect_episodes(clocked(main), {Being.act: ones}, points=beings(), seeds=[1]))
+    assert not figure.axes[0].patches
+    assert [(patch.get_x(), patch.get_width()) for patch in figure.axes[2].patches] == [(0, 10)]
+
+
 # -- many agents ----------------------------------------------------------------------------------
 
 

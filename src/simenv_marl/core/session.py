@@ -72,8 +72,7 @@ class Session:
                 self._driver, self.simulation = spare.taken()
                 self._reset = resetter(self.simulation)
         except BaseException:
-            self._end_stack()
-            self._let_go_of_patches()
+            self._put_away()
             raise
 
     # -- the simulation's stack -------------------------------------------------------------------
@@ -99,9 +98,11 @@ class Session:
         assert self._driver is not None
         return self._driver
 
-    def _end_stack(self) -> None:
+    def _put_away(self) -> None:
+        """End the stack, and put back what was patched."""
         if self._driver is not None:
             self._driver.end()
+        self._let_go_of_patches()
 
     def at_work(self) -> AbstractContextManager[None]:
         """Keep what runs for the environment apart from what runs around it."""
@@ -289,8 +290,7 @@ class Session:
         finally:
             if self.episode is None and not self._starting:
                 self._closed = True
-                self._end_stack()
-                self._let_go_of_patches()
+                self._put_away()
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
@@ -298,8 +298,7 @@ class Session:
             if self.episode is not None:
                 self.episode.abandon()
         finally:
-            self._end_stack()
-            self._let_go_of_patches()
+            self._put_away()
 
     def _hold_patches(self) -> None:
         if self._held:

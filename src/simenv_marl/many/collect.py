@@ -243,10 +243,10 @@ def _checked_seeds(seeds: Any) -> list[int]:
     return checked  # type: ignore[return-value]
 
 
-def _checked_policies(policies: Any) -> dict[Any, Any]:
+def _checked_policies(policies: Any) -> Mapping[Any, Any]:
     if policies is not None and not isinstance(policies, Mapping):
         raise OptionValueError(f"policies must be a dict from agents or points to callables, not {policies!r}")
-    return dict(policies or {})
+    return policies or {}
 
 
 def _check_collect(collect: Any) -> None:

@@ -138,10 +138,6 @@ def panels_of(parts: Mapping[Any, Trajectories], episode: int, agents: Any, acti
         raise OptionValueError(
             f"there is nothing to draw of episode {episode} (seed {seed}): no agent has decided in it"
         )
-    # Where the model has let go of an agent before its last reward was known, its end is not: one usual step later.
-    gaps = np.concatenate([np.diff(row.at) for row in rows])
-    gap = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
-    rows = [row if row.end == row.end else replace(row, end=float(row.at[-1]) + gap) for row in rows]
     if agents is not None:
         rows = _chosen(rows, agents, episode)
     keys = list(dict.fromkeys(row.key for row in rows))

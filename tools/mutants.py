@@ -6,6 +6,8 @@ is what one wants when tests have been added. It draws from all modules except `
 
 Before the first mutant, the tests run once and it is measured which of them execute which lines, and how long they
 take. A mutant is only shown to tests that execute its line, some quick ones of each file first.
+
+Some changes are no mistakes: ``mutants_known.toml`` has each with the reason why no test need find it.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -323,12 +326,28 @@ def report(results: list[dict[str, Any]]) -> None:
         print(f"\n{what:32} drawn killed")
         for name in sorted(drawn):
             print(f"{name:32} {drawn[name]:5} {killed[name]:6}")
+    known = {(entry["module"], entry["change"].strip()): entry["why"] for entry in reasons()}
     survivors = [result for result in results if result["outcome"] == "survived"]
-    for result in survivors:
-        print(f"\nsurvived {result['of']} tests: {result['mutant']}\n{result['diff']}")
+    told = [(result, known.get((result["module"], change_of(result)))) for result in survivors]
+    for result, why in sorted(told, key=lambda pair: pair[1] is None):
+        print(f"\nsurvived {result['of']} tests: {result['mutant']}\n{why or result['diff']}")
     seconds = sum(result["seconds"] for result in results) / max(1, len(results))
-    share = 1 - len(survivors) / max(1, len(results))
-    print(f"\n{len(results)} mutants, {share:.0%} killed, {seconds:.0f} s each")
+    number, listed = len(results) - len(survivors), sum(why is not None for _, why in told)
+    print(f"\n{len(results)} mutants, {number / max(1, len(results)):.0%} killed, {seconds:.0f} s each")
+    print(f"{number / max(1, len(results) - listed):.0%} without the {listed} that are no mistakes")
+
+
+def reasons() -> list[dict[str, str]]:
+    """The changes that are known to be no mistakes."""
+    text = (ROOT / "tools/mutants_known.toml").read_text(encoding="utf-8")
+    found: list[dict[str, str]] = tomllib.loads(text)["known"]
+    return found
+
+
+def change_of(result: dict[str, Any]) -> str:
+    """The lines that a mutant has changed, wherever they stand: those before, and those after."""
+    lines = [line for line in result["diff"].splitlines()[3:] if line.startswith(("-", "+"))]
+    return "\n".join(f"{line[0]} {line[1:].strip()}" for line in lines)
 
 
 if __name__ == "__main__":

@@ -117,6 +117,16 @@ def test_a_point_is_itself_again_where_it_is():
     assert unpack(pack(point.hook)) is point.hook
 
 
+def test_a_point_comes_along_with_its_hook():
+    @define(agent="local_0")
+    def function():
+        return 0
+
+    hook = unpack(pack(hook_of(function)))
+    assert hook is not hook_of(function)
+    assert (hook.point.hook, hook.point.definition.agent) == (hook, "local_0")
+
+
 @pytest.mark.parametrize("name", ["Base.decorated", "Base.plain"])
 def test_functions_go_to_other_processes_by_name(name):
     function = getattr(Base, name.partition(".")[2])

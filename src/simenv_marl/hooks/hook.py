@@ -283,7 +283,7 @@ class Hook(Target):
 
     def __reduce__(self) -> Any:
         made_of = (self.function, self.name, self.bound, self.kind, self.exposed)
-        return _restored, made_of, self.point, None, None, _give_point
+        return _restored, made_of, self.point, None, None, _came_along
 
     def stand_in(self, made_with: Any = None) -> FunctionType:
         """Make a function that stands in front of the hook's function for good.
@@ -444,7 +444,5 @@ def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -
     return hook
 
 
-def _give_point(hook: Hook, point: Any) -> None:
-    """Give a hook that was restored what the layer above had made of it, which may lead back to it."""
-    if hook.point is None:
-        hook.point = point
+def _came_along(hook: Hook, point: Any) -> None:
+    """What the layer above had made of a hook has come along, and is by now what it makes of this one."""

@@ -21,9 +21,13 @@ from simenv_marl import (
     WrongThreadError,
     aec_env,
     errors,
+    joint_env,
+    parallel_env,
     single_env,
 )
-from tests.worlds.models import Script, calling, culprits, decision, decisions, define, notes, play, script
+from tests.worlds.models import Script, calling, culprits, decision, decisions, define, notes, play, script, step
+
+VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
 
 # -- the tree -------------------------------------------------------------------------------------
 
@@ -574,7 +578,7 @@ def test_drawn_seeds_are_told_too_and_reproduce_the_error():
     [("step", where) for where in ("rule", "observation_space_mapping", "reward_mapping", "apply", "policy")]
     + [(what, where) for what in ("reset", "close") for where in ("rule", "observation_space_mapping")],
 )
-@pytest.mark.parametrize("view", [aec_env, single_env])
+@VIEWS
 def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing(where, what, view):
     seen = []
     armed = [False]
@@ -583,7 +587,7 @@ def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing
         if armed[0]:
             armed[0] = False
             with pytest.raises(ReentrancyError, match="the environment was used"):
-                env.step(1) if what == "step" else getattr(env, what)()
+                step(env, 1, "a_0") if what == "step" else getattr(env, what)()
             seen.append(what)
         return 1
 
@@ -598,21 +602,17 @@ def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing
     env = view(calling(*[decide, other] * 3), [decide, other], policies=policies)
     env.reset()
     armed[0] = True
-    flags = []
-    for _ in range(3):
-        result = env.step(1)
-        flags.append(env.terminations["a_0"] if view is aec_env else result[2])
+    assert [step(env, 1, "a_0") for _ in range(3)] == [False, False, True]
     assert seen == [what]
-    assert flags == [False, False, True]
     assert env.unwrapped.simulation.log[::2] == [1, 1, 1]
     env.close()
     env.reset()
-    env.step(1)
+    step(env, 1, "a_0")
 
 
 @pytest.mark.parametrize("where", ["reset", "rule", "observation_space_mapping", "policy"])
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
-@pytest.mark.parametrize("view", [aec_env, single_env])
+@VIEWS
 def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_nothing(where, what, view):
     raised = []
 
@@ -626,7 +626,7 @@ def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_
         if not raised:
             raised.append(None)
             with pytest.raises(SimEnvError, match="reset") as caught:
-                env.step(1) if what == "step" else getattr(env, what)()
+                step(env, 1, "a_0") if what == "step" else getattr(env, what)()
             raised.append(type(caught.value))
         return 1
 
@@ -642,8 +642,8 @@ def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_
     env = view(lambda: Resetting(main), [decide, other], policies=policies)
     env.reset()
     assert raised[1] is ReentrancyError or (what == "step" and issubclass(raised[1], ResetNeededError))
-    env.step(3)
-    env.step(4)
+    step(env, 3, "a_0")
+    step(env, 4, "a_0")
     assert env.unwrapped.simulation.episodes == 1
     assert env.unwrapped.simulation.log == [(1, 3), (1, 4)]
     env.close()
@@ -669,7 +669,7 @@ def in_a_thread(function):
 
 
 @pytest.mark.greenlet("threads of their own may be used from any other")
-@pytest.mark.parametrize("view", [aec_env, single_env])
+@VIEWS
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
 def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_nothing(what, view):
     unwound = []
@@ -681,16 +681,16 @@ def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_n
         finally:
             unwound.append(True)
 
-    decide = decision()
+    decide = decision(agent="a_0")
     env = view(script(main), decide)
     env.reset()
-    env.step(1)
-    error = in_a_thread(lambda: env.step(5) if what == "step" else getattr(env, what)())
+    step(env, 1, "a_0")
+    error = in_a_thread(lambda: step(env, 5, "a_0") if what == "step" else getattr(env, what)())
     assert isinstance(error, WrongThreadError)
     assert isinstance(error, RuntimeError)
     assert 'driver="thread"' in str(error)
     assert not unwound
-    env.step(2)
+    step(env, 2, "a_0")
     assert env.unwrapped.simulation.log == [1, 2]
     env.close()
     assert unwound == [True]
@@ -715,7 +715,7 @@ def test_threads_with_environments_of_their_own_do_not_meet():
         for _ in range(3):
             env.reset()
             while not env.step(number)[2]:
-                pass
+                assert decide() == "rule"
         logs[number] = env.unwrapped.simulation.log
         assert decide() == "rule"
 

@@ -17,7 +17,7 @@ import pytest
 from simenv_marl import RULE, WrongThreadError, aec_env, generate_env, parallel_env, single_env
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
-from tests.worlds.models import Script, calling, decision, script, stacks
+from tests.worlds.models import Script, calling, decision, script, stacks, unwinding
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
@@ -325,16 +325,8 @@ def test_between_episodes_an_environment_may_change_threads():
 @pytest.mark.parametrize("where", ["here", "elsewhere"])
 def test_an_environment_that_is_dropped_takes_its_stack_along(driver, when, where):
     gc.collect()
-    before, log = stacks(len(STACKS) + 1), []
-
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            log.append("unwound")
-
-    decide = decision()
-    held = [single_env(script(main), decide, driver=driver)]
+    before, log, decide = stacks(len(STACKS) + 1), [], decision()
+    held = [single_env(unwinding(decide, log), decide, driver=driver)]
     simulation = weakref.ref(held[0].simulation)
     if when != "never reset":
         held[0].reset()

@@ -288,8 +288,9 @@ def test_an_interrupt_ends_all_processes(tmp_path):
 
 
 def test_progress_is_shown_where_it_is_asked_for(capsys):
-    traces(seeds=range(5), workers=2, progress=True)
-    assert "5/5" in capsys.readouterr().err
+    for workers in (0, 2):
+        traces(seeds=range(5), workers=workers, progress=True)
+        assert "5/5" in capsys.readouterr().err
     traces(seeds=range(5))
     assert capsys.readouterr().err == ""
 

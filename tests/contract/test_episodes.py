@@ -880,18 +880,23 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(point, 
     assert sorted(turn.agent for turn in turns if turn.terminated) == ["sheep_0", "sheep_1", "sheep_2"]
 
 
+class Grass:
+    pass
+
+
+class Goat:
+    def __init__(self):
+        self.meadow = [Grass(), Grass()]
+
+    def browse(self):
+        return self.meadow[0]
+
+
+def browsing(agent):
+    return {Goat.browse: define(agent=agent, action_space=spaces.Discrete(2), choices=lambda goat: list(goat.meadow))}
+
+
 def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
-    class Grass:
-        pass
-
-    class Goat:
-        def __init__(self):
-            self.meadow = [Grass(), Grass()]
-
-        @define(agent=lambda self: "goat_0", action_space=spaces.Discrete(2), choices=lambda self: list(self.meadow))
-        def browse(self):
-            return self.meadow[0]
-
     def main(simulation):
         goat = Goat()
         watched = [weakref.ref(grass) for grass in goat.meadow]
@@ -901,7 +906,7 @@ def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
         other()
 
     other = decision(agent="other_0")
-    env = aec_env(script(main), [Goat.browse, other])
+    env = aec_env(script(main), browsing(lambda goat: "goat_0") | {other: define(agent="other_0")})
     env.reset()
     env.step(1)
     env.step(0)
@@ -909,17 +914,6 @@ def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
 
 
 def test_a_choice_that_the_model_lets_go_at_once_goes_at_once():
-    class Grass:
-        pass
-
-    class Goat:
-        def __init__(self):
-            self.meadow = [Grass(), Grass()]
-
-        @define(agent="goat_0", action_space=spaces.Discrete(2), choices=lambda self: list(self.meadow))
-        def browse(self):
-            return self.meadow[0]
-
     def main(simulation):
         goat = Goat()
         watched = [weakref.ref(grass) for grass in goat.meadow]
@@ -927,7 +921,7 @@ def test_a_choice_that_the_model_lets_go_at_once_goes_at_once():
         simulation.log.append([watch() is None for watch in watched])
 
     for action, gone in ((RULE, [True, False]), (0, [True, False]), (1, [False, True])):
-        env = single_env(script(main), Goat.browse)
+        env = single_env(script(main), browsing("goat_0"))
         env.reset()
         env.step(action)
         assert env.unwrapped.simulation.log == [gone]

@@ -284,15 +284,6 @@ def test_errors_in_the_model_surface_as_themselves(kind, at, view):
 
 
 @pytest.mark.parametrize("view", [aec_env, single_env])
-def test_errors_before_the_first_decision_surface_from_reset(view):
-    bomb, decide = Bomb(1), decision()
-    env = view(calling(bomb, decide), decide)
-    _, answered = surfaces(env)
-    assert answered == 0
-    goes_on(env)
-
-
-@pytest.mark.parametrize("view", [aec_env, single_env])
 def test_errors_after_the_last_decision_surface_from_step(view):
     bomb, decide = Bomb(1), decision(agent="culprit_0")
     env = view(calling(decide, bomb), decide)
@@ -313,35 +304,23 @@ def test_errors_in_policies_surface_as_themselves():
         goes_on(env)
 
 
-def test_errors_in_reset_surface_as_themselves():
-    class Resetting(Script):
-        def reset(self, seed=None, options=None):
-            super().reset(seed, options)
-            bomb()
-
-    bomb, decide = Bomb(2), decision()
-    for view in (aec_env, single_env):
-        bomb.calls = 0
-        env = view(lambda: Resetting(lambda simulation: decide()), decide)
-        env.reset()
-        _, answered = surfaces(env)
-        assert answered == 0
-        goes_on(env)
-
-
 @pytest.mark.parametrize("trigger", ["close", "reset"])
-def test_errors_in_stop_surface_as_themselves(trigger):
+@pytest.mark.parametrize("where", ["stop", "finally"])
+def test_errors_while_unwinding_surface_as_themselves(where, trigger):
     unwound = []
 
     class Stopping(Script):
         def stop(self):
-            bomb()
+            if where == "stop":
+                bomb()
 
     def main(simulation):
         try:
             decide()
         finally:
             unwound.append(True)
+            if where == "finally":
+                bomb()
 
     decide = decision(agent="culprit_0")
     for view in (aec_env, single_env):
@@ -354,40 +333,6 @@ def test_errors_in_stop_surface_as_themselves(trigger):
         assert culprits(caught.value)[-1] == "culprit"
         assert "4711" in notes(caught.value)
         assert unwound == [True]
-        goes_on(env)
-
-
-@pytest.mark.parametrize("trigger", ["close", "reset"])
-def test_errors_while_unwinding_surface_as_themselves(trigger):
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            bomb()
-
-    decide = decision(agent="culprit_0")
-    for view in (aec_env, single_env):
-        bomb = Bomb(1)
-        env = view(script(main), decide)
-        env.reset(seed=4711)
-        with pytest.raises(Culprit) as caught:
-            getattr(env, trigger)()
-        assert culprits(caught.value)[-1] == "culprit"
-        assert "4711" in notes(caught.value)
-        goes_on(env)
-
-
-def test_errors_in_expected_calls_surface_as_themselves():
-    class Foreseeing(Script):
-        def expected_calls(self, point):
-            bomb()
-            return []
-
-    bomb, decide = Bomb(1), decision()
-    for view in (aec_env, single_env):
-        bomb.calls = 0
-        env = view(lambda: Foreseeing(lambda simulation: decide()), decide)
-        surfaces(env)
         goes_on(env)
 
 

@@ -117,14 +117,6 @@ def test_what_is_refused_moves_nothing(action):
     assert env.simulation.log == [1, 2]
 
 
-def test_the_agent_that_is_missing_is_named():
-    ant, bee = points()
-    env = joint_env(calling(ant, bee), [ant, bee])
-    env.reset()
-    with pytest.raises(InvalidActionError, match="bee_0"):
-        env.step({"ant_0": 1})
-
-
 def test_rule_for_all_and_for_some():
     ant, bee = points()
     env = joint_env(calling(ant, bee, ant, bee), [ant, bee])

@@ -30,15 +30,16 @@ from simenv_marl import (
 )
 from tests.worlds.many_worlds import (
     HERE,
+    NAMES_OF_THE_VILLAGE,
     AnnouncedHunt,
     Announcing,
     Answered,
     Being,
     Colony,
-    Design,
     Hunt,
     Other,
     Played,
+    Village,
     advised,
     answer,
     banish,
@@ -1296,21 +1297,6 @@ def test_with_rule_throughout_a_colony_is_the_plain_run(design, seed):
 
 
 # -- PettingZoo's tests ---------------------------------------------------------------------------
-
-
-VILLAGE = Design(initial=5, most=40, ticks=12, overseen="after")
-NAMES_OF_THE_VILLAGE = [f"creature_{number}" for number in range(VILLAGE.most)]
-
-
-class Village(Colony):
-    """A colony that always has something to observe, and takes options."""
-
-    def __init__(self):
-        super().__init__(VILLAGE)
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed)
-        self.fortune = 7
 
 
 def village(**options):

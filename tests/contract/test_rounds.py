@@ -35,11 +35,11 @@ from simenv_marl import (
 from tests.worlds import worlds
 from tests.worlds.many_worlds import (
     HERE,
+    NAMES_OF_THE_VILLAGE,
     Announcing,
     Answered,
     Being,
-    Colony,
-    Design,
+    Village,
     answer,
     being_of,
     beings,
@@ -1270,15 +1270,6 @@ def test_in_turns_it_is_the_aec_view(design, seed, answers):
 
 
 # -- PettingZoo's tests ---------------------------------------------------------------------------
-
-
-VILLAGE = Design(initial=5, most=40, ticks=12, overseen="after")
-NAMES_OF_THE_VILLAGE = [f"creature_{number}" for number in range(VILLAGE.most)]
-
-
-class Village(Colony):
-    def __init__(self):
-        super().__init__(VILLAGE)
 
 
 class AnnouncingVillage(Village, Announcing):

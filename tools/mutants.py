@@ -5,7 +5,8 @@ line. Started once more, the script goes on where it was stopped; with ``--again
 is what one wants when tests have been added. It draws from all modules except ``testing`` and ``many/plots.py``.
 
 Before the first mutant, the tests run once and it is measured which of them execute which lines, and how long they
-take. A mutant is only shown to tests that execute its line, some quick ones of each file first.
+take. A mutant is only shown to tests that execute its function: first those that execute its line, some quick ones of
+each file before the others.
 
 Some changes are no mistakes: ``mutants_known.toml`` has each with the reason why no test need find it.
 """
@@ -63,19 +64,26 @@ class Measured:
     def tests(self, mutant: Mutant) -> list[str]:
         """The tests that could find a mutant, in the order in which they are to run.
 
-        A line that no test executes in this process may be executed in others, or be one that is executed at the
-        import: then those tests are taken that execute anything in its function, or else in its module.
+        First those that execute its line; then those that execute anything in its function, because what comes after a
+        switch between stacks is not always measured. Of what nothing executes, as at the import, all tests of the files
+        that execute anything in its module.
         """
         lines = self.lines.get(mutant.module, {})
-        found: set[str] = set()
-        for first, last in (mutant.lines, mutant.function, (0, 10**9)):
-            found = {test for line, tests in lines.items() if first <= line <= last for test in tests}
-            if found:
-                break
+        found = [
+            {test for line, tests in lines.items() if first <= line <= last for test in tests}
+            for first, last in (mutant.lines, mutant.function)
+        ]
+        if not any(found):
+            files = {file_of(test) for tests in lines.values() for test in tests}
+            found = [{test for test in self.seconds if not files or file_of(test) in files}]
+        return list(dict.fromkeys(test for tests in found for test in self.ordered(tests)))
+
+    def ordered(self, found: set[str]) -> list[str]:
+        """Tests in the order in which they are to run: some quick ones of each file first."""
         by_file: dict[str, list[str]] = {}
         for test in self.seconds:
-            if test in found or not found:
-                by_file.setdefault(test.partition("::")[0], []).append(test)
+            if test in found:
+                by_file.setdefault(file_of(test), []).append(test)
         files = sorted(by_file.values(), key=lambda tests: sum(map(self.seconds.__getitem__, tests)))
         quick = [[test for test in tests if self.seconds[test] < QUICK] for tests in files]
         first_ones = [
@@ -85,7 +93,12 @@ class Measured:
         ]
         rest = [test for tests in files for test in tests]
         rest.sort(key=lambda test: "[thread" in test)  # what the first driver finds, the second one need not
-        return list(dict.fromkeys(first_ones + rest))
+        return first_ones + rest
+
+
+def file_of(test: str) -> str:
+    """The file in which a test stands."""
+    return test.partition("::")[0]
 
 
 def main() -> None:
@@ -264,7 +277,7 @@ def outcome(mutant: Mutant, folder: Path, measured: Measured) -> dict[str, Any]:
     notes.unlink(missing_ok=True)
     chosen = folder / "chosen.json"
     chosen.write_text(json.dumps({test: TEST_LIMIT + 10 * measured.seconds[test] for test in tests}), encoding="utf-8")
-    files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
+    files = list(dict.fromkeys(map(file_of, tests)))
     options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "tools.mutants_plugin"]
     limit = 120 + 3 * sum(measured.seconds[test] for test in tests)
     try:

@@ -1250,3 +1250,18 @@ def test_what_a_module_cannot_import_is_its_own_error(tmp_path, monkeypatch):
         attach_handler(print, "lame_model.Walk.go", "before")
     with pytest.raises(UnknownTargetError, match="lame_modell"):
         attach_handler(print, "lame_modell.Walk.go", "before")
+
+
+def test_errors_of_a_generator_that_is_closed_are_raised():
+    @expose_to_plugins
+    def items():
+        try:
+            yield 1
+        finally:
+            raise LookupError("while it was closed")
+
+    with handlers((lambda: None, items, "before_next")):
+        generator = items()
+        assert next(generator) == 1
+        with pytest.raises(LookupError, match="while it was closed"):
+            generator.close()

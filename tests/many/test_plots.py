@@ -292,6 +292,7 @@ def test_policies_have_panels_of_their_own_unless_they_are_many():
     many = plot_timeline(collected(30))
     assert [axes.get_title(loc="left") for axes in many.axes[:2]] == ["30 agents: action", "reward"]
     assert len(drawn(many.axes[0])) == 60
+    assert texts(many.axes[0]) == ["1"]
 
 
 def test_decisions_of_the_same_time_share_it():

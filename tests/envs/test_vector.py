@@ -337,13 +337,14 @@ def test_boxes_take_actions_in_other_dtypes():
 def test_observations_are_copies_unless_told_otherwise(kind, copy):
     model, decision = VARIETY[kind]
     envs = vector_env(model, {POINT: decision}, num_envs=2, copy=copy)
-    first, _ = envs.reset(seed=0)
-    image = first["image"] if kind == "nested" else first
-    kept = image.copy()
-    second, *others = envs.step([1, 1])
-    assert np.shares_memory(image, second["image"] if kind == "nested" else second) != copy
-    assert np.array_equal(image, kept) == copy
-    assert not any(np.shares_memory(a, b) for a, b in zip(others[:3], envs.step([1, 1])[1:4], strict=True))
+    told = [envs.reset(seed=0)]
+    for _ in range(2):
+        image = told[-1][0]["image"] if kind == "nested" else told[-1][0]
+        kept = image.copy()
+        told.append(envs.step([1, 1]))
+        assert np.shares_memory(image, told[-1][0]["image"] if kind == "nested" else told[-1][0]) != copy
+        assert np.array_equal(image, kept) == copy
+    assert not any(np.shares_memory(a, b) for a, b in zip(told[1][1:4], told[2][1:4], strict=True))
     envs.close()
 
 

@@ -140,7 +140,7 @@ def panels_of(parts: Mapping[Any, Trajectories], episode: int, agents: Any, acti
         )
     if agents is not None:
         rows = _chosen(rows, agents, episode)
-    keys = list(dict.fromkeys(row.key for row in rows))
+    keys = dict.fromkeys(row.key for row in rows)
     alike = len({tuple((leaf.name, leaf.width, leaf.names is None) for leaf in leaves[key]) for key in keys}) == 1
     if len(keys) <= CHARTED or not alike:
         return [Panel(title_of(key), [row for row in rows if row.key == key], leaves[key]) for key in keys]

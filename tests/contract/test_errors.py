@@ -25,6 +25,7 @@ from simenv_marl import (
     parallel_env,
     single_env,
 )
+from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, calling, culprits, decision, decisions, define, notes, play, script, step
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
@@ -597,22 +598,6 @@ def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_
 # -- threads --------------------------------------------------------------------------------------
 
 
-def in_a_thread(function):
-    """Run a function in a thread; return what it has returned or raised."""
-    outcome = []
-
-    def run():
-        try:
-            outcome.append(function())
-        except BaseException as error:
-            outcome.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    return outcome[0]
-
-
 @pytest.mark.greenlet("threads of their own may be used from any other")
 @VIEWS
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
@@ -630,10 +615,9 @@ def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_n
     env = view(script(main), decide)
     env.reset()
     step(env, 1, "a_0")
-    error = in_a_thread(lambda: step(env, 5, "a_0") if what == "step" else getattr(env, what)())
-    assert isinstance(error, WrongThreadError)
-    assert isinstance(error, RuntimeError)
-    assert 'driver="thread"' in str(error)
+    with pytest.raises(WrongThreadError, match='driver="thread"') as caught:
+        in_a_thread(lambda: step(env, 5, "a_0") if what == "step" else getattr(env, what)())
+    assert isinstance(caught.value, RuntimeError)
     assert not unwound
     step(env, 2, "a_0")
     assert env.unwrapped.simulation.log == [1, 2]

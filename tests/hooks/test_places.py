@@ -49,6 +49,14 @@ class Base:
         return self.__hidden()
 
 
+class _Base(Base):
+    def __hidden(self):
+        return "hidden"
+
+    def look(self):
+        return self.__hidden()
+
+
 class Sub(Base):
     pass
 
@@ -69,15 +77,17 @@ def taken(hook):
 # -- names ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["Base.__hidden", "Base._Base__hidden"])
-def test_private_names_are_found_as_they_are_written_and_as_they_are(name):
-    assert resolve(f"{HERE}.{name}", TARGET) == (Base, "_Base__hidden")
-    hook = hook_of_name(f"{HERE}.{name}")
+@pytest.mark.parametrize("owner", [Base, _Base])
+@pytest.mark.parametrize("name", ["__hidden", "_Base__hidden"])
+def test_private_names_are_found_as_they_are_written_and_as_they_are(owner, name):
+    name = f"{HERE}.{owner.__name__}.{name}"
+    assert resolve(name, TARGET) == (owner, "_Base__hidden")
+    hook = hook_of_name(name)
     hook.hold()
     taken(hook)
-    assert Base().look() == "taken"
+    assert owner().look() == "taken"
     hook.let_go()
-    assert Base().look() == "hidden"
+    assert owner().look() == "hidden"
 
 
 @pytest.mark.parametrize(

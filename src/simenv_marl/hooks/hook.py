@@ -403,7 +403,7 @@ class Hook(Target):
 
     def _changed(self) -> None:
         takers, slot = self.takers, self.slot
-        for plugins in slot if self.rule is self.function else [None, *slot]:
+        for plugins in list(slot) if self.rule is self.function else [None, *slot]:  # the collector may change it
             takers[plugins] = self.around(self.run_rule, plugins)
         for key, taker in list(takers.items()):
             if not isinstance(key, greenlet):

@@ -339,9 +339,12 @@ def report(results: list[dict[str, Any]]) -> None:
         print(f"\n{what:32} drawn killed")
         for name in sorted(drawn):
             print(f"{name:32} {drawn[name]:5} {killed[name]:6}")
-    known = {(entry["module"], entry["change"].strip()): entry["why"] for entry in reasons()}
+    known = {(entry["module"], entry.get("change", "").strip()): entry["why"] for entry in reasons()}
     survivors = [result for result in results if result["outcome"] == "survived"]
-    told = [(result, known.get((result["module"], change_of(result)))) for result in survivors]
+    told = [
+        (result, known.get((result["module"], change_of(result)), known.get((result["module"], ""))))
+        for result in survivors
+    ]
     for result, why in sorted(told, key=lambda pair: pair[1] is None):
         print(f"\nsurvived {result['of']} tests: {result['mutant']}\n{why or result['diff']}")
     seconds = sum(result["seconds"] for result in results) / max(1, len(results))

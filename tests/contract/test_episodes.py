@@ -366,11 +366,14 @@ def test_an_observation_is_computed_when_its_decision_arises():
     assert env.observe("b_0").tolist() == [122, 1]
 
 
-def test_at_the_end_the_observation_is_computed_from_the_last_arguments():
+def test_at_the_end_observation_and_reward_are_computed_from_the_last_arguments():
     def decide(entity, *, size):
         return 0
 
-    decide = define(observation_space_mapping=lambda entity, size: [entity["level"], size])(decide)
+    decide = define(
+        observation_space_mapping=lambda entity, size: [entity["level"], size],
+        reward_mapping=lambda entity, size: size,
+    )(decide)
     entities = [{"level": 1}, {"level": 2}]
 
     def main(simulation):
@@ -380,8 +383,9 @@ def test_at_the_end_the_observation_is_computed_from_the_last_arguments():
 
     env = single_env(script(main), decide)
     assert env.reset()[0].tolist() == [1, 5]
-    assert env.step(1)[0].tolist() == [2, 6]
-    assert env.step(1)[0].tolist() == [20, 6]
+    for expected, observed in ((6.0, [2, 6]), (6.0, [20, 6])):
+        observation, reward, *_ = env.step(1)
+        assert (observation.tolist(), reward) == (observed, expected)
 
 
 @pytest.mark.parametrize(

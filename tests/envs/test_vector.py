@@ -221,6 +221,14 @@ def test_some_can_be_reset_with_options_for_them():
     envs.close()
 
 
+def test_a_mask_may_name_all_at_first():
+    envs = vector_env(Counter, Counter.decide, num_envs=2)
+    with pytest.raises(NotResetError, match="no episodes yet"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.reset(options={"reset_mask": np.ones(2, np.bool_)})
+    envs.close()
+
+
 def test_without_autoreset_an_ended_episode_must_be_reset():
     envs = vector_env(Counter, Counter.decide, num_envs=3, autoreset_mode="Disabled")
     envs.reset(seed=0)

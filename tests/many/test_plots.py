@@ -107,7 +107,9 @@ def test_the_clock_is_what_runs_from_left_to_right():
             simulation.log.append(ant())
 
     ant = decision(agent="ant_0")
-    figure = plot_timeline(collect_episodes(clocked(main), {ant: lambda seen: [1]}, seeds=[1]))
+    bee = decision(agent="bee_0")  # who never decides, and so tells no time
+    policies = {ant: lambda seen: [1], bee: lambda seen: [1]}
+    figure = plot_timeline(collect_episodes(clocked(main), policies, seeds=[1]))
     assert dots(figure.axes[0]) == [([[0, 1], [10, 1], [20, 1]], True)]
     assert figure.axes[-1].get_xlabel() == "time"
     (ending,) = figure.axes[0].lines[1:]
@@ -258,6 +260,7 @@ def test_rows_of_actions_with_components_are_coloured_by_one():
     assert values("how[0]") == {1}
     assert values("how[1]") == {2}
     assert "how[0], one of 3" in plot_timeline(found).axes[0].get_title(loc="left")
+    assert "action far, one of 3" in plot_timeline(found, component="far").axes[0].get_title(loc="left")
     with pytest.raises(OptionValueError, match=r"'how\[1\]'"):
         plot_timeline(found, component="where")
 

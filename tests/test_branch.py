@@ -41,6 +41,7 @@ from simenv_marl import (
     single_env,
 )
 from simenv_marl.core import episode
+from simenv_marl.core.forking import loops_on
 from tests.worlds import filing
 from tests.worlds.copied import Walk
 from tests.worlds.filing import Archive
@@ -640,6 +641,37 @@ class Clerks(Holding):
 
     def run(self):
         asyncio.run(self.all())
+
+
+class Listening(Holding):
+    """A task that is woken by what arrives in a pipe."""
+
+    async def hear(self):
+        loop, (reading, writing) = asyncio.get_running_loop(), os.pipe()
+        for number in range(3):
+            heard = loop.create_future()
+            loop.add_reader(reading, lambda heard=heard: heard.done() or heard.set_result(os.read(reading, 1)))
+            filing.choose()
+            os.write(writing, bytes([number]))
+            self.log.append(await asyncio.wait_for(heard, 10))
+        loop.remove_reader(reading)
+        os.close(reading)
+        os.close(writing)
+
+    def run(self):
+        asyncio.run(self.hear())
+
+
+def test_what_event_loops_listen_to_goes_on_in_a_fork():
+    env = single_env(Listening, filing.choose)
+    env.reset()
+    env.step(1)
+    assert branch(env, filing.left, 1, method="fork") == [filing.left(env)] == [[b"\0", b"\1", b"\2"]]
+
+
+def test_where_asyncio_is_not_imported_there_are_no_event_loops(monkeypatch):
+    monkeypatch.delitem(sys.modules, "asyncio.selector_events")
+    assert loops_on({0}) == []
 
 
 def test_event_loops_of_asyncio_go_on_in_a_fork():

@@ -160,6 +160,8 @@ def test_what_cannot_be_looked_at(command, target, told, capsys):
         ["check", "walking:Walk", "--seed", "-1"],
         ["check", "walking:Walk", "--episodes", "0"],
         ["check", "walking:Walk", "--time-limit", "never"],
+        ["check", "walking:Walk", "--time-limit", "0"],
+        ["check", "walking:Walk", "--time-limit", "inf"],
     ],
 )
 def test_wrong_arguments(arguments, capsys):
@@ -167,3 +169,8 @@ def test_wrong_arguments(arguments, capsys):
         main(arguments)
     assert caught.value.code == 2
     assert "usage" in capsys.readouterr().err
+
+
+def test_less_than_a_second_is_a_limit_too(capsys):
+    assert main(["check", "walking:Walk", "--time-limit", "0.5", "--episodes", "1"]) in (0, 1)
+    assert capsys.readouterr().err == ""

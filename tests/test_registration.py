@@ -465,23 +465,15 @@ print(pettingzoo.make("parallel", {COOP!r}).possible_agents)
     assert run_apart(code).splitlines() == [*many_registered.IDS[:-1], *["['helm_0', 'sail_0']"] * 2]
 
 
-def test_in_another_process_by_its_spec():
-    text = gymnasium.make(SINGLES[0], max_steps=2).spec.to_json()
-    code = f"""
-import gymnasium, tests.worlds.many_registered
-from gymnasium.envs.registration import EnvSpec
-env = gymnasium.make(EnvSpec.from_json({text!r}))
-print(env.reset(seed=5)[0].tolist())
-"""
-    here, _ = gymnasium.make(SINGLES[0]).reset(seed=5)
-    assert run_apart(code) == str(here.tolist())
-
-
-def test_in_another_process_by_its_spec_alone():
+@pytest.mark.parametrize(
+    ("prefix", "import_first"), [("", "import tests.worlds.many_registered"), ("tests.worlds.many_registered:", "")]
+)
+def test_in_another_process_by_its_spec(prefix, import_first):
     """A spec that was written down says all that is needed, as those of other environments do."""
-    text = gymnasium.make(f"tests.worlds.many_registered:{SINGLES[0]}").spec.to_json()
+    text = gymnasium.make(f"{prefix}{SINGLES[0]}", max_steps=2).spec.to_json()
     code = f"""
 import gymnasium
+{import_first}
 from gymnasium.envs.registration import EnvSpec
 env = gymnasium.make(EnvSpec.from_json({text!r}))
 print(env.reset(seed=5)[0].tolist())

@@ -5,7 +5,10 @@ line. Started once more, the script goes on where it was stopped; with ``--again
 is what one wants when tests have been added. It draws from all modules except ``testing`` and ``many/plots.py``.
 
 Before the first mutant, the tests run once and it is measured which of them execute which lines, and how long they
-take. A mutant is only shown to tests that execute its line, some quick ones of each file first.
+take. A mutant is only shown to tests that execute its function: first those that execute its line, some quick ones of
+each file before the others.
+
+Some changes are no mistakes: ``mutants_known.toml`` has each with the reason why no test need find it.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -60,19 +64,26 @@ class Measured:
     def tests(self, mutant: Mutant) -> list[str]:
         """The tests that could find a mutant, in the order in which they are to run.
 
-        A line that no test executes in this process may be executed in others, or be one that is executed at the
-        import: then those tests are taken that execute anything in its function, or else in its module.
+        First those that execute its line; then those that execute anything in its function, because what comes after a
+        switch between stacks is not always measured. Of what nothing executes, as at the import, all tests of the files
+        that execute anything in its module.
         """
         lines = self.lines.get(mutant.module, {})
-        found: set[str] = set()
-        for first, last in (mutant.lines, mutant.function, (0, 10**9)):
-            found = {test for line, tests in lines.items() if first <= line <= last for test in tests}
-            if found:
-                break
+        found = [
+            {test for line, tests in lines.items() if first <= line <= last for test in tests}
+            for first, last in (mutant.lines, mutant.function)
+        ]
+        if not any(found):
+            files = {file_of(test) for tests in lines.values() for test in tests}
+            found = [{test for test in self.seconds if not files or file_of(test) in files}]
+        return list(dict.fromkeys(test for tests in found for test in self.ordered(tests)))
+
+    def ordered(self, found: set[str]) -> list[str]:
+        """Tests in the order in which they are to run: some quick ones of each file first."""
         by_file: dict[str, list[str]] = {}
         for test in self.seconds:
-            if test in found or not found:
-                by_file.setdefault(test.partition("::")[0], []).append(test)
+            if test in found:
+                by_file.setdefault(file_of(test), []).append(test)
         files = sorted(by_file.values(), key=lambda tests: sum(map(self.seconds.__getitem__, tests)))
         quick = [[test for test in tests if self.seconds[test] < QUICK] for tests in files]
         first_ones = [
@@ -82,7 +93,12 @@ class Measured:
         ]
         rest = [test for tests in files for test in tests]
         rest.sort(key=lambda test: "[thread" in test)  # what the first driver finds, the second one need not
-        return list(dict.fromkeys(first_ones + rest))
+        return first_ones + rest
+
+
+def file_of(test: str) -> str:
+    """The file in which a test stands."""
+    return test.partition("::")[0]
 
 
 def main() -> None:
@@ -261,7 +277,7 @@ def outcome(mutant: Mutant, folder: Path, measured: Measured) -> dict[str, Any]:
     notes.unlink(missing_ok=True)
     chosen = folder / "chosen.json"
     chosen.write_text(json.dumps({test: TEST_LIMIT + 10 * measured.seconds[test] for test in tests}), encoding="utf-8")
-    files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
+    files = list(dict.fromkeys(map(file_of, tests)))
     options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "tools.mutants_plugin"]
     limit = 120 + 3 * sum(measured.seconds[test] for test in tests)
     try:
@@ -323,12 +339,31 @@ def report(results: list[dict[str, Any]]) -> None:
         print(f"\n{what:32} drawn killed")
         for name in sorted(drawn):
             print(f"{name:32} {drawn[name]:5} {killed[name]:6}")
+    known = {(entry["module"], entry.get("change", "").strip()): entry["why"] for entry in reasons()}
     survivors = [result for result in results if result["outcome"] == "survived"]
-    for result in survivors:
-        print(f"\nsurvived {result['of']} tests: {result['mutant']}\n{result['diff']}")
+    told = [
+        (result, known.get((result["module"], change_of(result)), known.get((result["module"], ""))))
+        for result in survivors
+    ]
+    for result, why in sorted(told, key=lambda pair: pair[1] is None):
+        print(f"\nsurvived {result['of']} tests: {result['mutant']}\n{why or result['diff']}")
     seconds = sum(result["seconds"] for result in results) / max(1, len(results))
-    share = 1 - len(survivors) / max(1, len(results))
-    print(f"\n{len(results)} mutants, {share:.0%} killed, {seconds:.0f} s each")
+    number, listed = len(results) - len(survivors), sum(why is not None for _, why in told)
+    print(f"\n{len(results)} mutants, {number / max(1, len(results)):.0%} killed, {seconds:.0f} s each")
+    print(f"{number / max(1, len(results) - listed):.0%} without the {listed} that are no mistakes")
+
+
+def reasons() -> list[dict[str, str]]:
+    """The changes that are known to be no mistakes."""
+    text = (ROOT / "tools/mutants_known.toml").read_text(encoding="utf-8")
+    found: list[dict[str, str]] = tomllib.loads(text)["known"]
+    return found
+
+
+def change_of(result: dict[str, Any]) -> str:
+    """The lines that a mutant has changed, wherever they stand: those before, and those after."""
+    lines = [line for line in result["diff"].splitlines()[3:] if line.startswith(("-", "+"))]
+    return "\n".join(f"{line[0]} {line[1:].strip()}" for line in lines)
 
 
 if __name__ == "__main__":

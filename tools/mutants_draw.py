@@ -1,6 +1,7 @@
 """Which mutants of a module there could be: each a small mistake of one of a few kinds.
 
-What cannot matter is left out: annotations, docstrings, the words of messages, what is only there for type checkers.
+What cannot matter is left out: annotations, docstrings, the words of messages, what is only there for type checkers,
+and what only says what holds anyway (``assert``, ``strict=``, the bodies of abstract methods).
 """
 
 from __future__ import annotations
@@ -186,6 +187,8 @@ def counts(statement: ast.stmt) -> bool:
     if isinstance(statement, ast.AnnAssign) and statement.value is None:
         return False
     text = ast.unparse(statement).partition("\n")[0]
+    if text == "raise NotImplementedError":
+        return False
     if isinstance(statement, ast.Assign) and text.startswith(("__all__", "__slots__")):
         return False
     if isinstance(statement, ast.If) and ("TYPE_CHECKING" in text or "__name__" in text):
@@ -215,6 +218,8 @@ def expressions(statement: ast.stmt) -> Iterator[ast.expr]:
         node = waiting.pop()
         if isinstance(node, ast.stmt | ast.JoinedStr | ast.arg | ast.ExceptHandler | ast.match_case):
             continue
+        if isinstance(node, ast.keyword) and node.arg == "strict":
+            continue
         if isinstance(node, ast.expr):
             yield node
         if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("cast", "TypeVar", "ParamSpec"):
@@ -241,6 +246,9 @@ def depend(one: ast.stmt, other: ast.stmt) -> bool:
     """Whether it may matter which of two statements comes first."""
     if ast.dump(one) == ast.dump(other) or not isinstance(one, ast.Assign | ast.AugAssign | ast.Expr | ast.Delete):
         return False  # what follows a return is never reached
+    lists = [appended_to(one), appended_to(other)]
+    if None not in lists and lists[0] != lists[1]:
+        return False
     calls = [
         any(isinstance(node, ast.Call | ast.Yield | ast.Await) for node in ast.walk(part)) for part in (one, other)
     ]
@@ -251,10 +259,21 @@ def depend(one: ast.stmt, other: ast.stmt) -> bool:
     return any(changed_by(this) & names_in(that) for this, that in ((one, other), (other, one)))
 
 
+def appended_to(statement: ast.stmt) -> str | None:
+    """What a statement appends something to, if it does nothing else."""
+    call = statement.value if isinstance(statement, ast.Expr) else None
+    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute) or call.func.attr != "append":
+        return None
+    alone = not any(isinstance(node, ast.Call) for argument in call.args for node in ast.walk(argument))
+    return ast.unparse(call.func.value) if alone else None
+
+
 def changed_by(statement: ast.stmt) -> set[str]:
     """What a statement assigns to, as it is written."""
+    inner = [node.target for node in ast.walk(statement) if isinstance(node, ast.comprehension)]
+    own = {id(name) for target in inner for name in ast.walk(target)}  # which nothing else sees
     nodes = (node for node in ast.walk(statement) if isinstance(getattr(node, "ctx", None), ast.Store))
-    return {ast.unparse(node) for node in nodes}
+    return {ast.unparse(node) for node in nodes if id(node) not in own}
 
 
 def names_in(statement: ast.stmt) -> set[str]:

@@ -127,7 +127,7 @@ def make_single(recipe: str, module: str, point: str, **options: Any) -> Any:
     return _make(known, "single", _single_options(known, point, options))
 
 
-def make_single_vector(recipe: str, module: str, point: str, num_envs: int = 1, **options: Any) -> Any:
+def make_single_vector(recipe: str, module: str, point: str, num_envs: int, **options: Any) -> Any:
     """The entry point of the vector view over such single views."""
     known = _recipe(recipe, module)
     return _make_vector(known, "single", num_envs, _single_options(known, point, options))
@@ -148,7 +148,7 @@ def make_joint(recipe: str, module: str, **options: Any) -> Any:
     return _make(known, "joint", {**known.options, "flatten": known.flatten, **options})
 
 
-def make_joint_vector(recipe: str, module: str, num_envs: int = 1, **options: Any) -> Any:
+def make_joint_vector(recipe: str, module: str, num_envs: int, **options: Any) -> Any:
     """The entry point of the vector view over joint views."""
     known = _recipe(recipe, module)
     return _make_vector(known, "joint", num_envs, {**known.options, "flatten": known.flatten, **options})

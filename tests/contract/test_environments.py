@@ -1,7 +1,5 @@
 """Section 4: generate_env, aec_env, single_env and their options."""
 
-import copy
-
 import gymnasium
 import numpy as np
 import pettingzoo
@@ -16,7 +14,6 @@ from simenv_marl import (
     DefinitionError,
     InvalidActionError,
     OptionValueError,
-    SimEnvError,
     UnknownOptionError,
     UnknownPointError,
     ViewError,
@@ -474,33 +471,6 @@ def test_an_agent_has_one_decision_point():
         env.step(1)
 
 
-# -- copies ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("make", [aec_env, single_env])
-@pytest.mark.parametrize("state", ["fresh", "suspended", "over"])
-def test_a_copy_of_an_environment_works_or_is_refused(make, state):
-    env = make(calling(PUMP, PUMP), PUMP)
-    if state != "fresh":
-        env.reset()
-        env.step(1)
-    if state == "over":
-        env.step(1)
-    try:
-        copied = copy.deepcopy(env)
-    except (SimEnvError, TypeError):
-        pass
-    else:
-        copied.reset()
-        copied.step(3)
-        copied.step(4)
-        assert copied.unwrapped.simulation.log == [3, 4]
-        assert copied.unwrapped.simulation is not env.unwrapped.simulation
-    env.reset()
-    env.step(5)
-    assert env.unwrapped.simulation.log == [5]
-
-
 # -- rendering ------------------------------------------------------------------------------------
 
 
@@ -512,19 +482,6 @@ class Rendering(Script):
 
     def render(self, mode):
         return f"{mode} of {self.episodes}"
-
-
-@pytest.mark.parametrize("make", [aec_env, single_env, lambda *a, **k: generate_env(*a, **k)()])
-def test_rendering(make):
-    env = make(Rendering, PUMP, render_mode="ansi")
-    assert env.render_mode == "ansi"
-    assert list(env.metadata["render_modes"]) == ["ansi", "rgb_array"]
-    env.reset()
-    assert env.render() == "ansi of 1"
-    with pytest.raises(OptionValueError, match="is not one of the simulation's"):
-        make(Rendering, PUMP, render_mode="human")
-    with pytest.warns(UserWarning, match="render_mode"):
-        assert make(Rendering, PUMP).render() is None
 
 
 @pytest.mark.parametrize("make", [aec_env, parallel_env, single_env, joint_env])

@@ -366,11 +366,14 @@ def test_an_observation_is_computed_when_its_decision_arises():
     assert env.observe("b_0").tolist() == [122, 1]
 
 
-def test_at_the_end_the_observation_is_computed_from_the_last_arguments():
+def test_at_the_end_observation_and_reward_are_computed_from_the_last_arguments():
     def decide(entity, *, size):
         return 0
 
-    decide = define(observation_space_mapping=lambda entity, size: [entity["level"], size])(decide)
+    decide = define(
+        observation_space_mapping=lambda entity, size: [entity["level"], size],
+        reward_mapping=lambda entity, size: size,
+    )(decide)
     entities = [{"level": 1}, {"level": 2}]
 
     def main(simulation):
@@ -380,8 +383,9 @@ def test_at_the_end_the_observation_is_computed_from_the_last_arguments():
 
     env = single_env(script(main), decide)
     assert env.reset()[0].tolist() == [1, 5]
-    assert env.step(1)[0].tolist() == [2, 6]
-    assert env.step(1)[0].tolist() == [20, 6]
+    for expected, observed in ((6.0, [2, 6]), (6.0, [20, 6])):
+        observation, reward, *_ = env.step(1)
+        assert (observation.tolist(), reward) == (observed, expected)
 
 
 @pytest.mark.parametrize(
@@ -880,18 +884,23 @@ def test_the_environment_keeps_no_entity_alive_that_the_model_has_let_go(point, 
     assert sorted(turn.agent for turn in turns if turn.terminated) == ["sheep_0", "sheep_1", "sheep_2"]
 
 
+class Grass:
+    pass
+
+
+class Goat:
+    def __init__(self):
+        self.meadow = [Grass(), Grass()]
+
+    def browse(self):
+        return self.meadow[0]
+
+
+def browsing(agent):
+    return {Goat.browse: define(agent=agent, action_space=spaces.Discrete(2), choices=lambda goat: list(goat.meadow))}
+
+
 def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
-    class Grass:
-        pass
-
-    class Goat:
-        def __init__(self):
-            self.meadow = [Grass(), Grass()]
-
-        @define(agent=lambda self: "goat_0", action_space=spaces.Discrete(2), choices=lambda self: list(self.meadow))
-        def browse(self):
-            return self.meadow[0]
-
     def main(simulation):
         goat = Goat()
         watched = [weakref.ref(grass) for grass in goat.meadow]
@@ -901,7 +910,7 @@ def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
         other()
 
     other = decision(agent="other_0")
-    env = aec_env(script(main), [Goat.browse, other])
+    env = aec_env(script(main), browsing(lambda goat: "goat_0") | {other: define(agent="other_0")})
     env.reset()
     env.step(1)
     env.step(0)
@@ -909,17 +918,6 @@ def test_the_environment_keeps_no_choice_alive_that_the_model_has_let_go():
 
 
 def test_a_choice_that_the_model_lets_go_at_once_goes_at_once():
-    class Grass:
-        pass
-
-    class Goat:
-        def __init__(self):
-            self.meadow = [Grass(), Grass()]
-
-        @define(agent="goat_0", action_space=spaces.Discrete(2), choices=lambda self: list(self.meadow))
-        def browse(self):
-            return self.meadow[0]
-
     def main(simulation):
         goat = Goat()
         watched = [weakref.ref(grass) for grass in goat.meadow]
@@ -927,7 +925,7 @@ def test_a_choice_that_the_model_lets_go_at_once_goes_at_once():
         simulation.log.append([watch() is None for watch in watched])
 
     for action, gone in ((RULE, [True, False]), (0, [True, False]), (1, [False, True])):
-        env = single_env(script(main), Goat.browse)
+        env = single_env(script(main), browsing("goat_0"))
         env.reset()
         env.step(action)
         assert env.unwrapped.simulation.log == [gone]

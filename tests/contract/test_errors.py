@@ -21,9 +21,14 @@ from simenv_marl import (
     WrongThreadError,
     aec_env,
     errors,
+    joint_env,
+    parallel_env,
     single_env,
 )
-from tests.worlds.models import Script, calling, culprits, decision, decisions, define, notes, play, script
+from tests.core.test_threads import in_a_thread
+from tests.worlds.models import Script, calling, culprits, decision, decisions, define, notes, play, script, step
+
+VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
 
 # -- the tree -------------------------------------------------------------------------------------
 
@@ -280,15 +285,6 @@ def test_errors_in_the_model_surface_as_themselves(kind, at, view):
 
 
 @pytest.mark.parametrize("view", [aec_env, single_env])
-def test_errors_before_the_first_decision_surface_from_reset(view):
-    bomb, decide = Bomb(1), decision()
-    env = view(calling(bomb, decide), decide)
-    _, answered = surfaces(env)
-    assert answered == 0
-    goes_on(env)
-
-
-@pytest.mark.parametrize("view", [aec_env, single_env])
 def test_errors_after_the_last_decision_surface_from_step(view):
     bomb, decide = Bomb(1), decision(agent="culprit_0")
     env = view(calling(decide, bomb), decide)
@@ -309,35 +305,23 @@ def test_errors_in_policies_surface_as_themselves():
         goes_on(env)
 
 
-def test_errors_in_reset_surface_as_themselves():
-    class Resetting(Script):
-        def reset(self, seed=None, options=None):
-            super().reset(seed, options)
-            bomb()
-
-    bomb, decide = Bomb(2), decision()
-    for view in (aec_env, single_env):
-        bomb.calls = 0
-        env = view(lambda: Resetting(lambda simulation: decide()), decide)
-        env.reset()
-        _, answered = surfaces(env)
-        assert answered == 0
-        goes_on(env)
-
-
 @pytest.mark.parametrize("trigger", ["close", "reset"])
-def test_errors_in_stop_surface_as_themselves(trigger):
+@pytest.mark.parametrize("where", ["stop", "finally"])
+def test_errors_while_unwinding_surface_as_themselves(where, trigger):
     unwound = []
 
     class Stopping(Script):
         def stop(self):
-            bomb()
+            if where == "stop":
+                bomb()
 
     def main(simulation):
         try:
             decide()
         finally:
             unwound.append(True)
+            if where == "finally":
+                bomb()
 
     decide = decision(agent="culprit_0")
     for view in (aec_env, single_env):
@@ -350,40 +334,6 @@ def test_errors_in_stop_surface_as_themselves(trigger):
         assert culprits(caught.value)[-1] == "culprit"
         assert "4711" in notes(caught.value)
         assert unwound == [True]
-        goes_on(env)
-
-
-@pytest.mark.parametrize("trigger", ["close", "reset"])
-def test_errors_while_unwinding_surface_as_themselves(trigger):
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            bomb()
-
-    decide = decision(agent="culprit_0")
-    for view in (aec_env, single_env):
-        bomb = Bomb(1)
-        env = view(script(main), decide)
-        env.reset(seed=4711)
-        with pytest.raises(Culprit) as caught:
-            getattr(env, trigger)()
-        assert culprits(caught.value)[-1] == "culprit"
-        assert "4711" in notes(caught.value)
-        goes_on(env)
-
-
-def test_errors_in_expected_calls_surface_as_themselves():
-    class Foreseeing(Script):
-        def expected_calls(self, point):
-            bomb()
-            return []
-
-    bomb, decide = Bomb(1), decision()
-    for view in (aec_env, single_env):
-        bomb.calls = 0
-        env = view(lambda: Foreseeing(lambda simulation: decide()), decide)
-        surfaces(env)
         goes_on(env)
 
 
@@ -574,7 +524,7 @@ def test_drawn_seeds_are_told_too_and_reproduce_the_error():
     [("step", where) for where in ("rule", "observation_space_mapping", "reward_mapping", "apply", "policy")]
     + [(what, where) for what in ("reset", "close") for where in ("rule", "observation_space_mapping")],
 )
-@pytest.mark.parametrize("view", [aec_env, single_env])
+@VIEWS
 def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing(where, what, view):
     seen = []
     armed = [False]
@@ -583,7 +533,7 @@ def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing
         if armed[0]:
             armed[0] = False
             with pytest.raises(ReentrancyError, match="the environment was used"):
-                env.step(1) if what == "step" else getattr(env, what)()
+                step(env, 1, "a_0") if what == "step" else getattr(env, what)()
             seen.append(what)
         return 1
 
@@ -598,21 +548,17 @@ def test_using_an_environment_from_inside_itself_is_an_error_and_changes_nothing
     env = view(calling(*[decide, other] * 3), [decide, other], policies=policies)
     env.reset()
     armed[0] = True
-    flags = []
-    for _ in range(3):
-        result = env.step(1)
-        flags.append(env.terminations["a_0"] if view is aec_env else result[2])
+    assert [step(env, 1, "a_0") for _ in range(3)] == [False, False, True]
     assert seen == [what]
-    assert flags == [False, False, True]
     assert env.unwrapped.simulation.log[::2] == [1, 1, 1]
     env.close()
     env.reset()
-    env.step(1)
+    step(env, 1, "a_0")
 
 
 @pytest.mark.parametrize("where", ["reset", "rule", "observation_space_mapping", "policy"])
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
-@pytest.mark.parametrize("view", [aec_env, single_env])
+@VIEWS
 def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_nothing(where, what, view):
     raised = []
 
@@ -626,7 +572,7 @@ def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_
         if not raised:
             raised.append(None)
             with pytest.raises(SimEnvError, match="reset") as caught:
-                env.step(1) if what == "step" else getattr(env, what)()
+                step(env, 1, "a_0") if what == "step" else getattr(env, what)()
             raised.append(type(caught.value))
         return 1
 
@@ -642,8 +588,8 @@ def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_
     env = view(lambda: Resetting(main), [decide, other], policies=policies)
     env.reset()
     assert raised[1] is ReentrancyError or (what == "step" and issubclass(raised[1], ResetNeededError))
-    env.step(3)
-    env.step(4)
+    step(env, 3, "a_0")
+    step(env, 4, "a_0")
     assert env.unwrapped.simulation.episodes == 1
     assert env.unwrapped.simulation.log == [(1, 3), (1, 4)]
     env.close()
@@ -652,24 +598,8 @@ def test_using_an_environment_from_inside_its_own_reset_is_an_error_and_changes_
 # -- threads --------------------------------------------------------------------------------------
 
 
-def in_a_thread(function):
-    """Run a function in a thread; return what it has returned or raised."""
-    outcome = []
-
-    def run():
-        try:
-            outcome.append(function())
-        except BaseException as error:
-            outcome.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    thread.join()
-    return outcome[0]
-
-
 @pytest.mark.greenlet("threads of their own may be used from any other")
-@pytest.mark.parametrize("view", [aec_env, single_env])
+@VIEWS
 @pytest.mark.parametrize("what", ["step", "reset", "close"])
 def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_nothing(what, view):
     unwound = []
@@ -681,16 +611,15 @@ def test_using_an_environment_from_another_thread_is_a_clear_error_and_changes_n
         finally:
             unwound.append(True)
 
-    decide = decision()
+    decide = decision(agent="a_0")
     env = view(script(main), decide)
     env.reset()
-    env.step(1)
-    error = in_a_thread(lambda: env.step(5) if what == "step" else getattr(env, what)())
-    assert isinstance(error, WrongThreadError)
-    assert isinstance(error, RuntimeError)
-    assert 'driver="thread"' in str(error)
+    step(env, 1, "a_0")
+    with pytest.raises(WrongThreadError, match='driver="thread"') as caught:
+        in_a_thread(lambda: step(env, 5, "a_0") if what == "step" else getattr(env, what)())
+    assert isinstance(caught.value, RuntimeError)
     assert not unwound
-    env.step(2)
+    step(env, 2, "a_0")
     assert env.unwrapped.simulation.log == [1, 2]
     env.close()
     assert unwound == [True]
@@ -715,7 +644,7 @@ def test_threads_with_environments_of_their_own_do_not_meet():
         for _ in range(3):
             env.reset()
             while not env.step(number)[2]:
-                pass
+                assert decide() == "rule"
         logs[number] = env.unwrapped.simulation.log
         assert decide() == "rule"
 

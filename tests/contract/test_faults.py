@@ -18,6 +18,7 @@ from simenv_marl import (
     RULE,
     ResetNeededError,
     aec_env,
+    difference,
     handlers,
     joint_env,
     parallel_env,
@@ -29,7 +30,7 @@ from simenv_marl import (
 )
 from simenv_marl.hooks.stacks import EVALUATING
 from tests.core.test_threads import in_a_thread
-from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play
+from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play, step
 
 # -- a model that may fail anywhere ---------------------------------------------------------------
 
@@ -498,14 +499,17 @@ def deep_down(function, room):
     return down(sys.getrecursionlimit() - here - room)
 
 
+class Announced(Script):
+    def expected_calls(self, point):
+        return [()]
+
+
 @pytest.mark.usefixtures("_collected")
 @VIEWS
 def test_an_environment_survives_the_end_of_its_users_stack(view):
-    decide = decision()
-
-    class Model(Script):
-        def expected_calls(self, point):
-            return [()]
+    numbers = count()
+    change = difference(lambda: next(numbers))
+    decide = decision(reward_mapping=change)
 
     def main(simulation):
         try:
@@ -514,15 +518,12 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
         finally:
             simulation.log.append("unwound")
 
-    def step():
-        env.step({"choose_0": 3} if view in (parallel_env, joint_env) else 3)
-
-    env = view(lambda: Model(main), decide)
+    env = view(lambda: Announced(main), decide)
     ends = set()
     for room in range(1, 60):
         env.reset()
         log = env.unwrapped.simulation.log
-        for what in (step, env.reset, env.close):
+        for what in (lambda: step(env, 3, "choose_0"), env.reset, env.close):
             try:
                 deep_down(what, room)
                 ends.add("went well")
@@ -533,9 +534,10 @@ def test_an_environment_survives_the_end_of_its_users_stack(view):
         env.reset()
         assert log[-1] == "unwound"
         for _ in range(3):
-            step()
+            step(env, 3, "choose_0")
         assert env.unwrapped.simulation.log == [3, 3, 3, "unwound"]
         assert nobody_is_asked()
+        assert change() == change() == 0.0
     assert ends >= {"went well", "came to the end"}
 
 
@@ -565,10 +567,6 @@ def test_a_runaway_recursion_surfaces_as_itself(view, where):
         action_space_mapping=at_place("action", 0),
     )
 
-    class Model(Script):
-        def expected_calls(self, point):
-            return [()]
-
     def main(simulation):
         try:
             for _ in range(3):
@@ -577,20 +575,17 @@ def test_a_runaway_recursion_surfaces_as_itself(view, where):
         finally:
             at_place("finally", 0)()
 
-    def step(action=3):
-        action = RULE if where == "rule" else action
-        env.step({"choose_0": action} if view in (parallel_env, joint_env) and action is not RULE else action)
-
-    env = view(lambda: Model(main), decide)
+    action = RULE if where == "rule" else 3
+    env = view(lambda: Announced(main), decide)
     for _ in range(2):
         env.reset(seed=5)
-        step()
+        step(env, action, "choose_0")
         armed.append(where)
         with pytest.raises(RecursionError) as caught:
-            env.close() if where == "finally" else step()
+            env.close() if where == "finally" else step(env, action, "choose_0")
         assert "run_away" in culprits(caught.value)  # a tracer may be the one that finds no room
         assert "seed 5" in notes(caught.value)
         env.reset()
         for _ in range(3):
-            step()
+            step(env, action, "choose_0")
     env.close()

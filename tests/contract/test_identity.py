@@ -20,7 +20,7 @@ from simenv_marl import (
     single_env,
 )
 from tests.worlds import random_worlds
-from tests.worlds.models import play
+from tests.worlds.models import follow_the_rule
 from tests.worlds.random_worlds import PLAN, POINTS, ROSTER, Yard, advised, designs, outcome, plain, seeds
 
 VIEWS = (aec_env, parallel_env, joint_env, single_env)
@@ -80,17 +80,7 @@ def test_with_rule_throughout_every_view_is_the_plain_run(design, seed, options)
     expected = outcome(plain(design, seed))
     for view in VIEWS:
         env = made(view, design, **options)
-        if view is aec_env:
-            play(env, RULE, seed=seed)
-        elif view is parallel_env:
-            env.reset(seed=seed)
-            while env.agents:
-                env.step(dict.fromkeys(env.agents, RULE))
-        else:
-            env.reset(seed=seed)
-            while not any(env.step(RULE)[2:4]):
-                pass
-        assert outcome(env.unwrapped.simulation) == expected, view
+        assert outcome(follow_the_rule(env, seed)) == expected, view
         env.close()
     assert outcome(simulate(lambda: Yard(design), points=POINTS, seed=seed, **options)) == expected
     assert outcome(simulate(lambda: Yard(design), dict.fromkeys(POINTS, RULE), seed=seed, **options)) == expected

@@ -24,20 +24,22 @@ from simenv_marl import (
     UnknownPointError,
     aec_env,
     difference,
+    joint_env,
     parallel_env,
     single_env,
 )
 from tests.worlds.many_worlds import (
     HERE,
+    NAMES_OF_THE_VILLAGE,
     AnnouncedHunt,
     Announcing,
     Answered,
     Being,
     Colony,
-    Design,
     Hunt,
     Other,
     Played,
+    Village,
     advised,
     answer,
     banish,
@@ -50,7 +52,7 @@ from tests.worlds.many_worlds import (
     others,
     seeds,
 )
-from tests.worlds.models import decision, decisions, define, notes, play, script
+from tests.worlds.models import decision, decisions, define, follow_the_rule, notes, play, script
 
 
 class Knowing:
@@ -82,6 +84,21 @@ def living(*numbers, ends=None):
         for number in numbers:
             simulation.log.append(simulation.beings[number].act())
         return ends
+
+    return script(main)
+
+
+def leaving(*others, before=lambda being: None):
+    """A factory of simulations in which a being decides and goes; then others decide."""
+
+    def main(simulation):
+        simulation.beings = [Being(0), *(Being(number) for number in others)]
+        first, *following = simulation.beings
+        first.act()
+        before(first)
+        first.leave()
+        for being in following:
+            being.act()
 
     return script(main)
 
@@ -693,14 +710,7 @@ def test_a_revived_agent_is_an_error_that_ends_the_episode(roster):
 
 
 def test_a_namesake_of_a_removed_agent_is_an_error_too():
-    def main(simulation):
-        one = Being(0)
-        one.act()
-        one.leave()
-        Being(1).act()
-        Being(0).act()
-
-    env = aec_env(script(main), beings())
+    env = aec_env(leaving(1, 0), beings())
     env.reset()
     env.step(1)
     env.step(None)
@@ -709,13 +719,7 @@ def test_a_namesake_of_a_removed_agent_is_an_error_too():
 
 
 def test_an_end_does_not_outlast_its_episode():
-    def main(simulation):
-        one = Being(0)
-        one.act()
-        one.leave()
-        Being(1).act()
-
-    env = aec_env(script(main), beings())
+    env = aec_env(leaving(1), beings())
     assert [turn.agent for turn in play(env, 1)] == [turn.agent for turn in play(env, 1)]
 
 
@@ -935,6 +939,21 @@ class Old(Leaver):
     pass
 
 
+def test_the_last_observation_is_of_the_last_arguments():
+    class Walker:
+        def walk(self, place):
+            return "rule"
+
+    def main(simulation):
+        simulation.walker = Walker()
+        simulation.walker.walk(1)
+        simulation.walker.walk(2)
+
+    point = define(agent=lambda walker, place: "walker_0", observation_space_mapping=lambda walker, place: [place, 0])
+    turns = play(aec_env(script(main), {Walker.walk: point}), 1)
+    assert [turn.observation[0] for turn in turns] == [1, 2, 2]
+
+
 def test_one_removal_ends_the_agents_of_several_points():
     leave = f"{__name__}.Leaver.leave"
     points = {
@@ -1031,14 +1050,7 @@ def test_removals_that_are_not_even_defined(removed_by):
 
 def test_removals_are_what_they_were_for_everybody_else():
     leave, act = vars(Being)["leave"], vars(Being)["act"]
-
-    def main(simulation):
-        one = Being(0)
-        one.act()
-        one.leave()
-        Being(1).act()
-
-    env = aec_env(script(main), beings())
+    env = aec_env(leaving(1), beings())
     env.reset()
     outside = Being(0)
     assert outside.act() == "rule"
@@ -1064,17 +1076,8 @@ def test_points_that_were_named_while_another_environment_was_open():
 
 
 def test_an_error_in_a_last_reward_surfaces():
-    def main(simulation):
-        one = Being(0)
-        one.act()
-        one.health = None
-        one.leave()
-        Being(1).act()
-
-    def wages(being):
-        return 1.0 + being.health
-
-    env = aec_env(script(main), beings(reward_mapping=wages, observation_space_mapping=lambda being: [0, 0]))
+    changes = {"reward_mapping": lambda being: 1.0 + being.health, "observation_space_mapping": lambda being: [0, 0]}
+    env = aec_env(leaving(1, before=lambda being: setattr(being, "health", None)), beings(**changes))
     env.reset()
     with pytest.raises(TypeError) as caught:
         env.step(1)
@@ -1285,30 +1288,15 @@ def test_observations_tell_what_is_needed(design, seed):
 def test_with_rule_throughout_a_colony_is_the_plain_run(design, seed):
     plain = Colony(design)
     plain.reset(seed)
-    ended = plain.run()
-    env = colony(aec_env, design)
-    played(env, lambda *_: RULE, seed)
-    assert env.simulation.trace == plain.trace
-    assert env.simulation.random.getstate() == plain.random.getstate()
-    assert (ended is TRUNCATED) == design.truncates
+    plain.run()
+    for view, roster in ((aec_env, False), (parallel_env, False), (joint_env, True)):
+        for simulation in (Colony, Announcing):
+            found = follow_the_rule(colony(view, design, simulation, roster=roster), seed)
+            assert found.trace == plain.trace
+            assert found.random.getstate() == plain.random.getstate()
 
 
 # -- PettingZoo's tests ---------------------------------------------------------------------------
-
-
-VILLAGE = Design(initial=5, most=40, ticks=12, overseen="after")
-NAMES_OF_THE_VILLAGE = [f"creature_{number}" for number in range(VILLAGE.most)]
-
-
-class Village(Colony):
-    """A colony that always has something to observe, and takes options."""
-
-    def __init__(self):
-        super().__init__(VILLAGE)
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed)
-        self.fortune = 7
 
 
 def village(**options):

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, rule
 
-from simenv_marl import RULE, EpisodeOverError, InvalidActionError, ResetNeededError, aec_env, single_env
-from tests.worlds.models import notes
+from simenv_marl import RULE, EpisodeOverError, InvalidActionError, ResetNeededError, aec_env, parallel_env, single_env
+from tests.worlds.models import follow_the_rule, notes
 from tests.worlds.worlds import (
     Design,
     FuseError,
@@ -100,10 +100,10 @@ def test_with_rule_throughout_it_is_the_plain_run(design, seed):
     plain = World(open_ended, points_of(open_ended))
     plain.reset(seed)
     plain.run()
-    env = made(open_ended)
-    list(turns_of(env, seed, [RULE] * 100))
-    assert env.unwrapped.simulation.trace == plain.trace
-    assert env.unwrapped.simulation.random.getstate() == plain.random.getstate()
+    for make in (aec_env, parallel_env):
+        simulation = follow_the_rule(made(open_ended, make), seed)
+        assert simulation.trace == plain.trace
+        assert simulation.random.getstate() == plain.random.getstate()
 
 
 @given(designs(), seeds, answers)

@@ -1,11 +1,8 @@
 """The parallel view: what becomes of the actions of a round."""
 
-import gc
 import warnings
 from collections import Counter
-from dataclasses import replace
 from functools import cache
-from threading import Thread
 
 import numpy as np
 import pytest
@@ -30,29 +27,28 @@ from simenv_marl import (
     ResetNeededError,
     RewardError,
     UnknownAgentError,
-    WrongThreadError,
     aec_env,
     difference,
     generate_env,
-    joint_env,
     parallel_env,
 )
 from tests.worlds import worlds
 from tests.worlds.many_worlds import (
     HERE,
+    NAMES_OF_THE_VILLAGE,
     Announcing,
     Answered,
     Being,
-    Colony,
-    Design,
+    Village,
     answer,
+    being_of,
     beings,
     colony,
     colony_points,
     designs,
     seeds,
 )
-from tests.worlds.models import calling, decision, define, notes, script
+from tests.worlds.models import Script, calling, decision, define, notes, script
 
 
 def points(number=2, **changes):
@@ -885,26 +881,11 @@ def test_max_steps_counts_rounds():
             ended = number == 2
             assert flags(results) == {"ant_0": (False, ended), "bee_0": (False, ended)}
             assert results[1] == {"ant_0": 1.0, "bee_0": 1.0}
+        assert deciding(results) == env.agents == []
+        assert not any(env.step({}))
+        with pytest.raises(EpisodeOverError, match="begin the next one"):
+            env.step({"ant_0": 1, "bee_0": 1})
         assert env.simulation.log == [0, 0, 1, 1, 2, 2]
-        assert env.agents == []
-
-
-def test_nothing_goes_on_after_max_steps():
-    ant, bee = points(reward_mapping=lambda: 1.0)
-    env = parallel_env(endless(ant, bee), [ant, bee], max_steps=1)
-    env.reset()
-    env.step({"ant_0": 1, "bee_0": 1})
-    assert not any(env.step({}))
-    with pytest.raises(EpisodeOverError, match="begin the next one"):
-        env.step({"ant_0": 1, "bee_0": 1})
-    assert env.simulation.log == [1, 1]
-
-
-def test_nothing_is_pending_after_max_steps():
-    ant, bee = points()
-    env = parallel_env(endless(ant, bee), [ant, bee], max_steps=1)
-    env.reset()
-    assert deciding(env.step({"ant_0": 1, "bee_0": 1})) == []
 
 
 def test_a_step_without_an_action_does_not_count():
@@ -953,31 +934,6 @@ def test_steps_out_of_place():
     assert env.agents == ["ant_0", "bee_0"]
 
 
-def test_an_episode_without_a_decision():
-    ant = decision(agent="ant_0")
-    with pytest.raises(NoDecisionError, match="without a decision"):
-        parallel_env(calling(), ant).reset()
-
-
-def test_an_error_of_the_model_surfaces_from_the_round():
-    ant, bee = points()
-
-    def main(simulation):
-        ant()
-        bee()
-        raise ZeroDivisionError
-
-    env = parallel_env(script(main), [ant, bee])
-    env.reset(seed=17)
-    with pytest.raises(ZeroDivisionError) as caught:
-        env.step({"ant_0": 1, "bee_0": 1})
-    assert "seed 17" in notes(caught.value)
-    assert "bee_0" in notes(caught.value)
-    assert env.agents == []
-    env.reset()
-    assert env.agents == ["ant_0", "bee_0"]
-
-
 @pytest.mark.parametrize("mapping", ["reward_mapping", "observation_space_mapping", "action_mask_mapping"])
 def test_an_error_in_a_mapping_says_whose_it_was(mapping):
     good = {"reward_mapping": 0.0, "observation_space_mapping": [1, 2], "action_mask_mapping": [1] * 10}[mapping]
@@ -997,47 +953,6 @@ def test_an_error_in_a_mapping_says_whose_it_was(mapping):
     assert env.agents == []
 
 
-def test_closing_in_mid_round_answers_nobody():
-    ant, bee = points()
-    ended = []
-
-    def main(simulation):
-        try:
-            simulation.log.append(ant())
-            simulation.log.append(bee())
-        finally:
-            ended.append(list(simulation.log))
-
-    env = parallel_env(script(main), [ant, bee])
-    env.reset()
-    env.step({"ant_0": 1})
-    env.close()
-    assert ended == [[1]]
-
-
-@pytest.mark.parametrize("method", ["step", "reset", "close"])
-@pytest.mark.parametrize("make", [aec_env, parallel_env, joint_env])
-def test_an_environment_is_not_used_from_inside_itself(make, method):
-    """Neither by a mapping that is asked at the return of a round."""
-    calls = []
-    action = 1 if make is aec_env else {"ant_0": 1}
-
-    def pay():
-        calls.append(0)
-        if len(calls) == 2:
-            getattr(env, method)(*[action][: method == "step"])
-        return 0.0
-
-    ant = decision(agent="ant_0", reward_mapping=pay)
-    env = make(calling(ant, ant, ant, ant), ant)
-    env.reset()
-    with pytest.raises(ReentrancyError, match="was used from"):
-        env.step(action)
-    assert env.simulation.log == [1]
-    env.reset()
-    env.step(action)
-
-
 def test_an_environment_is_not_used_while_it_asks_who_is_expected():
     class Nosy(Hive):
         def expected_calls(self, point):
@@ -1052,50 +967,6 @@ def test_an_environment_is_not_used_while_it_asks_who_is_expected():
     env.reset()
     with pytest.raises(ReentrancyError, match="was used from"):
         env.step({"being_0": 1, "being_1": 1})
-
-
-@pytest.mark.greenlet("threads of their own may be used from any other")
-@pytest.mark.parametrize("make", [parallel_env, joint_env])
-def test_rounds_are_played_in_the_thread_of_the_episode(make):
-    ant, bee = points()
-    env = make(calling(ant, bee, ant, bee), [ant, bee])
-    env.reset()
-    caught = []
-
-    def elsewhere():
-        try:
-            env.step({"ant_0": 1, "bee_0": 2})
-        except WrongThreadError as error:
-            caught.append(error)
-
-    thread = Thread(target=elsewhere)
-    thread.start()
-    thread.join()
-    assert len(caught) == 1
-    assert env.simulation.log == []
-    env.step({"ant_0": 1, "bee_0": 2})
-    assert env.simulation.log == [1, 2]
-
-
-def test_an_abandoned_environment_unwinds_its_simulation():
-    ant, bee = points()
-    ended = []
-
-    def main(simulation):
-        try:
-            ant()
-            bee()
-        finally:
-            ended.append(True)
-
-    for make in (parallel_env, joint_env):
-        env = make(script(main), [ant, bee])
-        env.reset()
-        env.step(dict.fromkeys(["ant_0", "bee_0"], RULE))
-        env.reset()
-        del env
-        gc.collect()
-    assert ended == [True] * 4
 
 
 def test_what_is_returned_is_the_users_own():
@@ -1360,21 +1231,6 @@ def test_a_colony_that_announces_loses_no_reward(design, seed):
             assert totals[agent] == plain.last[agent] - joined[agent]
 
 
-@given(designs, seeds)
-@settings(max_examples=60)
-def test_with_rule_throughout_a_colony_is_the_plain_run(design, seed):
-    plain = Colony(design)
-    plain.reset(seed)
-    plain.run()
-    for simulation in (Colony, Announcing):
-        env = colony(parallel_env, design, simulation)
-        env.reset(seed=seed)
-        while env.agents:
-            env.step(dict.fromkeys(env.agents, RULE))
-        assert env.simulation.trace == plain.trace
-        assert env.simulation.random.getstate() == plain.random.getstate()
-
-
 # -- points of all kinds --------------------------------------------------------------------------
 
 
@@ -1413,31 +1269,7 @@ def test_in_turns_it_is_the_aec_view(design, seed, answers):
     assert set(truncated.values()) == set(aec.truncations.values())
 
 
-@given(worlds.designs(), seeds)
-@settings(max_examples=100)
-def test_with_rule_throughout_it_is_the_plain_run(design, seed):
-    design = replace(design, policies=frozenset(), max_steps=None)
-    plain = worlds.World(design, worlds.points_of(design))
-    plain.reset(seed)
-    plain.run()
-    env = made(design, parallel_env)
-    env.reset(seed=seed)
-    while env.agents:
-        env.step(RULE)
-    assert env.simulation.trace == plain.trace
-    assert env.simulation.random.getstate() == plain.random.getstate()
-
-
 # -- PettingZoo's tests ---------------------------------------------------------------------------
-
-
-VILLAGE = Design(initial=5, most=40, ticks=12, overseen="after")
-NAMES_OF_THE_VILLAGE = [f"creature_{number}" for number in range(VILLAGE.most)]
-
-
-class Village(Colony):
-    def __init__(self):
-        super().__init__(VILLAGE)
 
 
 class AnnouncingVillage(Village, Announcing):
@@ -1543,3 +1375,27 @@ def test_what_cannot_be_observed_anew_is_never_the_same_object():
         observations, *_ = env.step({"being_0": 1, "being_1": 1})
         assert observations["being_0"].tolist() == [0, 0]
         observations["being_0"][:] = 99
+
+
+def test_one_that_was_announced_can_be_removed_when_its_agent_has_no_name_any_more():
+    class Crowd(Script):
+        def reset(self, seed=None):
+            super().reset(seed)
+            self.beings = [Being(0), Being(1)]
+
+        def expected_calls(self, point):
+            return [(being,) for being in self.beings]
+
+    def main(simulation):
+        one, other = simulation.beings
+        one.act()
+        other.health = 1
+        other.leave()
+        one.act()
+
+    named = beings(agent=lambda being: being_of(being) if being.health == 0 else None)
+    env = parallel_env(lambda: Crowd(main), named)
+    env.reset()
+    assert env.agents == ["being_0", "being_1"]
+    _, _, terminations, *_ = env.step({"being_0": 1, "being_1": 1})
+    assert terminations == {"being_0": False, "being_1": True}

@@ -59,39 +59,6 @@ class Banking(Script):
         return account.money
 
 
-def trace(env, seed, action_of):
-    """Everything that an episode tells, step by step."""
-    env.reset(seed=seed)
-    for agent in env.agent_iter():
-        observation, *rest = env.last()
-        ended = rest[1] or rest[2 - 1]
-        action = None if ended else action_of()
-        yield agent, observation.tolist(), rest, action
-        env.step(action)
-
-
-@pytest.mark.parametrize("number", [2, 5])
-def test_interleaved_environments_do_what_each_does_alone(number):
-    points = [Account.spend, Account.earn]
-
-    def actions(seed):
-        source = random.Random(seed)
-        return lambda: RULE if source.random() < 0.3 else source.randrange(10)
-
-    alone = [list(trace(aec_env(Banking, points), seed, actions(seed))) for seed in range(number)]
-    env_class = generate_env(Banking, points)
-    together = [[] for _ in range(number)]
-    running = [(n, trace(env_class(), n, actions(n))) for n in range(number)]
-    order = random.Random(1)
-    while running:
-        n, episode = order.choice(running)
-        try:
-            together[n].append(next(episode))
-        except StopIteration:
-            running.remove((n, episode))
-    assert together == alone
-
-
 def test_some_may_run_their_rule_and_others_be_decided():
     one = aec_env(Banking, Account.spend)
     two = aec_env(Banking, Account.earn)
@@ -778,20 +745,6 @@ def test_models_may_recurse_as_deeply_as_without_an_environment():
     env.step(1)
     env.step(2)
     assert env.unwrapped.simulation.log == [1, 2]
-
-
-@pytest.mark.usefixtures("_collected")
-def test_a_runaway_recursion_of_the_model_is_its_error():
-    def runaway():
-        return runaway()
-
-    decide = decision(runaway)
-    env = single_env(calling(decide), decide)
-    env.reset()
-    with pytest.raises(RecursionError):
-        env.step(RULE)
-    env.reset()
-    env.step(1)
 
 
 def test_many_environments_may_be_suspended_at_once():

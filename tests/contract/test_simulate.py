@@ -21,6 +21,7 @@ from simenv_marl import (
     aec_env,
     difference,
     simulate,
+    simulate_many,
 )
 from tests.worlds.many_worlds import (
     HERE,
@@ -82,41 +83,6 @@ def test_policies_see_what_agents_see():
     )
     assert simulate(calling(ant, ant), {ant: policy}).log == [1, 1]
     assert seen == [([0], [0, 1] + [0] * 8), ([1], [0, 1] + [0] * 8)]
-
-
-def test_policies_may_leave_it_to_the_rule():
-    answers = iter([3, RULE, 4])
-    ant = decision(agent="ant_0")
-    assert simulate(calling(ant, ant, ant), {ant: lambda observation: next(answers)}).log == [3, "rule", 4]
-
-
-def test_choices_and_apply():
-    ant = decision(agent="ant_0", choices=lambda: ["x", "y"], action_space=spaces.Discrete(2))
-    bee = decision(agent="bee_0", apply=lambda action: action * 10)
-    policies = {ant: lambda observation: 1, bee: lambda observation: 2}
-    assert simulate(calling(ant, bee), policies).log == ["y", 20]
-
-
-def test_policies_of_entities():
-    def main(simulation):
-        for number in (0, 1, 2, 1):
-            simulation.log.append(Being(number).act())
-
-    policies = {"being_1": lambda observation: 5}
-    assert simulate(script(main), policies, points=beings()).log == ["rule", 5, "rule", 5]
-    policies = {Being.act: lambda observation: int(observation[0])}
-    assert simulate(script(main), policies, points=beings()).log == [0, 1, 2, 1]
-
-
-def test_entities_may_die():
-    def main(simulation):
-        one, two = Being(0), Being(1)
-        for being in (one, two):
-            simulation.log.append(being.act())
-        one.leave()
-        simulation.log.append(two.act())
-
-    assert simulate(script(main), {Being.act: lambda observation: 5}, points=beings()).log == [5, 5, 5]
 
 
 def test_seeds():
@@ -235,6 +201,7 @@ def test_no_reward_is_asked_for():
     paid = []
     ant = decision(agent="ant_0", reward_mapping=lambda: paid.append(0) or 0.0)
     simulate(calling(ant, ant), {ant: lambda observation: 1})
+    simulate_many(calling(ant, ant), {ant: lambda observations: [1] * 3}, seeds=range(3))
     assert paid == []
 
 
@@ -339,6 +306,8 @@ def test_policies_keep_nobody_alive(action):
 
     points = beings(observation_space_mapping=lambda being: [0.0, 0.0])
     assert simulate(script(main), {Being.act: lambda observation: action}, points=points).log == [True] * 3
+    many = simulate_many(script(main), {Being.act: lambda observations: [action] * 4}, points=points, seeds=range(4))
+    assert [simulation.log for simulation in many] == [[True] * 3] * 4
     points |= {Other.act: beings(agent="other_0", removed_by=())[Being.act]}
     env = aec_env(script(main), points, policies={Being.act: lambda observation: action})
     with pytest.raises(NoDecisionError, match="without a decision"):  # nobody else decides

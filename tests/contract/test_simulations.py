@@ -1,6 +1,7 @@
 """Section 2, and 5.1 of the contract: what a simulation is, how it is made, reset, seeded and ended."""
 
 import threading
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -565,3 +566,20 @@ def test_rosters_may_be_iterators():
 def test_what_is_no_roster(roster):
     with pytest.raises(OptionValueError, match="possible_agents"):
         aec_env(script(lambda simulation: None), beings(), possible_agents=roster)
+
+
+def test_a_reset_may_be_any_callable():
+    class Ready(Simulation):
+        def __init__(self):
+            super().__init__()
+            self.got = []
+            self.reset = partial(self.begin, "size")
+
+        def begin(self, what, seed):
+            self.model = Model()
+            self.got.append((what, seed))
+
+    env = single_env(lambda: Ready(), Model.decide)
+    for seed in (1, 2):
+        env.reset(seed=seed)
+    assert env.unwrapped.simulation.got == [("size", 1), ("size", 2)]

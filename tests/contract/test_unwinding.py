@@ -19,13 +19,13 @@ from simenv_marl import (
     parallel_env,
     single_env,
 )
-from tests.worlds.models import Script, alive, calling, decision, notes, script, stacks
+from tests.worlds.models import Script, alive, calling, decision, notes, script, stacks, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])
 TRIGGERS = pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
 
 
-@VIEWS
+@pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, single_env])
 @TRIGGERS
 def test_an_end_in_mid_episode_unwinds_the_simulation(view, trigger):
     log = []
@@ -49,10 +49,10 @@ def test_an_end_in_mid_episode_unwinds_the_simulation(view, trigger):
         finally:
             log.append("outer")
 
-    decide = decision()
+    decide = decision(agent="a_0")
     env = view(script(main), decide)
     env.reset()
-    env.step(1)
+    step(env, 1, "a_0")
     assert log == ["enter"]
     if trigger == "collect":
         del env
@@ -252,19 +252,11 @@ def test_an_episode_that_has_ended_holds_nothing_that_its_model_has_let_go(view)
 
 @VIEWS
 def test_an_abandoned_environment_goes_without_the_collector(view):
-    log = []
-
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            log.append("unwound")
-
-    decide = decision()
+    log, decide = [], decision()
     gc.collect()
     gc.disable()
     try:
-        env = view(script(main), decide)
+        env = view(unwinding(decide, log), decide)
         env.reset()
         del env
         assert log == ["unwound"]
@@ -459,15 +451,7 @@ def test_errors_while_a_collected_simulation_unwinds_are_not_lost():
 
 
 def test_an_environment_whose_thread_has_ended_can_be_dropped():
-    log = []
-
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            log.append("unwound")
-
-    env = single_env(script(main), decide)
+    env = single_env(unwinding(decide, []), decide)
     thread = threading.Thread(target=env.reset)
     thread.start()
     thread.join()

@@ -9,15 +9,14 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from queue import Queue
-from random import Random
 from textwrap import dedent
 
 import pytest
 
-from simenv_marl import RULE, WrongThreadError, aec_env, parallel_env, single_env
+from simenv_marl import WrongThreadError, single_env
 from simenv_marl.hooks.stacks import STACKS
 from tests.core.test_threads import in_a_thread
-from tests.worlds.models import Script, calling, culprits, decision, nobody_is_asked, notes, play, script
+from tests.worlds.models import Script, calling, culprits, decision, nobody_is_asked, notes, script
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
@@ -31,51 +30,7 @@ def _nobody_is_running_afterwards():
     assert STACKS.keys() <= before
 
 
-# -- the same results -----------------------------------------------------------------------------
-
-
-class Walk:
-    """Somebody walks at random; how far and whether at all is decided."""
-
-    def reset(self, seed=None):
-        self.random, self.place, self.log = Random(seed), 0, []
-
-    def run(self):
-        while abs(self.place) < 20 and len(self.log) < 60:
-            if self.random.random() < 0.7:
-                self.place += stride(self)
-            self.log.append((self.place, rest(self) if self.random.random() < 0.5 else None))
-
-
-def stride_rule(walk):
-    return walk.random.choice([-3, 1, 2, 4])
-
-
-changes = {"observation_space_mapping": lambda walk: [walk.place, 0], "reward_mapping": lambda walk: walk.place}
-stride = decision(stride_rule, agent="stride_0", **changes)
-rest = decision(lambda walk: walk.random.random(), agent="rest_0", **changes)
-
-
-@pytest.mark.parametrize("view", [aec_env, parallel_env])
-def test_both_drivers_give_the_same_episodes(view):
-    traces = []
-    for driver in ("greenlet", "thread"):
-        env = view(Walk, [stride, rest], driver=driver, max_steps=50)
-        trace = []
-        for seed in range(5):
-            for action in (RULE, 3):
-                if view is aec_env:
-                    turns = play(env, action, seed=seed)
-                    trace += [(*turn[:1], turn.observation.tolist(), *turn[2:6]) for turn in turns]
-                else:
-                    env.reset(seed=seed)
-                    while env.agents:
-                        observations, *rest_of_it = env.step(dict.fromkeys(env.agents, action))
-                        trace.append(({a: o.tolist() for a, o in observations.items()}, *rest_of_it))
-                trace.append(env.simulation.log)
-        traces.append(trace)
-    assert traces[0] == traces[1]
-    assert len(traces[0]) > 100
+# -- several at once ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("outer", ["greenlet", "thread"])
@@ -99,27 +54,6 @@ def test_environments_run_inside_each_others_simulations(outer, inner):
     assert env.simulation.log == [(1, False), (2, True), [1, 2], "rule"]
     env.reset()
     env.close()
-
-
-@DRIVERS
-def test_environments_on_many_threads_of_the_user_do_not_meet(driver):
-    decide = decision()
-    logs, barrier = {}, threading.Barrier(6)
-
-    def work(number):
-        env = single_env(calling(*[decide] * 30), decide, driver=driver)
-        barrier.wait()
-        env.reset()
-        while not env.step(number)[2]:
-            assert decide() == "rule"
-        logs[number] = env.simulation.log
-
-    threads = [threading.Thread(target=work, args=(number,)) for number in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert logs == {number: [number] * 30 for number in range(6)}
 
 
 @DRIVERS

@@ -46,7 +46,6 @@ class Casino:
 
 BET = f"{__name__}.Casino.bet"
 POINTS = {BET: define(agent="player_0", observation_space_mapping=lambda casino, card: [card, np.random.random()])}
-BOTH_STATES = pytest.mark.parametrize("state", [rng.SwiftState, rng.PortableState])
 
 
 def world():
@@ -209,6 +208,7 @@ def test_models_that_seed_the_generators_themselves():
     assert world() == before
 
 
+@pytest.mark.usefixtures("_states")
 def test_other_bit_generators_of_the_user_stay():
     ours = np.random.get_bit_generator()
     theirs = np.random.PCG64(3)
@@ -239,6 +239,19 @@ def test_one_environment_inside_another():
     outer = simulate(Casino, {BET: policy}, points=POINTS, seed=3, global_rng=True)
     assert outer.log == without.log
     assert inner.simulation.log[: len(expected)] == expected
+
+
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+def test_one_environment_in_the_rule_of_another(driver):
+    """The state of the outer one is in place in its simulation's thread, too."""
+
+    class Gambler(Casino):
+        def run(self):
+            self.inner = simulate(Casino, points=POINTS, seed=self.seed, global_rng=True, driver=driver)
+            return super().run()
+
+    outer = simulate(Gambler, points=POINTS, seed=3, global_rng=True, driver=driver)
+    assert outer.inner.log == outer.log == plain(3)
 
 
 def test_two_at_work_at_once_in_two_threads_are_refused():

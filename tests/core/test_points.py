@@ -6,6 +6,7 @@ import weakref
 import pytest
 
 from simenv_marl import UnknownPointError, handlers
+from simenv_marl.core import processes
 from simenv_marl.core.points import find_point, find_points, locate, portable
 from simenv_marl.core.processes import pack, unpack
 from simenv_marl.decision import point_of, registered, unwrapped
@@ -22,6 +23,11 @@ class Base:
     @define(agent="decorated_0")
     def decorated(self):
         return "decorated"
+
+    @classmethod
+    @define()
+    def of_class(cls):
+        return "of the class"
 
 
 class Sub(Base):
@@ -111,11 +117,29 @@ def test_a_point_is_itself_again_where_it_is():
     assert unpack(pack(point.hook)) is point.hook
 
 
+def test_a_point_comes_along_with_its_hook():
+    @define(agent="local_0")
+    def function():
+        return 0
+
+    hook = unpack(pack(hook_of(function)))
+    assert hook is not hook_of(function)
+    assert (hook.point.hook, hook.point.definition.agent) == (hook, "local_0")
+
+
 @pytest.mark.parametrize("name", ["Base.decorated", "Base.plain"])
 def test_functions_go_to_other_processes_by_name(name):
     function = getattr(Base, name.partition(".")[2])
     assert portable(function) == f"{HERE}.{name}"
     assert portable(lambda: 0).__name__ == "<lambda>"
+
+
+def test_functions_are_themselves_again_in_other_processes(monkeypatch):
+    """The name leads there, whatever binds them: nothing is made anew."""
+    functions = [Base.decorated, Base.plain, Base.of_class.__func__]
+    parcels = list(map(pack, functions))
+    monkeypatch.setattr(processes, "_known", {})  # as where nothing has come from yet
+    assert list(map(unpack, parcels)) == functions
 
 
 def test_what_is_named_twice_or_not_at_all_is_refused():

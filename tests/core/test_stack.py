@@ -17,7 +17,7 @@ import pytest
 from simenv_marl import RULE, WrongThreadError, aec_env, generate_env, parallel_env, single_env
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
-from tests.worlds.models import Script, calling, decision, script, stacks
+from tests.worlds.models import Script, calling, decision, script, stacks, unwinding
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])
 
@@ -113,6 +113,29 @@ def test_a_connection_that_was_opened_in_reset_is_used_in_run_and_over_episodes(
         assert env.step(5)[2]
         assert env.simulation.log == [(4,), (5,), *[(seed,) for seed in range(1, number + 1)]]
     env.close()
+
+
+@DRIVERS
+def test_an_event_loop_is_the_simulations_own_while_that_is_unwound(driver):
+    async def work(simulation):
+        try:
+            decide()
+        finally:
+            simulation.log.append(asyncio.get_running_loop() is not here)
+            await asyncio.sleep(0)
+            simulation.log.append("unwound")
+
+    async def use(env):
+        nonlocal here
+        here = asyncio.get_running_loop()
+        env.reset()
+        env.close()
+        return asyncio.get_running_loop()
+
+    decide, here = decision(), None
+    env = single_env(script(lambda simulation: asyncio.run(work(simulation))), decide, driver=driver)
+    assert asyncio.run(use(env)) is here
+    assert env.simulation.log == [True, "unwound"]
 
 
 @DRIVERS
@@ -302,16 +325,8 @@ def test_between_episodes_an_environment_may_change_threads():
 @pytest.mark.parametrize("where", ["here", "elsewhere"])
 def test_an_environment_that_is_dropped_takes_its_stack_along(driver, when, where):
     gc.collect()
-    before, log = stacks(len(STACKS) + 1), []
-
-    def main(simulation):
-        try:
-            decide()
-        finally:
-            log.append("unwound")
-
-    decide = decision()
-    held = [single_env(script(main), decide, driver=driver)]
+    before, log, decide = stacks(len(STACKS) + 1), [], decision()
+    held = [single_env(unwinding(decide, log), decide, driver=driver)]
     simulation = weakref.ref(held[0].simulation)
     if when != "never reset":
         held[0].reset()

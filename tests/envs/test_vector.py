@@ -6,6 +6,7 @@ import copy
 import gc
 import pickle
 import threading
+import weakref
 from typing import Any
 
 import gymnasium
@@ -38,7 +39,7 @@ from simenv_marl import (
 )
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
 from tests.worlds.many_worlds import Being, beings
-from tests.worlds.models import notes, stacks
+from tests.worlds.models import decision, notes, script, stacks
 from tests.worlds.worlds import FuseError, designs, seeds
 
 pytestmark = FORKS
@@ -219,6 +220,14 @@ def test_some_can_be_reset_with_options_for_them():
     envs.close()
 
 
+def test_a_mask_may_name_all_at_first():
+    envs = vector_env(Counter, Counter.decide, num_envs=2)
+    with pytest.raises(NotResetError, match="no episodes yet"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.reset(options={"reset_mask": np.ones(2, np.bool_)})
+    envs.close()
+
+
 def test_without_autoreset_an_ended_episode_must_be_reset():
     envs = vector_env(Counter, Counter.decide, num_envs=3, autoreset_mode="Disabled")
     envs.reset(seed=0)
@@ -335,13 +344,14 @@ def test_boxes_take_actions_in_other_dtypes():
 def test_observations_are_copies_unless_told_otherwise(kind, copy):
     model, decision = VARIETY[kind]
     envs = vector_env(model, {POINT: decision}, num_envs=2, copy=copy)
-    first, _ = envs.reset(seed=0)
-    image = first["image"] if kind == "nested" else first
-    kept = image.copy()
-    second, *others = envs.step([1, 1])
-    assert np.shares_memory(image, second["image"] if kind == "nested" else second) != copy
-    assert np.array_equal(image, kept) == copy
-    assert not any(np.shares_memory(a, b) for a, b in zip(others[:3], envs.step([1, 1])[1:4], strict=True))
+    told = [envs.reset(seed=0)]
+    for _ in range(2):
+        image = told[-1][0]["image"] if kind == "nested" else told[-1][0]
+        kept = image.copy()
+        told.append(envs.step([1, 1]))
+        assert np.shares_memory(image, told[-1][0]["image"] if kind == "nested" else told[-1][0]) != copy
+        assert np.array_equal(image, kept) == copy
+    assert not any(np.shares_memory(a, b) for a, b in zip(told[1][1:4], told[2][1:4], strict=True))
     envs.close()
 
 
@@ -696,4 +706,33 @@ def test_what_is_reset_to_ask_for_the_agents_is_unwound():
     point = definition(agent=lambda self: "counter_0")
     envs = vector_env(Announcing, {f"{__name__}.Counter.decide": point}, num_envs=2)
     assert len(ended) == 1
+    envs.close()
+
+
+def test_what_a_model_lets_go_goes_while_others_of_the_vector_are_settled():
+    """Neither the answers nor what comes from the simulations is held any longer than it is used."""
+
+    class Answer:
+        pass
+
+    answers, there = weakref.WeakSet(), []
+
+    def answer(action):
+        made = Answer()
+        answers.add(made)
+        return made
+
+    decide = decision(
+        agent="a_0", action_space_mapping=answer, reward_mapping=lambda: there.append(len(answers)) or 0.0
+    )
+
+    def main(simulation):
+        for _ in range(3):
+            decide()
+
+    envs = vector_env(script(main), decide, num_envs=4)
+    envs.reset(seed=0)
+    there.clear()
+    envs.step(np.ones(4, np.int64))
+    assert there == [0] * 4
     envs.close()

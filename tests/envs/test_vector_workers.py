@@ -31,6 +31,7 @@ from simenv_marl import (
     make_step,
     vector_env,
 )
+from simenv_marl.envs.worker import is_shareable
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
 from tests.worlds.models import notes
 from tests.worlds.worlds import designs, seeds
@@ -86,8 +87,8 @@ class Failing(Counter):
                 raise error
             if self.how == "kill":
                 os.kill(os.getpid(), signal.SIGKILL)
-            if self.how == "exit":
-                os._exit(7)
+            if self.how in (1, 7):
+                os._exit(self.how)
             if self.how == "system exit":
                 raise SystemExit(3)
 
@@ -219,11 +220,12 @@ def test_calls_and_attributes_go_to_the_workers_and_back():
 @pytest.mark.parametrize("copy", [True, False])
 def test_observations_are_copies_unless_told_otherwise(copy):
     envs = workers(copy=copy)
-    first, _ = envs.reset(seed=0)
-    kept = first.copy()
-    second, *_ = envs.step(ONES)
-    assert (second is first) != copy
-    assert np.array_equal(first, kept) == copy
+    second, _ = envs.reset(seed=0)
+    for _ in range(2):
+        first, kept = second, second.copy()
+        second, *_ = envs.step(ONES)
+        assert (second is first) != copy
+        assert np.array_equal(first, kept) == copy
     envs.close()
     assert first.shape == (4, 2)  # it can be read still
 
@@ -296,12 +298,13 @@ class Breaking:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
-@pytest.mark.parametrize(("how", "code"), [("kill", -signal.SIGKILL), ("exit", 7)])
+@pytest.mark.parametrize(("how", "code"), [("kill", -signal.SIGKILL), (7, 7), (1, 1)])
 def test_a_worker_that_dies_is_an_error_and_is_replaced_at_the_next_reset(how, code):
     envs = workers(Failing)
     envs.reset(seed=0, options={3: how})
-    with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* exit code {code}"):
+    with pytest.raises(WorkerError, match=f"worker 1 .*2 to 3.* exit code {code}") as caught:
         envs.step(ONES)
+    assert ("__main__" in str(caught.value)) == (code == 1)  # with which an error in a script ends it
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
     with pytest.raises(WorkerError, match="is dead"):
@@ -328,7 +331,7 @@ def test_workers_that_are_killed_between_steps_are_noticed():
 
 def test_errors_survive_pickling():
     envs = workers(Failing)
-    envs.reset(seed=0, options={1: "exit"})
+    envs.reset(seed=0, options={1: 7})
     with pytest.raises(WorkerError, match="died with exit code") as caught:
         envs.step(ONES)
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
@@ -392,6 +395,37 @@ def test_an_environment_that_is_dropped_ends_its_workers():
     del envs
     gc.collect()
     assert all(map(gone, there))
+
+
+class Leaving(Counter):
+    """Leaves a file, which takes a while, when it is unwound."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        super().reset(seed, options)
+        self.path = Path((options or {})["path"]) / str(seed)
+
+    def run(self) -> Any:
+        try:
+            return super().run()
+        finally:
+            time.sleep(0.3)
+            self.path.touch()
+
+
+def test_workers_of_an_environment_that_is_dropped_may_finish(tmp_path):
+    envs = workers(Leaving)
+    envs.reset(seed=0, options={"path": str(tmp_path)})
+    del envs
+    gc.collect()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2", "3"]
+
+
+def test_what_is_shared_are_arrays_of_one_size():
+    number, text = spaces.Discrete(3), spaces.Text(3)
+    for part, expected in ((number, True), (text, False)):
+        assert is_shareable(part) is expected
+        assert is_shareable(spaces.Dict(first=number, second=part)) is expected
+        assert is_shareable(spaces.Tuple([number, part])) is expected
 
 
 def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):

@@ -37,7 +37,7 @@ class Stack:
 
     def __init__(self, plugins=None):
         self.plugins, self.asked, self.hidden = plugins, [], 0
-        self.children = Children()  # where other tests have left environments, threads are watched
+        self.children = Children(None)  # where other tests have left environments, threads are watched
 
     def taker(self, hook, here):
         self.asked.append(here)
@@ -90,6 +90,23 @@ def test_a_taker_gets_the_arguments_as_they_were_passed(args, kwargs):
         made()
     hook.leave(getcurrent())
     assert hook.takers == {}
+
+
+@pytest.mark.parametrize(
+    ("function", "alone"),
+    [
+        (Model.decide, True),
+        (Model.items, False),
+        (lambda model=None: 0, False),
+        (lambda *models: 0, False),
+        (lambda *, model: 0, False),
+        (lambda model, /: 0, True),
+        (lambda: 0, False),
+    ],
+)
+def test_what_takes_nothing_but_what_it_is_called_on_is_told_apart(function, alone):
+    function.__qualname__ = f"Model.{function.__name__}"
+    assert Hook(function, "somewhere.Model.function").alone is alone
 
 
 def test_every_kind_of_function_has_takers_of_its_kind():

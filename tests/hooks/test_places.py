@@ -14,7 +14,17 @@ from unittest import mock
 import pytest
 from greenlet import getcurrent
 
-from simenv_marl import PatchError, UnknownTargetError, aec_env, attach_handler, handlers, remove_handler
+from simenv_marl import (
+    PatchError,
+    UnknownTargetError,
+    aec_env,
+    attach_handler,
+    attached_handlers,
+    expose_to_plugins,
+    handlers,
+    remove_handler,
+    trace,
+)
 from simenv_marl.hooks.hook import hook_of
 from simenv_marl.hooks.places import Held, Place, hook_at, places_of, plain, resolve
 from simenv_marl.hooks.targets import TARGET
@@ -43,6 +53,14 @@ class Base:
         return self.__hidden()
 
 
+class _Base(Base):
+    def __hidden(self):
+        return "hidden"
+
+    def look(self):
+        return self.__hidden()
+
+
 class Sub(Base):
     pass
 
@@ -63,15 +81,17 @@ def taken(hook):
 # -- names ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["Base.__hidden", "Base._Base__hidden"])
-def test_private_names_are_found_as_they_are_written_and_as_they_are(name):
-    assert resolve(f"{HERE}.{name}", TARGET) == (Base, "_Base__hidden")
-    hook = hook_of_name(f"{HERE}.{name}")
+@pytest.mark.parametrize("owner", [Base, _Base])
+@pytest.mark.parametrize("name", ["__hidden", "_Base__hidden"])
+def test_private_names_are_found_as_they_are_written_and_as_they_are(owner, name):
+    name = f"{HERE}.{owner.__name__}.{name}"
+    assert resolve(name, TARGET) == (owner, "_Base__hidden")
+    hook = hook_of_name(name)
     hook.hold(1)
     taken(hook)
-    assert Base().look() == "taken"
+    assert owner().look() == "taken"
     hook.let_go(1)
-    assert Base().look() == "hidden"
+    assert owner().look() == "hidden"
 
 
 @pytest.mark.parametrize(
@@ -167,6 +187,25 @@ def test_a_function_of_a_module_is_set_under_all_its_names():
         assert {owner.__name__ for owner, _ in places_of(function)} == {HERE, "other_module"}
     finally:
         del sys.modules["other_module"]
+    reference = weakref.ref(other)
+    del other
+    gc.collect()
+    assert reference() is None
+    assert hook.function is original
+
+
+def test_a_function_is_found_by_what_its_module_calls_it():
+    module, log = types.ModuleType("renaming_module"), []
+    exec("def first(): return 1\nsecond = first\ndel first", vars(module))
+    sys.modules["renaming_module"] = module
+    try:
+        attach_handler(lambda: log.append("called"), module.second, "before")
+        assert [entry[1] for entry in attached_handlers()] == ["renaming_module.second"]
+        assert module.second() == 1
+        assert log == ["called"]
+        remove_handler(module.second, "before")
+    finally:
+        del sys.modules["renaming_module"]
 
 
 def test_what_something_else_has_set_is_left_alone_and_usable_afterwards():
@@ -278,6 +317,71 @@ def test_a_function_that_is_decorated_while_an_environment_uses_it_stays_decorat
     env.reset()
     assert env.agents == ["other_0"]
     env.close()
+
+
+@pytest.mark.parametrize("make", [define(), expose_to_plugins])
+def test_what_is_decorated_while_an_environment_uses_it_has_handlers_of_its_own(make):
+    class Model:
+        def decide(self):
+            return "rule"
+
+    env = aec_env(calling(lambda: Model().decide()), {Model.decide: define()})
+    env.reset()
+    Model.decorated = make(Model.decide)
+    env.close()
+    with trace() as calls:
+        Model().decorated()
+    assert len(calls) == 1
+    log = []
+    attach_handler(log.append, Model.decide, "before")
+    try:
+        Model().decorated()
+        assert log == []
+        Model().decide()
+        assert len(log) == 1
+    finally:
+        remove_handler(Model.decide, "before")
+
+
+def test_modules_may_be_imported_while_names_are_looked_for(monkeypatch):
+    class Lazy:
+        """Stands in for a module that is imported as soon as something is asked of it."""
+
+        @property
+        def __class__(self):
+            sys.modules.setdefault("late_module", types.ModuleType("late_module"))
+            return types.ModuleType
+
+    monkeypatch.setitem(sys.modules, "lazy_module", Lazy())
+    try:
+        assert places_of(function) == [(sys.modules[HERE], "function")]
+    finally:
+        del sys.modules["late_module"]
+
+
+def test_modules_may_change_in_other_threads_while_names_are_looked_for():
+    module, ended = types.ModuleType("changing_module"), threading.Event()
+    vars(module).update({f"name_{number}": number for number in range(3000)})
+
+    def work():
+        while not ended.is_set():
+            for number in range(50):
+                setattr(module, f"more_{number}", number)
+            for number in range(50):
+                delattr(module, f"more_{number}")
+
+    thread, interval = threading.Thread(target=work), sys.getswitchinterval()
+    sys.modules["changing_module"] = module
+    sys.setswitchinterval(1e-6)
+    thread.start()
+    try:
+        for _ in range(30):
+            assert places_of(function) == [(sys.modules[HERE], "function")]
+    finally:
+        sys.setswitchinterval(interval)
+        ended.set()
+        thread.join()
+        del sys.modules["changing_module"]
 
 
 @pytest.fixture

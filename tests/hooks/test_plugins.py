@@ -1218,35 +1218,16 @@ def test_the_end_of_items_has_no_notes():
     assert notes(stop.value) == ""
 
 
-class Secretive:
-    def __hide(self, value):
-        return value
+def test_errors_of_a_generator_that_is_closed_are_raised():
+    @expose_to_plugins
+    def items():
+        try:
+            yield 1
+        finally:
+            raise LookupError("while it was closed")
 
-    def hide(self, value):
-        return self.__hide(value)
-
-
-class _Shy:
-    def __hide(self, value):
-        return value
-
-    def hide(self, value):
-        return self.__hide(value)
-
-
-@pytest.mark.parametrize("kind", [Secretive, _Shy])
-@pytest.mark.parametrize("written", ["__hide", "mangled"])
-def test_private_names_are_found_as_they_are_written(kind, written):
-    name = written if written == "__hide" else f"_{kind.__name__.lstrip('_')}__hide"
-    with handlers((lambda self, value, _result: ChangedResult(_result + 1), f"{HERE}.{kind.__name__}.{name}", "after")):
-        assert kind().hide(3) == 4
-    assert kind().hide(3) == 3
-
-
-def test_what_a_module_cannot_import_is_its_own_error(tmp_path, monkeypatch):
-    (tmp_path / "lame_model.py").write_text("import no_such_module_at_all\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ModuleNotFoundError, match="no_such_module_at_all"):
-        attach_handler(print, "lame_model.Walk.go", "before")
-    with pytest.raises(UnknownTargetError, match="lame_modell"):
-        attach_handler(print, "lame_modell.Walk.go", "before")
+    with handlers((lambda: None, items, "before_next")):
+        generator = items()
+        assert next(generator) == 1
+        with pytest.raises(LookupError, match="while it was closed"):
+            generator.close()

@@ -1,6 +1,7 @@
 """Section 8: plugins of one environment alone, and handlers around decisions."""
 
 import gc
+import sys
 from contextlib import suppress
 from random import Random
 from threading import Thread
@@ -334,20 +335,36 @@ def test_environments_in_threads_of_their_own_have_their_own_plugins():
 
 
 def test_environments_may_be_collected_at_any_moment():
-    choose = decision()
-    thresholds = gc.get_threshold()
-    gc.set_threshold(1, 1, 1)
+    """Also while handlers are made ready, which looks through those that environments have."""
+    choose, number = decision(), 0
+
+    def look(frame, event, arg):
+        nonlocal left
+        left -= event == "call" and "/hooks/" in frame.f_code.co_filename
+        if left == 0:
+            gc.collect()
+
+    gc.disable()
     try:
-        for _ in range(10):
+        left = 0
+        while left <= 0:  # until there are no more calls
             plugins = [(lambda *args, **kwargs: None, BID, "before")]
             env = aec_env(calling(lambda: Trader().bid("tea"), choose), choose, plugins=plugins)
             env.reset()
             env.itself = env
             del env
-            with handlers((lambda *args, **kwargs: None, BID, "before")):
-                assert Trader().bid("tea") == 5
+            number += 1
+            left = number
+            sys.setprofile(look)
+            try:
+                with handlers((lambda *args, **kwargs: None, BID, "before")):
+                    assert Trader().bid("tea") == 5
+            finally:
+                sys.setprofile(None)
+            gc.collect()
     finally:
-        gc.set_threshold(*thresholds)
+        gc.enable()
+    assert number > 10
 
 
 def test_nested_environments_have_each_their_own():

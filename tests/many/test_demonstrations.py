@@ -1,6 +1,7 @@
 """Demonstrations by the rule and by others: mixtures and comparisons. Of data sets: ``clients/test_minari.py``."""
 
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -33,6 +34,11 @@ def twos(observations):
 
 
 # -- mixtures -------------------------------------------------------------------------------------
+
+
+def test_mixtures_tell_what_they_are_made_of():
+    assert repr(Mixture({ones: 3, RULE: 1})) == "<Mixture: 0.75 ones, 0.25 rule>"
+    assert "0.5 functools.partial" in repr(Mixture([(partial(ones), 1), (RULE, 1)]))
 
 
 def test_mixtures_leave_each_decision_to_one_of_their_policies():

@@ -107,7 +107,9 @@ def test_the_clock_is_what_runs_from_left_to_right():
             simulation.log.append(ant())
 
     ant = decision(agent="ant_0")
-    figure = plot_timeline(collect_episodes(clocked(main), {ant: lambda seen: [1]}, seeds=[1]))
+    bee = decision(agent="bee_0")  # who never decides, and so tells no time
+    policies = {ant: lambda seen: [1], bee: lambda seen: [1]}
+    figure = plot_timeline(collect_episodes(clocked(main), policies, seeds=[1]))
     assert dots(figure.axes[0]) == [([[0, 1], [10, 1], [20, 1]], True)]
     assert figure.axes[-1].get_xlabel() == "time"
     (ending,) = figure.axes[0].lines[1:]
@@ -185,6 +187,18 @@ def test_where_nobody_lives_is_shaded():
     assert [line.get_marker() for line in third.lines[1:]] == ["|"]
 
 
+def test_whom_the_model_has_let_go_of_lives_to_the_end():
+    def main(simulation):
+        simulation.log.append(Being(0).act())
+        keeper = Being(1)
+        for _ in range(3):
+            simulation.log.append(keeper.act())
+
+    figure = plot_timeline(collect_episodes(clocked(main), {Being.act: ones}, points=beings(), seeds=[1]))
+    assert not figure.axes[0].patches
+    assert [(patch.get_x(), patch.get_width()) for patch in figure.axes[2].patches] == [(0, 10)]
+
+
 # -- many agents ----------------------------------------------------------------------------------
 
 
@@ -246,6 +260,7 @@ def test_rows_of_actions_with_components_are_coloured_by_one():
     assert values("how[0]") == {1}
     assert values("how[1]") == {2}
     assert "how[0], one of 3" in plot_timeline(found).axes[0].get_title(loc="left")
+    assert "action far, one of 3" in plot_timeline(found, component="far").axes[0].get_title(loc="left")
     with pytest.raises(OptionValueError, match=r"'how\[1\]'"):
         plot_timeline(found, component="where")
 
@@ -280,6 +295,7 @@ def test_policies_have_panels_of_their_own_unless_they_are_many():
     many = plot_timeline(collected(30))
     assert [axes.get_title(loc="left") for axes in many.axes[:2]] == ["30 agents: action", "reward"]
     assert len(drawn(many.axes[0])) == 60
+    assert texts(many.axes[0]) == ["1"]
 
 
 def test_decisions_of_the_same_time_share_it():

@@ -12,6 +12,7 @@ import time
 import joblib
 import numpy as np
 import pytest
+from joblib._parallel_backends import ThreadingBackend
 
 from simenv_marl import (
     RULE,
@@ -287,9 +288,27 @@ def test_an_interrupt_ends_all_processes(tmp_path):
     assert printed.split() == [b"interrupted"]
 
 
-def test_progress_is_shown(capsys):
-    traces(seeds=range(5), workers=2, progress=True)
-    assert "5/5" in capsys.readouterr().err
+def test_progress_is_shown_where_it_is_asked_for(capsys):
+    for workers in (0, 2):
+        traces(seeds=range(5), workers=workers, progress=True)
+        assert "5/5" in capsys.readouterr().err
+    traces(seeds=range(5))
+    assert capsys.readouterr().err == ""
+
+
+def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkeypatch):
+    class Silent(ThreadingBackend):
+        supports_return_generator = False
+        sizes = ()
+
+        def submit(self, func, callback=None):
+            Silent.sizes += (len(func),)
+            return super().submit(func, callback)
+
+    monkeypatch.setitem(joblib.parallel.BACKENDS, "silent", Silent)
+    with joblib.parallel_config(backend="silent"):
+        assert traces(seeds=range(9), workers=2, batch_size=1) == traces(seeds=range(9))
+    assert Silent.sizes == (1,) * 5  # each with two seeds
 
 
 def test_what_is_collected_of_lots_in_which_nobody_decides():

@@ -346,6 +346,21 @@ def colony(make: Any, design: Design, simulation: type[Colony] = Colony, *, rost
     return _made[key]
 
 
+VILLAGE = Design(initial=5, most=40, ticks=12, overseen="after")
+NAMES_OF_THE_VILLAGE = [f"creature_{number}" for number in range(VILLAGE.most)]
+
+
+class Village(Colony):
+    """A colony that always has something to observe, and takes options."""
+
+    def __init__(self) -> None:
+        super().__init__(VILLAGE)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> None:
+        super().reset(seed)
+        self.fortune = 7
+
+
 def advised(observation: Any, seed: int) -> Any:
     """The answer of whoever makes that observation."""
     number, decided = int(observation[0]), int(observation[1])

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import greenlet
 import numpy as np
 from gymnasium import spaces
+from pettingzoo import AECEnv, ParallelEnv
 
 from simenv_marl import RULE, Definition, make_step
 
@@ -78,6 +79,18 @@ def calling(*functions: Callable[[], Any], ends: Any = None) -> Callable[[], Scr
     return script(main)
 
 
+def unwinding(decide: Callable[[], Any], log: list[Any]) -> Callable[[], Script]:
+    """A factory of simulations that decide once, and tell when they have ended."""
+
+    def main(simulation: Any) -> None:
+        try:
+            decide()
+        finally:
+            log.append("unwound")
+
+    return script(main)
+
+
 class Turn(NamedTuple):
     """What one pass of ``agent_iter`` has seen and done."""
 
@@ -115,6 +128,32 @@ def play(env: Any, actions: Any = RULE, *, seed: int | None = None, reset: bool 
         turns.append(Turn(agent, observation, reward, terminated, truncated, info, action))
         env.step(action)
     return turns
+
+
+def step(env: Any, action: Any, agent: str) -> bool:
+    """Take an action of an agent in any view. Returns whether that has ended it."""
+    if isinstance(env, AECEnv):
+        env.step(action)
+        return bool(env.terminations[agent] or env.truncations[agent])
+    if isinstance(env, ParallelEnv):
+        env.step({agent: action})
+        return agent not in env.agents
+    return any(env.step({agent: action} if isinstance(env.action_space, spaces.Dict) else action)[2:4])
+
+
+def follow_the_rule(env: Any, seed: int | None = None) -> Any:
+    """Let the rule decide throughout, in any view. Returns the simulation."""
+    if isinstance(env, AECEnv):
+        play(env, seed=seed)
+        return env.unwrapped.simulation
+    env.reset(seed=seed)
+    if isinstance(env, ParallelEnv):
+        while env.agents:
+            env.step(dict.fromkeys(env.agents, RULE))
+    else:
+        while not any(env.step(RULE)[2:4]):
+            pass
+    return env.unwrapped.simulation
 
 
 def decisions(turns: list[Turn]) -> list[str]:

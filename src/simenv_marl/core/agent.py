@@ -9,7 +9,7 @@ from typing import Any, Final
 from weakref import ref
 
 import numpy as np
-from greenlet import getcurrent, greenlet
+from greenlet import getcurrent
 
 from ..errors import MaskError, RewardError, shown
 from ..hooks.stacks import DIFFERENCES, EVALUATING
@@ -233,7 +233,10 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
                     point.finite(agent.observation)
         finally:
             if here is not None:
-                _evaluated(here, before)
+                if before is None:  # no function is called: at the end of the stack none might run
+                    del EVALUATING[here]
+                else:
+                    EVALUATING[here] = before
 
     def settle_quietly(agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         here = getcurrent() if DIFFERENCES else None
@@ -248,18 +251,13 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
             agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
         finally:
             if here is not None:
-                _evaluated(here, before)
+                if before is None:  # no function is called: at the end of the stack none might run
+                    del EVALUATING[here]
+                else:
+                    EVALUATING[here] = before
 
     again = settle_quietly if quiet and not masked else settle
     return settle, again
-
-
-def _evaluated(here: greenlet, before: Any) -> None:
-    """Nothing is evaluated for an agent on a stack any more, but for the agent before it, if there was one."""
-    if before is None:
-        del EVALUATING[here]
-    else:
-        EVALUATING[here] = before
 
 
 def checked_reward(agent: Agent, reward: Any) -> float:

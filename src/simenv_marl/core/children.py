@@ -33,8 +33,8 @@ class Children:
 
     __slots__ = ("_opened", "driver")
 
-    def __init__(self) -> None:
-        self.driver: BaseDriver | None = None
+    def __init__(self, driver: BaseDriver | None) -> None:
+        self.driver = driver
         self._opened: WeakSet[Any] = WeakSet()
 
     def note(self, thing: Any) -> None:

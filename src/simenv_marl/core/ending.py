@@ -220,11 +220,8 @@ class Ending(Participants):
         if self.pending is None and not self.over:
             return  # the process ends while it is moving in another thread, which ends with it
         self.pending, self.over = None, True
-        if not self.running:
-            return
-        if not self.driver.reachable():
-            self.running = False  # its own thread unwinds it, as soon as that switches again
-            return
+        if not self.running or not self.driver.reachable():
+            return  # else its own thread unwinds it, as soon as that switches again
         with self.at_work():
             for problem in self._unwind():
                 warn_user(f"a simulation that was abandoned raised {shown(problem)}", ResourceWarning)

@@ -133,7 +133,7 @@ class Standing:
         Args:
             loops: The event loops that are to go on, too.
         """
-        self._python, self._loops = random.getstate(), list(loops)
+        self._python, self._loops = random.getstate(), loops
         self._files = list(_files())
         self._paths = {os.path.realpath(_path(number)) for number in _numbers(self._files)}
 

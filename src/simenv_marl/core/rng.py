@@ -56,6 +56,7 @@ class PortableState:
     def separate(self) -> None:
         """Share it no more."""
         self._generator = _copied(self._generator)
+        self._numpy |= self._generator.state  # which is another one where the user has set a generator of another kind
 
 
 class SwiftState:

@@ -82,8 +82,7 @@ class Session:
                 self._driver, self.simulation = spare.taken()
                 self._reset = resetter(self.simulation)
         except BaseException:
-            self._end_stack()
-            self._let_go_of_patches()
+            self._put_away()
             raise
 
     # -- the simulation's stack -------------------------------------------------------------------
@@ -110,9 +109,11 @@ class Session:
         assert self._driver is not None
         return self._driver
 
-    def _end_stack(self) -> None:
+    def _put_away(self) -> None:
+        """End the stack, and put back what was patched."""
         if self._driver is not None:
             self._driver.end()
+        self._let_go_of_patches()
 
     def at_work(self) -> AbstractContextManager[None]:
         """Keep what runs for the environment apart from what runs around it."""
@@ -341,8 +342,7 @@ class Session:
                 try:
                     self._close_simulation()
                 finally:
-                    self._end_stack()
-                    self._let_go_of_patches()
+                    self._put_away()
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
@@ -353,8 +353,7 @@ class Session:
             if not left:  # else it is still to unwind, in another thread
                 self._close_abandoned()
         finally:
-            self._end_stack()
-            self._let_go_of_patches()
+            self._put_away()
 
     def _close_abandoned(self) -> None:
         try:

@@ -208,8 +208,7 @@ class BaseDriver:
     def children(self) -> Children:
         """The threads that the simulation has started, over all its episodes."""
         if self._children is None:
-            self._children = Children()
-            self._children.driver = self
+            self._children = Children(self)
         return self._children
 
     # -- jobs -------------------------------------------------------------------------------------

@@ -126,8 +126,8 @@ class AgentsView(View):
         return made
 
     def _seed_spaces(self, agent: str, seed: int) -> None:
-        seed_space(self._observation_spaces[agent], seed, agent)
-        seed_space(self._action_spaces[agent], seed, agent)
+        for space in (self._observation_spaces[agent], self._action_spaces[agent]):
+            seed_space(space, seed, agent)
 
     def _observation(self, episode: Episode, agent: str) -> Any:
         """The latest observation of an agent, as a copy of the caller's own."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from threading import Lock
 from typing import Any
 
@@ -25,7 +25,7 @@ from ..errors import (
 )
 from .batches import Actions, Batch
 from .gymnasium_base import OneAgentView
-from .rows import Row, SubEnvironments, Told
+from .rows import Row, SubEnvironments
 from .worker import Recipe
 from .workers import Workers
 
@@ -291,7 +291,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
 
 
-def _merged(told: Told, number: int) -> dict[str, Any]:
+def _merged(told: Iterable[tuple[int, Any]], number: int) -> dict[str, Any]:
     """The infos of many as one: what ``VectorEnv._add_info`` makes of them one by one, but a key at a time."""
     columns: dict[str, tuple[list[int], list[Any]]] = {}
     for index, info in told:
@@ -313,7 +313,7 @@ def _column(key: str, indices: list[int], values: list[Any], number: int) -> Any
     first = values[0]
     column: NDArray[Any]
     if isinstance(first, dict) and key != "final_obs":
-        return _merged(list(zip(indices, values, strict=True)), number)
+        return _merged(zip(indices, values, strict=True), number)
     if key != "final_obs" and (type(first) in (int, float, bool) or isinstance(first, np.number)):
         column = np.zeros(number, type(first))
         column[indices] = values

@@ -127,12 +127,12 @@ class Recipe:
 
     def spelt_out(self, common: SubEnvironments) -> Recipe:
         """The same, with what only this process could find out: which points are registered, which agents there are."""
-        points, options = self.points, dict(self.options)
+        points, options = self.points, self.options
         named = [named.point for named in common.plan._named]
         if points is None and [point.name for point in named] == decision_points():
             points = decision_points()
         if not common.single:
-            options["possible_agents"] = common.plan.options.possible_agents
+            options = {**options, "possible_agents": common.plan.options.possible_agents}
         return Recipe(self.simulation, points, options, "single" if common.single else "joint")
 
 

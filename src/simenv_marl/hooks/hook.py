@@ -107,7 +107,7 @@ def generate(
         alone: As ``is_alone`` has it.
         namespace: What the names mean of which ``_ASK`` is made.
     """
-    parameters = list(signature.parameters.values()) if signature is not None else []
+    parameters = signature.parameters.values() if signature is not None else ()
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
     # Under its own name, by which it may be passed all the same where a staticmethod looks like a method.
@@ -284,7 +284,7 @@ class Hook(Target):
 
     def __reduce__(self) -> Any:
         made_of = (self.function, self.name, self.bound, self.kind, self.exposed)
-        return _restored, made_of, self.point, None, None, _give_point
+        return _restored, made_of, self.point, None, None, _came_along
 
     def stand_in(self, made_with: Any = None) -> FunctionType:
         """Make a function that stands in front of the hook's function for good.
@@ -401,7 +401,7 @@ class Hook(Target):
 
     def _changed(self) -> None:
         takers, slot = self.takers, self.slot
-        for plugins in list(slot) if self.rule is self.function else [None, *slot]:
+        for plugins in list(slot) if self.rule is self.function else [None, *slot]:  # the collector may change it
             takers[plugins] = self.around(self.run_rule, plugins)
         for key, taker in list(takers.items()):
             if not isinstance(key, greenlet):
@@ -442,7 +442,5 @@ def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -
     return hook
 
 
-def _give_point(hook: Hook, point: Any) -> None:
-    """Give a hook that was restored what the layer above had made of it, which may lead back to it."""
-    if hook.point is None:
-        hook.point = point
+def _came_along(hook: Hook, point: Any) -> None:
+    """What the layer above had made of a hook has come along, and is by now what it makes of this one."""

@@ -278,7 +278,7 @@ def _names_in_modules() -> list[tuple[ModuleType, str, Any]]:
         (module, name, value)
         for module in list(modules.values())
         if isinstance(module, ModuleType)
-        for name, value in list(vars(module).items())
+        for name, value in vars(module).copy().items()
     ]
 
 

@@ -234,9 +234,9 @@ class Plugins(_Added):
         return any(a.target.stale for a in self._attached)
 
     @property
-    def hooks(self) -> list[Hook]:
+    def hooks(self) -> Iterable[Hook]:
         """The hooks of functions that have handlers."""
-        return list({id(a.target): a.target for a in self._attached if isinstance(a.target, Hook)}.values())
+        return {id(a.target): a.target for a in self._attached if isinstance(a.target, Hook)}.values()
 
 
 # -- seeing what happens --------------------------------------------------------------------------

@@ -76,7 +76,7 @@ def simulate_many(
     checked = _checked_seeds(seeds)
     _check_numbers(batch_size, workers)
     _check_collect(collect)
-    arguments = (simulation, dict(_checked_policies(policies)), points, collect, int(batch_size), options)
+    arguments = (simulation, _checked_policies(policies), points, collect, int(batch_size), options)
     # Made here also where the work is done elsewhere, so that what cannot work is found out before.
     plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unanswered=True)
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
@@ -164,7 +164,7 @@ def collect_episodes(
     checked = _checked_seeds(seeds)
     _check_numbers(batch_size, workers)
     _check_collect(collect)
-    given = dict(_checked_policies(policies))
+    given = _checked_policies(policies)
     plan, keys = learners_plan(simulation, given, points, options)
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:

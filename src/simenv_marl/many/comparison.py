@@ -112,9 +112,8 @@ class _Onlooker:
 
 def _compared(found: Trajectories, tolerance: float) -> Comparison:
     """Make the comparison of what an onlooker has noted."""
-    extras = dict(found.extras)
-    noted = extras.pop("noted", np.zeros(0)).tolist()
-    found = replace(found, extras=extras)
+    noted = found.extras.get("noted", np.zeros(0)).tolist()
+    found = replace(found, extras={name: values for name, values in found.extras.items() if name != "noted"})
     if not len(found):
         return Comparison(found, found.actions, np.zeros(0, np.bool_))
     check_known(found)

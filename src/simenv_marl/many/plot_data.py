@@ -89,7 +89,7 @@ class Panel:
     leaves: list[Leaf]
 
 
-def by_policy(trajectories: Any) -> dict[Any, Trajectories]:
+def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
     """What was given to be drawn, by the keys of the policies."""
     if isinstance(trajectories, Trajectories):
         return {None: trajectories}
@@ -100,7 +100,7 @@ def by_policy(trajectories: Any) -> dict[Any, Trajectories]:
         )
     if not trajectories:
         raise OptionValueError("there is nothing to draw: no policy has answered any decision")
-    return dict(trajectories)
+    return trajectories
 
 
 def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
@@ -139,13 +139,9 @@ def panels_of(parts: Mapping[Any, Trajectories], episode: int, agents: Any, acti
         raise OptionValueError(
             f"there is nothing to draw of episode {episode} (seed {seed}): no agent has decided in it"
         )
-    # Where the model has let go of an agent before its last reward was known, its end is not: one usual step later.
-    gaps = np.concatenate([np.diff(row.at) for row in rows])
-    gap = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
-    rows = [row if row.end == row.end else replace(row, end=float(row.at[-1]) + gap) for row in rows]
     if agents is not None:
         rows = _chosen(rows, agents, episode)
-    keys = list(dict.fromkeys(row.key for row in rows))
+    keys = dict.fromkeys(row.key for row in rows)
     alike = len({tuple((leaf.name, leaf.width, leaf.names is None) for leaf in leaves[key]) for key in keys}) == 1
     if len(keys) <= CHARTED or not alike:
         return [Panel(title_of(key), [row for row in rows if row.key == key], leaves[key]) for key in keys]
@@ -261,7 +257,7 @@ def cells_of(rows: Sequence[Row], *, slim: bool) -> NDArray[np.float64]:
 # -- many episodes --------------------------------------------------------------------------------
 
 
-def _collections(collected: Any) -> dict[str, dict[Any, Trajectories]]:
+def _collections(collected: Any) -> dict[str, Mapping[Any, Trajectories]]:
     """What was given to be drawn, by what it is called."""
     if isinstance(collected, Mapping) and any(isinstance(value, Mapping) for value in collected.values()):
         return {str(label): by_policy(value) for label, value in collected.items()}

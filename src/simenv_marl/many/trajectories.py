@@ -62,7 +62,7 @@ class Trajectories:
         action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such: the legal actions. None where all are.
         times: ``(N,)`` float64: the simulation's time at the decision. None where it has no clock.
         elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
-            its end; nan where the model has let go of the agent before. None where there is no clock.
+            its end. None where there is no clock.
         extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
         observation_space, action_space: Of the decision point. None where no agent has decided, and it is not known
             at which point they would have.

@@ -20,6 +20,7 @@ from ..core.plan import Plan
 from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.stacking import rows, stacker
+from ..core.together import step_all
 from ..decision import DecisionPoint
 from ..errors import InvalidActionError, annotate, shown
 from ..hooks.stacks import outside_simulation
@@ -226,6 +227,20 @@ def run(
         _Batches(plan, seeds, size, finish, watcher).run()
 
 
+def _checked(episode: Episode, action: Any) -> Any:
+    """A checked action of the pending agent."""
+    agent: Any = episode.pending
+    try:
+        return action if action is RULE else agent.point.checked(action, agent.name, agent.mask)
+    except InvalidActionError as error:
+        episode.annotate(error)
+        raise
+
+
+def _blame(number: int, error: BaseException) -> None:
+    """Notes say of which seed an error is."""
+
+
 CROWD: Final = 256
 """So many simulations are under way at first. Of more, each has left the processor's caches when its turn comes again,
 and takes twice as long. A policy that takes longer than all of them is worth that: then there may be more."""
@@ -275,11 +290,10 @@ class _Batches:
         asked = perf_counter()
         if watcher is not None:
             watcher.asking(group, places, waiting, kept)
+        step_all(waiting, list(map(_checked, waiting, actions)), _blame)
         waiting.reverse()  # taken out one by one, so that nothing holds those that have ended
-        for place, action in zip(places, actions, strict=True):
-            episode = waiting.pop()
-            episode.step(action)
-            self._settle(place, episode)
+        for place in places:
+            self._settle(place, waiting.pop())
         if watcher is not None:
             watcher.answered(group, actions, extras)
         if 2 * number > self._crowd < self._size and asked - begun > perf_counter() - asked:

@@ -1,0 +1,73 @@
+"""Many episodes of one thread that are moved together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from greenlet import getcurrent
+
+from ..hooks.stacks import EVALUATING
+from .agent import Agent
+from .episode import Episode
+from .events import WAIT
+
+
+def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callable[[int, BaseException], None]) -> None:
+    """Answer the pending decisions of many episodes, and run each to its next one.
+
+    All of them move before any is settled: what one loop needs so stays in the processor's caches.
+
+    Args:
+        episodes: The episodes; in each a decision is pending.
+        actions: An action for each, checked.
+        blame: Called where something raises: with the number of the episode, and the error.
+
+    Raises:
+        BaseException: As ``Episode.step``. The other episodes have moved or not, and can be closed.
+    """
+    here, number, together = getcurrent(), 0, not EVALUATING
+    agents: list[Agent] = []
+    for episode in episodes:
+        if episode.pending is not None:
+            agents.append(episode.pending)
+        elif episode.unheard:
+            together = False
+        else:
+            blame(episodes.index(episode), error := episode.refusal())
+            raise error
+        if episode.driver.caller is not here or episode.plugins is not None:
+            together = False
+    event: Any = None
+    events: Any = []
+    try:
+        if not together:
+            for number, episode in enumerate(episodes):
+                episode.step(actions[number])
+            return
+        replies: list[Any] = []
+        for number, episode in enumerate(episodes):
+            replies.append(episode.answer(agents[number], actions[number]))
+        for number, episode in enumerate(episodes):
+            resume = episode.driver.resume
+            events.append(resume(replies[number]))
+        del replies
+        events.reverse()  # taken out one by one: nothing is to keep alive what a model lets go
+        for number, episode in enumerate(episodes):  # noqa: B007 - it tells which one has raised
+            event, args, kwargs = events.pop()
+            reply = event.arise(episode, args, kwargs)
+            if reply is not WAIT:
+                event = args = kwargs = None
+                episode.go_on(reply)
+    except BaseException as error:
+        events = event = args = kwargs = resume = None  # else the error would keep them alive
+        for place, episode in enumerate(episodes):
+            if place == number:
+                if episode.pending is None and not episode.over:
+                    episode.fail(error)
+                elif together:  # else ``step`` has done that
+                    episode.annotate(error)
+            elif episode.pending is None and not episode.over:
+                episode.pending = episode.latest  # so that it can be closed
+        blame(number, error)
+        raise

@@ -250,6 +250,7 @@ def test_the_environment_cannot_be_used_from_inside(books, use) -> None:
         assert issubclass(caught[0], ReentrancyError)
 
 
+@pytest.mark.filterwarnings("ignore:unclosed database", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_simulations_that_have_none_need_none(books) -> None:
     class Plain(Shop):
         close = None

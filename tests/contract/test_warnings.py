@@ -1,7 +1,9 @@
 """What a user is warned of at run time: shared generators, agents that never come, rounds that stand still."""
 
 import random
+import sys
 import threading
+import time
 import warnings
 
 import numpy as np
@@ -135,21 +137,35 @@ def test_what_other_threads_draw_is_not_laid_at_its_door(heard) -> None:
             random.random()
             draws_going_on.set()
 
+    def wait():
+        draws_going_on.clear()
+        assert draws_going_on.wait(10)
+        time.sleep(2 * sys.getswitchinterval())
+
     other = threading.Thread(target=draw)
     other.start()
-    assert draws_going_on.wait(10)
-    kind = gambler(lambda: [random.random() for _ in range(2000)])
-    play(single_env(kind, decide))
+    play(single_env(gambler(wait), decide))
     over.set()
     other.join()
     assert heard(DRAWS) == []
+
+
+@pytest.mark.greenlet("a thread of its own leaves others their turns, in which they may draw")
+def test_threads_that_only_wait_are_no_excuse(heard) -> None:
+    over = threading.Event()
+    other = threading.Thread(target=over.wait)
+    other.start()
+    play(single_env(gambler(random.random), decide))
+    over.set()
+    other.join()
+    assert len(heard(DRAWS)) == 1
 
 
 def test_it_costs_nothing_once_enough_was_seen(monkeypatch) -> None:
     monkeypatch.setattr(draws, "DECISIONS", 5)
     seen = []
     monkeypatch.setattr(
-        draws, "watched", lambda simulation, work, inner=draws.watched: (seen.append(1), inner(simulation, work))[1]
+        draws, "watched", lambda *args, inner=draws.watched, **kwargs: (seen.append(1), inner(*args, **kwargs))[1]
     )
     kind = gambler(lambda: 0)
     for _ in range(3):

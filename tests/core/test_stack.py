@@ -86,6 +86,7 @@ def test_the_script_of_its_user_goes_on():
 
 
 @DRIVERS
+@pytest.mark.filterwarnings("ignore:unclosed database", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_connection_that_was_opened_in_reset_is_used_in_run_and_over_episodes(driver):
     class Books(Script):
         def __init__(self):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from ctypes import c_char
 from threading import current_thread
 from threading import enumerate as enumerate_threads
+from time import process_time_ns, thread_time_ns
 from typing import Any, Final
 from weakref import WeakKeyDictionary, ref
 
@@ -18,10 +19,13 @@ import numpy as np
 
 from ..errors import warn_user
 from .switch import BaseDriver, Event
-from .threads import SIMULATION
+from .threads import SIMULATION, ThreadDriver
 
 DECISIONS: Final = 1_000
 """During so many decisions a kind of simulation is watched."""
+
+GLIMPSE: Final = 5_000
+"""In less than so many nanoseconds no other thread can be woken and draw."""
 
 _left: Final[WeakKeyDictionary[type, int]] = WeakKeyDictionary()
 """By class of simulations: during how many more."""
@@ -59,12 +63,21 @@ def is_watched(simulation: Any) -> bool:
     return _left.get(type(simulation), DECISIONS) > 0
 
 
-def watched(simulation: Any, work: Callable[[], Any]) -> Any:
-    """Let a simulation work; warn if the global generators have moved meanwhile. Returns what the work returns."""
-    before = _used()
+def watched(simulation: Any, work: Callable[[], Any], *, in_thread: bool) -> Any:
+    """Let a simulation work; warn if the global generators have moved meanwhile.
+
+    Args:
+        simulation: The simulation.
+        work: What lets it work.
+        in_thread: Whether it does so in a thread of its own, while its user's waits and others may run.
+
+    Returns:
+        What the work returns.
+    """
+    before, begun = _used(), _others()
     result = work()
     kind, moved = type(simulation), [one != other for one, other in zip(before, _used(), strict=True)]
-    drawn = any(moved) and _alone()
+    drawn = any(moved) and (_alone() or (not in_thread and _others() - begun < GLIMPSE))
     _left[kind] = 0 if drawn else _left.get(kind, DECISIONS) - 1
     if drawn:
         names = " and ".join(name for name, own in zip(("random", "numpy.random"), moved, strict=True) if own)
@@ -75,8 +88,13 @@ def watched(simulation: Any, work: Callable[[], Any]) -> Any:
     return result
 
 
+def _others() -> int:
+    """For how many nanoseconds all other threads have run."""
+    return process_time_ns() - thread_time_ns()
+
+
 def _alone() -> bool:
-    """Whether no other thread can have drawn while a simulation was at work: all others are suspended simulations."""
+    """Whether there is no other thread that can have drawn while a simulation was at work."""
     return all(thread is current_thread() or thread.name == SIMULATION for thread in enumerate_threads())
 
 
@@ -101,7 +119,11 @@ class WatchedDriver:
         """Let the simulation go on with a reply; return the event that comes from it next."""
         session: Any = self._session()
         if session is not None and is_watched(session.simulation):
-            event: Event = watched(session.simulation, lambda: self._driver.resume(reply))
+            event: Event = watched(
+                session.simulation,
+                lambda: self._driver.resume(reply),
+                in_thread=isinstance(self._driver, ThreadDriver),
+            )
             return event
         if session is not None:
             session.episode.driver = self._driver

@@ -208,7 +208,7 @@ class Session:
                     self._rng.begin(seed)
                 reset = partial(self._run, partial(self._reset, seed, options), context)
                 if watches:
-                    watched(self.simulation, reset)
+                    watched(self.simulation, reset, in_thread=self.claim is not None)
                 else:
                     reset()
         except BaseException as error:

@@ -184,6 +184,7 @@ def test_what_never_changes_needs_no_duplicate(value):
         ((1, np.array([2])), (1, np.array([2])), True),
         ((1, 2), (1, 3), False),
         ((1, 2), (1, 2, 3), False),
+        ((1, 2), 3, False),
         (3, 3, True),
         (3, 4, False),
         ("word", "word", True),

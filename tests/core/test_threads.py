@@ -297,6 +297,23 @@ def test_a_move_that_is_about_to_begin_lets_no_other_pass(view, monkeypatch):
     env.close()
 
 
+def test_an_interrupt_leaves_an_environment_to_any_thread():
+    def interrupt(frame, event, arg):
+        if event == "c_return" and arg.__name__ == "acquire":
+            raise KeyboardInterrupt
+
+    claim = Claim()
+    sys.setprofile(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt), claim:
+            pass
+    finally:
+        sys.setprofile(None)
+    in_a_thread(claim.__enter__)
+    with pytest.raises(ReentrancyError), claim:
+        pass
+
+
 def test_many_threads_at_once_get_a_step_each_or_none():
     decide = decision(observation_space_mapping=lambda: [len(env.simulation.log), 0.0])
     env = single_env(calling(*[decide] * 400), decide, driver="thread")

@@ -865,6 +865,13 @@ def test_items_may_be_handed_out_instead():
         assert stop.value.value == "over"
 
 
+def test_what_is_sent_before_a_generator_was_asked_is_not_sent_to_it():
+    with handlers((lambda number, step=1: "instead", counting, "instead_next")):
+        generator = counting(3)
+        assert next(generator) == "instead"
+    assert generator.send(5) == 0
+
+
 def test_a_generator_may_be_replaced():
     def instead(number, step=1):
         yield from "ab"
@@ -1125,8 +1132,9 @@ def test_exposed_classes_are_collected():
 
 def test_what_is_exposed_and_attached_is_listed():
     gc.collect()  # other tests have exposed functions, too
-    function = local()
+    function, items = local(), expose_to_plugins([1])
     name = f"{HERE}.local.<locals>.function"
+    assert exposed_functions().count("an iterable list") == 1
     assert name in exposed_functions()
     assert f"{MARKET}.Trader.bid" not in exposed_functions()
     with handlers((print, function, "before"), (failing, f"{MARKET}.Trader.bid", "instead")):
@@ -1142,6 +1150,7 @@ def test_what_is_exposed_and_attached_is_listed():
 
     assert f"{HERE}.test_what_is_exposed_and_attached_is_listed.<locals>.choose" in decision_points()
     assert choose() == 0
+    assert list(items) == [1]
 
 
 def test_calls_are_traced_in_the_order_in_which_they_begin():

@@ -244,6 +244,14 @@ def crowd(simulation):
             simulation.log.append(being.act())
 
 
+def test_actions_of_several_arrays_are_compared():
+    space = spaces.Sequence(spaces.Box(0, 9, (2,), np.float32))
+    ant = decision(agent="ant_0", action_space=space, rule_action_mapping=lambda decided: (np.array([1, 2], "f"),))
+    answers = [(np.array([1, 2], "f"),), (np.array([1, 3], "f"),)]
+    compared = compare_with_rule(calling(ant), {ant: lambda observations: answers}, seeds=range(2))
+    assert compared[ant].agreements.tolist() == [True, False]
+
+
 def test_policies_are_asked_while_the_rule_decides():
     logs = []
 

@@ -236,7 +236,7 @@ def stand_ins(point: DecisionPoint) -> list[DecisionPoint]:
 
 def _decorated_places(point: DecisionPoint) -> set[Any]:
     """The classes and modules that have a decision function of the point under the function's own name."""
-    name, wrappers = point.rule.__name__, set(point.wrappers)
+    name, wrappers = point.rule.__name__, point.wrappers
     owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
     found = ((owner, plain(vars(owner).get(name))) for owner in owners)
     return {owner for owner, function in found if isinstance(function, FunctionType) and function in wrappers}

@@ -214,15 +214,13 @@ class Workers:
         """
         self._be_theirs()
         self._identity += 1
-        asked = []
         messages = [(worker, arguments(worker)) for worker in self._workers]
         packed = [
             (worker, pack_plainly((self._identity, method, given))) for worker, given in messages if given is not None
         ]
         for worker, message in packed:
             worker.send(message)
-            asked.append(worker)
-        return self._gather(asked, self._identity)
+        return self._gather([worker for worker, _ in packed], self._identity)
 
     def _be_theirs(self) -> None:
         """Make sure that this is the process that they talk to.

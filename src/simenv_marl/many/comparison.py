@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.spaces import same as alike
 from ..core.stacking import stacker
 from ..errors import OptionValueError, shown
 from ..simulation import RULE
@@ -140,7 +141,7 @@ def _agreeing(one: Any, other: Any, tolerance: float) -> NDArray[np.bool_]:
     if one.dtype.kind == "f":
         same = np.abs(one - other) <= tolerance
     elif one.dtype == object:
-        same = np.array([bool(np.all(mine == theirs)) for mine, theirs in zip(one, other, strict=True)])
+        same = np.array(list(map(alike, one, other)))
     else:
         same = one == other
     return np.asarray(same.reshape(len(one), -1).all(axis=1), np.bool_)

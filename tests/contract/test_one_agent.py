@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 
 import gymnasium
 import numpy as np
@@ -17,6 +18,7 @@ from simenv_marl import (
     InvalidActionError,
     NoDecisionError,
     OptionValueError,
+    SimulationInterface,
     UnknownOptionError,
     UnknownPointError,
     ViewError,
@@ -197,12 +199,12 @@ def test_it_is_an_option_of_the_single_view_alone(make) -> None:
 
 
 def test_nothing_else_takes_it() -> None:
-    with pytest.raises(UnknownOptionError, match="single view"):
+    with pytest.raises(UnknownOptionError, match="single_env"):
         simulate(Game, points=MOVE, agent="player_red")
     for wrong in ("", 3, ("player_red",)):
         with pytest.raises(OptionValueError, match="agent"):
             single_env(Game, MOVE, agent=wrong)
-    with pytest.raises(UnknownPointError, match="policies"):
+    with pytest.raises(OptionValueError, match="policies"):
         single_env(Game, MOVE, agent="player_red", policies={"player_red": RULE})
 
 
@@ -389,6 +391,9 @@ def test_numbers_for_a_box_of_one_reach_the_mapping_as_such() -> None:
     assert flown(single_env, one, 3.5, clip_actions=True) == 1.0
     assert type(flown(single_env, one, 3.5, clip_actions=True)) is float
     assert flown(single_env, one, -2, clip_actions=True) == -1
+    half = spaces.Box(0.25, 0.5, (1,), np.float32)
+    assert flown(single_env, half, 7, clip_actions=True) == 0.5
+    assert flown(single_env, half, 0, clip_actions=True) == 0.25
     whole = spaces.Box(0, 5, (1,), np.int8)
     assert flown(single_env, whole, np.array([300]), clip_actions=True).tolist() == [5]
     with pytest.raises(InvalidActionError):
@@ -397,7 +402,7 @@ def test_numbers_for_a_box_of_one_reach_the_mapping_as_such() -> None:
 
 def test_boxes_within_other_spaces_are_clipped_and_nothing_else() -> None:
     space = spaces.Dict(gas=BOX, gear=spaces.Tuple([spaces.Discrete(3), spaces.Box(0, 1)]))
-    action = {"gas": np.float32([9, -9]), "gear": (2, np.float32([7]))}
+    action = {"gas": [9.5, -9], "gear": (2, np.float32([7]))}
     taken = flown(single_env, space, action, clip_actions=True)
     assert taken["gas"].tolist() == [1, 0]
     assert taken["gear"][1].tolist() == [1]
@@ -423,3 +428,136 @@ def test_the_vector_view_clips_as_the_single_view_does(numbers) -> None:
         assert taken is InvalidActionError
     else:
         assert taken is TypeError  # the model adds what it was given to a number
+
+
+# -- forced moves and ends ------------------------------------------------------------------------
+
+
+class Seats(Game, SimulationInterface):
+    """Red has no choice and is out before blue is asked; blue plays on for as long as it is let."""
+
+    offers = (1, 1)
+    days = 3
+
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.now = 0.0
+
+    def time(self):
+        return self.now
+
+    def run(self):
+        red, blue = self.players
+        for _ in self.offers:
+            red.coins += red.move([1])
+            self.now += 10
+        self.end_agent("player_red")
+        for _ in range(self.days):
+            blue.coins += blue.move([1, 2])
+            self.now += 10
+
+
+class Endless(Game, SimulationInterface):
+    """Red is out after its first move, and the others go on for ever."""
+
+    def run(self):
+        self.players[0].move([1, 2])
+        self.end_agent("player_red")
+        while True:
+            self.players[1].move([1, 2])
+
+
+class Pauses(Game):
+    """The same choices as the game's, at a time each."""
+
+    now = 0.0
+
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.now = 0.0
+
+    def time(self):
+        return self.now
+
+    def run(self):
+        for offered in (2, 1, 1, 2, 1):
+            self.players[0].move([1, 2][:offered])
+            self.players[0].coins += 1
+            self.now += 10
+
+
+def test_rewards_of_agents_that_end_during_the_reset_come_with_the_first_round() -> None:
+    roster = {"possible_agents": list(NAMES), "skip_forced": True}
+    env = parallel_env(Seats, MOVE, **roster)
+    env.reset(seed=1)
+    assert sorted(env.agents) == sorted(NAMES)
+    _, rewards, terminations, _, _ = env.step(dict.fromkeys(NAMES, 0))
+    assert rewards == {"player_red": 2.0, "player_blue": 1.0}
+    assert terminations == {"player_red": True, "player_blue": False}
+    assert env.agents == ["player_blue"]
+    joint = joint_env(Seats, MOVE, **roster)
+    joint.reset(seed=1)
+    assert joint.step(dict.fromkeys(NAMES, 0))[1] == 3.0
+
+    class Short(Seats):
+        days = 0
+
+    env = parallel_env(Short, MOVE, **roster)
+    env.reset(seed=1)
+    assert env.step(dict.fromkeys(env.agents, 0))[1]["player_red"] == 2.0
+
+
+def test_the_single_view_of_an_agent_that_ends_during_the_reset() -> None:
+    env = single_env(Seats, MOVE, agent="player_red", skip_forced=True)
+    for _ in range(2):
+        env.reset(seed=1)
+        assert env.step(0)[1:4] == (3.0, True, False)
+    vector = vector_env(Seats, MOVE, agent="player_red", skip_forced=True, num_envs=2)
+    vector.reset(seed=1)
+    assert vector.step(np.zeros(2, np.int64))[1:3] == (pytest.approx([3.0, 3.0]), pytest.approx([True, True]))
+    vector.close()
+
+
+def test_joint_vectors_take_episodes_of_forced_moves_alone() -> None:
+    roster = {"possible_agents": list(NAMES), "skip_forced": True}
+    env = vector_env(Forced, MOVE, view="joint", num_envs=2, **roster)
+    env.reset(seed=1)
+    for ended in (True, False, True):
+        assert env.step(dict.fromkeys(NAMES, np.zeros(2, np.int64)))[2].tolist() == [ended] * 2
+    env.close()
+
+
+def test_elapsed_time_adds_up_as_rewards_do() -> None:
+    env = single_env(Pauses, MOVE, agent="player_red", skip_forced=True)
+    env.reset(seed=1)
+    told = [env.step(0) for _ in range(2)]
+    assert [step[1] for step in told] == [6.0, 9.0]
+    assert [step[-1]["elapsed"] for step in told] == [30.0, 20.0]
+
+
+def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do() -> None:
+    env = single_env(Endless, MOVE, agent="player_red")
+    for _ in range(2):
+        env.reset(seed=1)
+        assert env.step(0)[2:4] == (True, False)
+        with pytest.raises(EpisodeOverError):
+            env.step(0)
+    env = single_env(Endless, MOVE, agent="player_red", policies={"player_blue": lambda observation: 0})
+    env.reset(seed=1)
+    assert env.step(0)[2]
+
+
+def test_names_of_a_roster_and_of_policies_that_agent_leaves_to_the_rule() -> None:
+    named = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(agent="better")}
+
+    class Casino(Game):
+        def run(self):
+            for player in self.players:
+                self.log.append((player.bet([5, 6]), player.move([1, 2])))
+
+    env = single_env(Casino, named, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE})
+    env.reset(seed=1)
+    env.step(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert env.step(0)[2]

@@ -30,12 +30,21 @@ DRAWS = "draws from the global generator"
 ABSENT = "did not appear in the episode"
 
 
+ALONE = pytest.mark.usefixtures("_alone")
+
+
 @pytest.fixture
 def heard():
     """The warnings of a test, as texts."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield lambda part: [str(warning.message) for warning in caught if part in str(warning.message)]
+
+
+@pytest.fixture
+def _alone(monkeypatch):
+    """As if no threads of other tests were left, beside which the driver of threads can blame no simulation."""
+    monkeypatch.setattr(draws, "enumerate_threads", lambda: [threading.current_thread()])
 
 
 # -- global generators ----------------------------------------------------------------------------
@@ -71,6 +80,7 @@ def play(env, draw=lambda: None):
     [(random.random, "random"), (np.random.random, "numpy.random"), (lambda: random.shuffle([1, 2, 3]), "random")],
 )
 @pytest.mark.parametrize("in_reset", [False, True])
+@ALONE
 def test_a_simulation_that_draws_is_warned_of_once(heard, draw, name, in_reset) -> None:
     kind = gambler(draw, in_reset=in_reset)
     for make in (single_env, aec_env):
@@ -82,6 +92,7 @@ def test_a_simulation_that_draws_is_warned_of_once(heard, draw, name, in_reset) 
     assert "Gambler" in message
 
 
+@ALONE
 def test_both_generators_are_named(heard) -> None:
     play(single_env(gambler(lambda: (random.random(), np.random.random())), decide))
     assert "random and numpy.random" in heard(DRAWS)[0]
@@ -92,6 +103,7 @@ def test_both_generators_are_named(heard) -> None:
     lambda kind: simulate_many(kind, {decide: lambda observations: np.ones(len(observations), np.int64)}, seeds=[1, 2]),
     lambda kind: _vector(kind),
 ])  # fmt: skip
+@ALONE
 def test_all_runners_notice(heard, run) -> None:
     run(gambler(random.random))
     assert len(heard(DRAWS)) == 1

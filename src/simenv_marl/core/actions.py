@@ -139,12 +139,13 @@ def _clipped(space: spaces.Space[Any], action: Any) -> Any:
         array = np.asarray(action)
     except (ValueError, TypeError):
         return action
-    if array.dtype.kind not in "iuf" or (
-        array.shape != space.shape and not (array.shape == () and space.low.size == 1)
-    ):
+    kinds = "iu" if space.dtype.kind in "iu" else "iuf"
+    fits = array.shape == space.shape or (array.shape == () and space.low.size == 1)
+    if array.dtype.kind not in kinds or not fits:
         return action
-    clipped = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape))
-    return type(action)(clipped) if type(action) in (int, float) else clipped
+    with np.errstate(over="ignore"):
+        clipped = np.clip(array, space.low.reshape(array.shape), space.high.reshape(array.shape)).astype(space.dtype)
+    return clipped.item() if type(action) in (int, float) else clipped
 
 
 # -- masks ----------------------------------------------------------------------------------------

@@ -68,6 +68,7 @@ class Ending(Participants):
         unwinding: Whether it is being ended.
         failed_in_model: Whether the error that has ended the episode came from the simulation.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
+        untold: Agents that forced moves have ended during the reset, whose reward and end the first round tells.
         turns: How many actions the environment's user has given.
         seed: What the simulation was reset with.
         driver: Its stack.
@@ -76,7 +77,7 @@ class Ending(Participants):
 
     __slots__ = (
         "_around", "begun", "driver", "failed_in_model", "over", "pending", "plugins", "running", "seed", "terminated",
-        "truncated", "turns", "unwinding",
+        "truncated", "turns", "untold", "unwinding",
     )  # fmt: skip
 
     def __init__(
@@ -97,6 +98,7 @@ class Ending(Participants):
         self.over = self.terminated = self.truncated = self.failed_in_model = self.begun = self.unwinding = False
         self.running = True
         self.turns = 0
+        self.untold: list[Agent] = []
 
     def at_work(self) -> at_work:
         """What is to be around all that runs for the environment."""
@@ -165,6 +167,8 @@ class Ending(Participants):
             raise InvalidActionError(f"a round takes a dict of actions by agent, not {shown(actions)}")
         for name, action in actions.items():
             agent = agents.get(name)
+            if agent is None and name in self.ended and self.ended[name] in self.untold:
+                continue
             if agent is None:
                 raise UnknownAgentError(f"there is an action for {shown(name)}, which is no live agent: {self.names()}")
             if action is not RULE:

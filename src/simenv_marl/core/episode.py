@@ -81,8 +81,9 @@ class Episode(Ending):
         script: The answers of another episode's tape that are yet to be given again; None where there were none.
         last_time: The time at the latest step of a joint view.
         skips: Whether decisions with one legal action are answered with it.
-        stalled: How many rounds have had no action for the pending agent since the simulation has moved.
-        unheard: Whether the episode has ended so before its user was asked, who learns of it at the first step.
+        stalled: How many rounds have had no action for the pending agent since the simulation last moved.
+        unheard: Whether the episode has ended before its user was asked, since all decisions were forced: the first
+            step tells of it.
     """
 
     __slots__ = ("_left", "decide", "last_time", "limit", "script", "skips", "stalled", "tape", "unheard", "when")
@@ -136,6 +137,7 @@ class Episode(Ending):
                     self._return(settle=self.when is When.RETURN)
                     for agent in self.agents.values() if self.skips else ():
                         agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # a reset tells no rewards
+                    self.untold = self.just_ended if self.skips else []
                 self.begun = True
             except BaseException as error:
                 self.fail(error)
@@ -287,7 +289,8 @@ class Episode(Ending):
             self.turns += bool(actions)
             for agent in (*self.agents.values(), *self.just_ended):
                 agent.acted = False
-            self.just_ended = []
+            self.just_ended = self.untold
+            self.untold = []
             self._left = left
             reply = self._answer_in_round(pending)
             self.stalled = self.stalled + 1 if reply is WAIT else 0
@@ -312,7 +315,11 @@ class Episode(Ending):
         """
         if name is None:
             return RULE
-        self.latest = agent = self.agent_for(point, name)
+        agent = self.agent_for(point, name)
+        if self.done:  # the simulation may go on for ever without a decision of its user's
+            self.finish(truncated=False)
+            return WAIT
+        self.latest = agent
         if agent.name in self.answered:
             return self.consult(agent, args, kwargs)
         return agent
@@ -327,12 +334,15 @@ class Episode(Ending):
             InvalidActionError: The policy's action is not legal.
             BaseException: Whatever a mapping or the policy raises.
         """
+        if self.done:
+            self.finish(truncated=False)
+            return WAIT
         if agent.policy is RULE:
             return RULE
         agent.settle(agent, args, kwargs, False)
         forced = self._forced(agent) if self.skips else None
         if forced is not None:
-            return self.answer(agent, forced, False)
+            return self._answer_forced(agent, forced)
         if agent.deferred:
             self.pending = agent
             return WAIT
@@ -357,10 +367,18 @@ class Episode(Ending):
         if forced is not None or not agent.asked:  # a reset, too, tells no rewards
             agent.reward, agent.carried = 0.0, agent.reward
         if forced is not None:
-            return self.answer(agent, forced, False)
+            return self._answer_forced(agent, forced)
         agent.asked = True
         self.pending = agent
         return WAIT
+
+    def _answer_forced(self, agent: Agent, action: Any) -> Any:
+        """Answer with the one legal action; as rewards do, the elapsed time adds up until the agent is asked."""
+        before = agent.answered_at
+        reply = self.answer(agent, action, False)
+        if before is not None:
+            agent.answered_at = before
+        return reply
 
     def _forced(self, agent: Agent) -> Any:
         """The one legal action of an agent; None where it has a choice."""

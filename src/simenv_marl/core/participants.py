@@ -19,11 +19,23 @@ class Participants:
         answered: The agents for which policies answer, by name.
         ended: The agents of the environment whose episode has ended before the simulation's, by name.
         just_ended: Those of them whose end no view has entered yet.
+        done: Whether the one agent of the environment has ended, and so nothing is left to ask for.
         latest: The agent whose decision was the latest, for those who read an error's notes.
         clock: Returns the simulation's time; None where it has none.
     """
 
-    __slots__ = ("_entities", "_plan", "_simulation", "agents", "answered", "clock", "ended", "just_ended", "latest")
+    __slots__ = (
+        "_entities",
+        "_plan",
+        "_simulation",
+        "agents",
+        "answered",
+        "clock",
+        "done",
+        "ended",
+        "just_ended",
+        "latest",
+    )
 
     def __init__(self, plan: Plan, simulation: Any, clock: Callable[[], float] | None) -> None:
         """Have the agents take part that are known beforehand."""
@@ -35,6 +47,7 @@ class Participants:
         self.ended: dict[str, Agent] = {}
         self.just_ended: list[Agent] = []
         self.latest: Agent | None = None
+        self.done = False
         self._entities: dict[tuple[BoundPoint, int], Agent] = {}
 
     def remember(self, agent: Agent, entity: Any) -> None:
@@ -111,6 +124,7 @@ class Participants:
         agent.ended = True
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
+        self.done = agent.name == self._plan.one_agent
 
     def conclude(self, agent: Agent) -> None:
         """Give an agent its last reward and its last observation."""

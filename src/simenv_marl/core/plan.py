@@ -106,9 +106,9 @@ class Plan:
         self.plugins = Plugins(options.plugins) if options.plugins else None
         self.wanted = {*self.policies, *declared_agents(options.possible_agents)}
         self.asks = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
-        self._bind_points()
+        self._bind_points(first=True)
 
-    def _bind_points(self) -> None:
+    def _bind_points(self, *, first: bool) -> None:
         """Make the decision points ready to be called, and find out who decides there."""
         options, unanswered = self.options, self.unanswered
         agents = name_agents(self._everything)
@@ -122,13 +122,15 @@ class Plan:
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
             if policy is not RULE or excepted:  # else its rule decides
                 self._bind(point, agent, policy)
+            else:
+                self.wanted.discard(agent)
         self.events: dict[Any, Any] = {}
         for bound in self.points:
             self.events[bound.point] = bound
         for bound in self.points:
             for other in stand_ins(bound.point):
                 self.events.setdefault(other, bound)
-        self._find_removals()
+        self._find_removals(warns=first)
         if self._ends_agents and self.points:
             self._cross(locate(END_AGENT)[0], Ended())
         self.decisions = {point.hook: event for point, event in self.events.items()}
@@ -139,7 +141,7 @@ class Plan:
         if self.rewarded:
             self.roster = {point.agent: point for point in self.active if point.agent is not None}
         else:
-            roster, self.complete = call_the_roll(self.active, options.possible_agents)
+            roster, self.complete = call_the_roll(self.active, options.possible_agents, agents)
             if not unanswered:
                 self.roster = {name: point for name, point in roster.items() if name not in self.policies}
         if options.agent is not None:
@@ -153,7 +155,7 @@ class Plan:
         made._everything = [
             replace(point, definition=given_simulation(point.definition, simulation)) for point in self._everything
         ]
-        made._bind_points()
+        made._bind_points(first=False)
         return made
 
     def _bind(self, named: NamedPoint, agent: str | None, policy: Any) -> None:
@@ -176,14 +178,16 @@ class Plan:
 
         Raises:
             AgentError: The agent is not declared, or its decision point is not known.
-            UnknownPointError: A policy answers for it.
+            OptionValueError: A policy answers for it.
         """
         if agent in self.policies:
-            raise UnknownPointError(
+            raise OptionValueError(
                 f"agent={shown(agent)} is answered by policies, and no decision is left to the environment"
             )
         if self.complete and agent not in self.roster:
-            raise AgentError(f"agent={shown(agent)} names no agent of the environment: {', '.join(self.roster)}")
+            raise AgentError(
+                f"agent={shown(agent)} names no agent of the environment; its agents are {', '.join(self.roster)}"
+            )
         points = [self.roster[agent]] if self.complete else self.active
         if len(points) > 1:
             raise AgentError(
@@ -226,7 +230,7 @@ class Plan:
         """What must be set in the model while an environment is in use."""
         return [*self.hooks] if self.plugins is None else [*self.hooks, self.plugins]
 
-    def _find_removals(self) -> None:
+    def _find_removals(self, *, warns: bool) -> None:
         for binding in self.points:
             for name, agent in binding.definition.removed_by.items():
                 point, _ = locate(name)
@@ -234,7 +238,7 @@ class Plan:
                 if not isinstance(removal, Removed):
                     raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
                 owner, remover = owner_class(binding.point), owner_class(point)
-                if agent is None and point.bound and owner and remover and not have_instances(owner, remover):
+                if agent is None and warns and point.bound and owner and remover and not have_instances(owner, remover):
                     warn_user(
                         f"{name}, which removed_by= of {binding.point.name} names, is called on a {remover.__name__},"
                         f" which is no {owner.__name__}, and so ends no agent; give a dict from {name!r} to a callable"
@@ -275,7 +279,7 @@ class Plan:
             source, points, options = variant.applied(points, options)
         checked = Options().amended(options)
         if unanswered and checked.agent is not None:
-            raise UnknownOptionError("agent is an option of the single view alone")
+            raise UnknownOptionError("agent is an option of single_env, and of what makes single views, alone")
         model: Any = source
         spare: list[Spare] = []
         plain_factory = not isinstance(source, type) and not hasattr(source, "run")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from sys import modules
 from typing import Any
 
@@ -45,7 +45,9 @@ def declared_agents(declared: Any) -> list[str]:
     return declared or []
 
 
-def call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, BoundPoint], bool]:
+def call_the_roll(
+    active: list[BoundPoint], declared: Any, known: Collection[str | None]
+) -> tuple[dict[str, BoundPoint], bool]:
     """Find out which agents are known beforehand, and whether these are all."""
     named = [binding for binding in active if binding.agent is None]
     names: dict[BoundPoint, list[Any]] = {}
@@ -59,7 +61,7 @@ def call_the_roll(active: list[BoundPoint], declared: Any) -> tuple[dict[str, Bo
                 )
             names[point] = value
     elif declared is not None:
-        others = [name for name in declared if name not in [b.agent for b in active]]
+        others = [name for name in declared if name not in known]
         if len(named) > 1 or (others and not named):
             raise OptionValueError(
                 "possible_agents must be a dict from decision point to names where"

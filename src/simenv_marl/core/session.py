@@ -294,6 +294,8 @@ class Session:
         """The error that says why no action can be taken now."""
         if self.episode is not None:
             return self.episode.refusal()
+        if self._starting:
+            return refusal("resetting")
         return refusal("closed" if self._closed else "copied" if self._copied else "new")
 
     def end(self) -> None:
@@ -343,6 +345,13 @@ class Session:
                     self._close_simulation()
                 finally:
                     self._put_away()
+
+    def close_after(self, error: BaseException) -> None:
+        """Close after an error, which gets a note should closing raise another one."""
+        try:
+            self.close()
+        except Exception as problem:
+            annotate(error, f"simenv_marl: and the simulation, when it was closed, raised {shown(problem)}")
 
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""

@@ -64,7 +64,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         """
         with self._session.claimed():
             episode = self._start(seed, options, When.RETURN)
-            self.agents = list(episode.agents)
+            self.agents = [*episode.agents, *(agent.name for agent in episode.untold)]
             if self._shows:
                 self.render()
             observations, _, _, _, infos = self._results(episode)

@@ -172,7 +172,7 @@ class Row:
             try:
                 if episode is None:
                     raise self.sessions[number].refusal()
-                if joint is not None:
+                if joint is not None and not episode.unheard:
                     joint.check(episode, action)
                 elif episode.pending is not None:
                     episode.pending.point.checked(action, self._agent, episode.pending.mask)
@@ -273,7 +273,7 @@ class Row:
             session.render()
         if joint is not None:
             return joint.observe(episode), joint.inform(episode)
-        agent = episode.agents[str(self._agent)]
+        agent: Any = episode.agent(str(self._agent))
         return agent.observation, agent.info
 
     def _again(self, number: int) -> tuple[Any, dict[str, Any]]:

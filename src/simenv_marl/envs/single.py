@@ -85,7 +85,8 @@ class SimulationEnv(OneAgentView):
         """
         with self._session.claimed():
             episode = self._begin(seed, options, When.DECISION)
-            self._own = own = episode.agents[self._agent]
+            self._own = own = episode.agent(self._agent)
+            assert own is not None
             if self._shows:
                 self.render()
             return own.observation, own.info

@@ -238,7 +238,7 @@ def _checked(episode: Episode, action: Any) -> Any:
 
 
 def _blame(number: int, error: BaseException) -> None:
-    """Notes say of which seed an error is."""
+    """Do nothing: the notes of an error tell its seed already."""
 
 
 CROWD: Final = 256

@@ -39,6 +39,8 @@ def simulate(
     session = Session(plan)
     try:
         session.start(checked_seed(seed), None, When.NEVER)
-        return session.simulation
-    finally:
-        session.close()
+    except BaseException as error:
+        session.close_after(error)
+        raise
+    session.close()
+    return session.simulation

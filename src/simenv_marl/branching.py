@@ -93,12 +93,16 @@ def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], numb
     twin = view.replayed()
     try:
         # Of the wrappers around it each is copied, with all that it remembers.
-        return function(copy.deepcopy(env, {id(view): twin}), number)
-    except Exception as error:
+        result = function(copy.deepcopy(env, {id(view): twin}), number)
+    except BaseException as error:
         annotate(error, f"simenv_marl: in branch {number}")
+        try:
+            twin.close()
+        except Exception as problem:
+            annotate(error, f"simenv_marl: and the branch, when it was closed, raised {shown(problem)}")
         raise
-    finally:
-        twin.close()
+    twin.close()
+    return result
 
 
 # -- by forking -----------------------------------------------------------------------------------

@@ -194,6 +194,23 @@ def test_its_error_is_raised_by_the_next_reset_or_by_close(books) -> None:
     assert Broken.book is Broken.__dict__.get("book", Shop.book)
 
 
+@pytest.mark.filterwarnings("ignore:unclosed")
+def test_its_error_does_not_take_the_place_of_an_earlier_one(books) -> None:
+    def fail(*_):
+        raise LookupError("first")
+
+    with pytest.raises(LookupError, match="first") as caught:
+        simulate(Broken, {BOOK: fail}, points=books, seed=1)
+    assert "books cannot be closed" in "".join(caught.value.__notes__)
+    env = single_env(Broken, books)
+    env.reset(seed=1)
+    with pytest.raises(LookupError, match="first") as caught:
+        branch(env, fail, 1, method="replay")
+    assert "books cannot be closed" in "".join(caught.value.__notes__)
+    with pytest.raises(ConnectionError):
+        env.close()
+
+
 def test_its_error_is_a_warning_where_nobody_can_catch_it(books) -> None:
     envs = [single_env(Broken, books)]
     envs[0].reset(seed=1)

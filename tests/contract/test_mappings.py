@@ -1,7 +1,9 @@
 """What mappings are given: the simulation, where they ask for it; a chosen answer, where there are choices."""
 
+import functools
 import gc
 import pickle
+import types
 import weakref
 
 import gymnasium
@@ -226,6 +228,15 @@ def test_a_parameter_that_may_be_passed_by_position_is_none_of_it() -> None:
     )
     told, _ = played(env)
     assert {reward for _, _, reward, _ in told} == {0.0}
+
+
+def test_a_wrapper_may_give_it_by_itself() -> None:
+    @functools.wraps(pay)
+    def given(dealer, offers):
+        return pay(dealer, offers, _simulation=types.SimpleNamespace(log=[1, 2, 3]))
+
+    told, _ = played(aec_env(Market, points(reward_mapping=given)))
+    assert {reward for _, _, reward, _ in told} == {0.0, 3.0}
 
 
 # -- choices with apply ---------------------------------------------------------------------------

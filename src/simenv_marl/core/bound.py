@@ -44,7 +44,10 @@ def asks_for_simulation(function: Any) -> bool:
         parameter = inspect.signature(function).parameters.get("_simulation")
     except (TypeError, ValueError):
         return False
-    return parameter is not None and parameter.kind is parameter.KEYWORD_ONLY
+    if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
+        return False
+    own = inspect.signature(function, follow_wrapped=False).parameters  # what is wrapped may be given it by the wrapper
+    return "_simulation" in own or any(p.kind is p.VAR_KEYWORD for p in own.values())
 
 
 def given_simulation(definition: Definition, simulation: Any) -> Definition:

@@ -73,7 +73,7 @@ class Participants:
             if name in self.ended:
                 raise AgentError(
                     f"the agent {name!r} decides at {point.point.name} after its end; let agent= give each entity"
-                    " a name of its own, and removed_by= name what really ends it"
+                    " a name of its own, and removed_by= or end_agent() tell what really ends it"
                 )
             policy = self._plan.policy_of(name, point)
             agent = self._agent_of(name, point, policy)

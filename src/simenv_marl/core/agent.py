@@ -190,9 +190,6 @@ Settle = Callable[..., None]
 def settling(point: BoundPoint) -> tuple[Settle, Settle]:
     """Make what rewards and observes the agents of a decision point.
 
-    Args:
-        point: The decision point.
-
     Returns:
         Two functions of the agent, and of the arguments of the call that is decided on: positional, and by keyword. The
         first takes three flags besides: whether it rewards, whether it observes, and whether this is the agent's end.

@@ -283,6 +283,12 @@ def test_what_only_the_rule_knows_is_grey():
     assert any("by rule, unknown" in texts(axes.figure.axes[1]) for axes in of_each)
 
 
+def test_policies_are_called_by_the_last_of_their_dotted_names():
+    for key in (Being.act, f"{Being.__module__}.Being.act"):
+        found = collect_episodes(herd(8, 1), {key: ones}, points=beings(), seeds=[5])
+        assert plot_timeline(found).axes[0].get_title(loc="left") == "Being.act, 8 agents: action"
+
+
 def test_nobody_but_the_rule_can_be_drawn():
     found = collect_episodes(herd(8, 2), {Being.act: lambda seen: RULE}, points=beings(), seeds=[5])
     plot_timeline(found).canvas.draw()

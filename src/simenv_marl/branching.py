@@ -17,7 +17,7 @@ from typing import Any, Final, NoReturn, TypeVar
 from .core.forking import Standing
 from .core.processes import pack, pack_error, unpack, unpack_error
 from .envs import View
-from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, shown, told
+from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, shown, told
 
 Result = TypeVar("Result")
 
@@ -96,10 +96,7 @@ def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], numb
         result = function(copy.deepcopy(env, {id(view): twin}), number)
     except BaseException as error:
         annotate(error, f"simenv_marl: in branch {number}")
-        try:
-            twin.close()
-        except Exception as problem:
-            annotate(error, f"simenv_marl: and the branch, when it was closed, raised {shown(problem)}")
+        close_after(error, twin.close, "the branch")
         raise
     twin.close()
     return result

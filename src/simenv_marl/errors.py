@@ -37,6 +37,7 @@ Every error is raised with its message alone, so that it survives pickling.
 import reprlib
 import sys
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -129,6 +130,14 @@ def annotate(error: BaseException, note: str) -> None:
             notes = vars(error).setdefault("__notes__", [])
             if isinstance(notes, list):
                 notes.append(note)
+
+
+def close_after(error: BaseException, close: Callable[[], None], what: str) -> None:
+    """Close something after an error, which stays the one that is seen should closing raise another one."""
+    try:
+        close()
+    except Exception as problem:
+        annotate(error, f"simenv_marl: and {what}, when it was closed, raised {shown(problem)}")
 
 
 def clear_frames(error: BaseException) -> None:

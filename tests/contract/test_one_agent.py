@@ -106,6 +106,17 @@ def definition(**changes):
 MOVE = {f"{PLACE}.move": definition()}
 
 
+class Casino(Game):
+    """Two players, who bet and move, in one round."""
+
+    def run(self):
+        for player in self.players:
+            self.log.append((player.bet([5, 6]), player.move([1, 2])))
+
+
+NAMED = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(agent="better")}
+
+
 def episode(env, choose=lambda info: 0):
     """Play an episode of a Gymnasium environment; what each step has returned but for the info, and the offers."""
     observation, info = env.reset(seed=3)
@@ -144,22 +155,15 @@ def test_the_others_are_left_to_policies_by_agent_or_by_point() -> None:
 
 
 def test_an_agent_with_a_name_of_its_own_is_one_of_several_points() -> None:
-    named = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(agent="better")}
-
-    class Casino(Game):
-        def run(self):
-            for player in self.players:
-                self.log.append((player.bet([5, 6]), player.move([1, 2])))
-
-    env = single_env(Casino, named, agent="mover")
+    env = single_env(Casino, NAMED, agent="mover")
     env.reset(seed=0)
     while not env.step(0)[2]:
         pass
     assert env.simulation.log == [(5, 1), (5, 1)]
     with pytest.raises(ViewError, match="agent="):
-        single_env(Casino, named)
+        single_env(Casino, NAMED)
     with pytest.raises(AgentError, match="mover, better"):
-        single_env(Casino, named, agent="mvoer")
+        single_env(Casino, NAMED, agent="mvoer")
 
 
 def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
@@ -167,11 +171,6 @@ def test_of_points_that_name_their_agents_a_roster_tells_whose_it_is() -> None:
         f"{PLACE}.move": definition(),
         f"{PLACE}.bet": definition(agent=lambda player, moves: f"{player.name}_bet"),
     }
-
-    class Casino(Game):
-        def run(self):
-            for player in self.players:
-                self.log.append((player.bet([5, 6]), player.move([1, 2])))
 
     with pytest.raises(AgentError, match="possible_agents"):
         single_env(Casino, named, agent="player_red")
@@ -548,14 +547,7 @@ def test_the_episode_is_over_once_its_one_agent_has_ended_whatever_the_others_do
 
 
 def test_names_of_a_roster_and_of_policies_that_agent_leaves_to_the_rule() -> None:
-    named = {f"{PLACE}.move": definition(agent="mover"), f"{PLACE}.bet": definition(agent="better")}
-
-    class Casino(Game):
-        def run(self):
-            for player in self.players:
-                self.log.append((player.bet([5, 6]), player.move([1, 2])))
-
-    env = single_env(Casino, named, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE})
+    env = single_env(Casino, NAMED, agent="mover", possible_agents=["mover", "better"], policies={"better": RULE})
     env.reset(seed=1)
     env.step(0)
     with warnings.catch_warnings():

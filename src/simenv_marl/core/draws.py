@@ -6,18 +6,15 @@ after the simulation was at work. From then on nothing of this is in the way.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
-from ctypes import c_char
 from threading import current_thread
 from threading import enumerate as enumerate_threads
 from time import process_time_ns, thread_time_ns
 from typing import Any, Final
 from weakref import WeakKeyDictionary, ref
 
-import numpy as np
-
 from ..errors import warn_user
+from .rng import used_up
 from .switch import BaseDriver, Event
 from .threads import SIMULATION, ThreadDriver
 
@@ -29,33 +26,6 @@ GLIMPSE: Final = 5_000
 
 _left: Final[WeakKeyDictionary[type, int]] = WeakKeyDictionary()
 """By class of simulations: during how many more."""
-
-_TWISTER: Final = 624 * 4
-"""Bytes of the state of NumPy's generator, before the number that tells how much of it is used up."""
-
-_python: Final[Any] = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
-_numpy: Final[Any] = np.random.mtrand._rand
-
-
-class _Used:
-    """How much the generators of Python and of NumPy have used up; nothing of a generator of another make."""
-
-    def __init__(self) -> None:
-        self._python = (c_char * 4).from_address(id(_python) + object.__basicsize__)
-        self._generator: Any = None
-        self._numpy: Any = None
-
-    def __call__(self) -> tuple[bytes, bytes]:
-        generator = _numpy._bit_generator
-        if generator is not self._generator:
-            self._numpy = (c_char * 4)()
-            if type(generator) is np.random.MT19937:
-                self._numpy = (c_char * 4).from_address(generator.ctypes.state_address + _TWISTER)
-            self._generator = generator
-        return self._python.raw, self._numpy.raw
-
-
-_used: Final = _Used()
 
 
 def is_watched(simulation: Any) -> bool:
@@ -74,9 +44,9 @@ def watched(simulation: Any, work: Callable[[], Any], *, in_thread: bool) -> Any
     Returns:
         What the work returns.
     """
-    before, begun = _used(), _others()
+    before, begun = used_up(), _others()
     result = work()
-    kind, moved = type(simulation), [one != other for one, other in zip(before, _used(), strict=True)]
+    kind, moved = type(simulation), [one != other for one, other in zip(before, used_up(), strict=True)]
     drawn = any(moved) and (_alone() or (not in_thread and _others() - begun < GLIMPSE))
     _left[kind] = 0 if drawn else _left.get(kind, DECISIONS) - 1
     if drawn:

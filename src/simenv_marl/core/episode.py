@@ -315,11 +315,7 @@ class Episode(Ending):
         """
         if name is None:
             return RULE
-        agent = self.agent_for(point, name)
-        if self.done:  # the simulation may go on for ever without a decision of its user's
-            self.finish(truncated=False)
-            return WAIT
-        self.latest = agent
+        self.latest = agent = self.agent_for(point, name)
         if agent.name in self.answered:
             return self.consult(agent, args, kwargs)
         return agent
@@ -334,7 +330,7 @@ class Episode(Ending):
             InvalidActionError: The policy's action is not legal.
             BaseException: Whatever a mapping or the policy raises.
         """
-        if self.done:
+        if self.done:  # the simulation may go on for ever without a decision of its user's
             self.finish(truncated=False)
             return WAIT
         if agent.policy is RULE:

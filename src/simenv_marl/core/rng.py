@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from _random import Random as Twister
 from collections.abc import Callable
-from ctypes import memmove, string_at
+from ctypes import c_char, memmove, string_at
 from threading import get_ident
 from typing import Any, Final, Protocol
 
@@ -20,6 +20,11 @@ from ..errors import WrongThreadError
 
 _HEADER: Final = object.__basicsize__
 _WORDS: Final = 4 * 625  # of both generators: 624 words of a Mersenne twister, and how many of them are used up
+
+_KEY: Final = 4 * 624
+"""Bytes of a Mersenne twister, before the number that tells how many of its words are used up."""
+
+_UNKNOWN: Final = (c_char * 4)()
 
 _python: Any = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
 _numpy: Any = np.random.mtrand._rand
@@ -128,6 +133,27 @@ def _copied(generator: Any) -> Any:
 
 
 _State: Final[Callable[[], State]] = SwiftState if _is_swift() else PortableState
+
+
+class _Used:
+    """Reads how much of the numbers that the generators have made in advance is used up."""
+
+    def __init__(self) -> None:
+        self._python = (c_char * 4).from_address(id(_python) + _HEADER) if _State is SwiftState else _UNKNOWN
+        self._generator: Any = None
+        self._numpy = _UNKNOWN
+
+    def __call__(self) -> tuple[bytes, bytes]:
+        generator = _numpy._bit_generator
+        if generator is not self._generator:
+            known = type(generator) is np.random.MT19937
+            self._numpy = (c_char * 4).from_address(generator.ctypes.state_address + _KEY) if known else _UNKNOWN
+            self._generator = generator
+        return self._python.raw, self._numpy.raw
+
+
+used_up: Final = _Used()
+"""Called, returns four bytes each of Python's and of NumPy's global generator, which change when that is drawn from."""
 
 
 class _Owner:

@@ -346,13 +346,6 @@ class Session:
                 finally:
                     self._put_away()
 
-    def close_after(self, error: BaseException) -> None:
-        """Close after an error, which gets a note should closing raise another one."""
-        try:
-            self.close()
-        except Exception as problem:
-            annotate(error, f"simenv_marl: and the simulation, when it was closed, raised {shown(problem)}")
-
     def abandon(self) -> None:
         """The same, from a finalizer: raises nothing."""
         try:

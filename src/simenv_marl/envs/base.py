@@ -198,8 +198,7 @@ class View:
     def __deepcopy__(self, memory: dict[int, Any]) -> Any:
         """Make an environment like this one, with a simulation of its own, that is to be reset."""
         made = memory[id(self)] = _made_again(type(self), self._made_of)
-        made.__setstate__(copy.deepcopy(self._state(), memory))
-        made._clear()
+        _take_over(made, copy.deepcopy(self._state(), memory))
         return made
 
     def __copy__(self) -> Any:
@@ -213,7 +212,7 @@ class View:
             found = getattr(found, name, None)
         if found is not made:  # a class that generate_env has made, and which is not found by its name
             made = next(base for base in made.__mro__ if base.__module__.startswith(__package__))
-        return _made_again, (made, self._made_of), self._state(), None, None, _unpickled
+        return _made_again, (made, self._made_of), self._state(), None, None, _take_over
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         self._session.take_over(kept.pop("session"))
@@ -282,8 +281,8 @@ def _made_again(view: type[View], plan: Plan) -> View:
     return made
 
 
-def _unpickled(view: View, state: dict[str, Any]) -> None:
-    """Have a view that was pickled take over what it is to take over."""
+def _take_over(view: View, state: dict[str, Any]) -> None:
+    """Have a copy take over the state of another view, but for what that has noted of its episode."""
     view.__setstate__(state)
     view._clear()
 

@@ -8,6 +8,7 @@ from typing import Any
 from ..core.episode import When
 from ..core.plan import Plan
 from ..core.session import Session, checked_seed
+from ..errors import close_after
 
 
 def simulate(
@@ -40,7 +41,7 @@ def simulate(
     try:
         session.start(checked_seed(seed), None, When.NEVER)
     except BaseException as error:
-        session.close_after(error)
+        close_after(error, session.close, "the simulation")
         raise
     session.close()
     return session.simulation

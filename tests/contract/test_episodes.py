@@ -776,6 +776,7 @@ def test_with_rule_throughout_a_run_is_the_plain_one_bit_for_bit(points, seed):
         assert env.unwrapped.simulation.log == Walk(seed).walk()
 
 
+@pytest.mark.filterwarnings("ignore:Script draws from the global generator")
 @pytest.mark.parametrize("seed", range(3))
 def test_with_rule_throughout_a_run_of_global_generators_is_the_plain_one(seed):
     decide = decision(lambda: random.random() + np.random.random(), agent="a_0")

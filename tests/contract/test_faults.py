@@ -360,6 +360,7 @@ def interrupt_at(number, function, *args):
     return where, raised
 
 
+@pytest.mark.usefixtures("_collected")
 @VIEWS
 def test_an_interrupt_anywhere_surfaces_and_the_next_episode_is_as_ever(view, monkeypatch):
     monkeypatch.setattr("simenv_marl.core.threads.SECONDS_TO_UNWIND", 0.05)
@@ -426,6 +427,7 @@ def cycle_of(env):
     return told
 
 
+@pytest.mark.usefixtures("_collected")
 @pytest.mark.parametrize("then", [close_again, drop, begin_again])
 def test_an_interrupt_anywhere_in_a_close_leaves_nothing_patched_in_the_end(then):
     fresh = cycle_of(farm_env(aec_env, "before"))
@@ -461,6 +463,7 @@ def test_an_interrupt_anywhere_in_a_close_leaves_nothing_patched_in_the_end(then
         lambda: handled(),
     ],
 )
+@pytest.mark.usefixtures("_collected")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # in a finalizer
 def test_an_interrupt_anywhere_in_what_opens_and_closes_leaves_nothing_patched(use):
     use()

@@ -30,6 +30,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
+from math import inf
 from typing import Any, Final
 
 from greenlet import getcurrent
@@ -78,6 +79,8 @@ class Episode(Ending):
 
     Attributes:
         tape: What the user and policies have answered, in that order; ``LOST`` where that is not kept.
+        most_steps: The step with which the episode is truncated; infinity where none is.
+        limit: The next number of turns at which something is to be seen to: see ``_come_to_limit``.
         script: The answers of another episode's tape that are yet to be given again; None where there were none.
         last_time: The time at the latest step of a joint view.
         skips: Whether decisions with one legal action are answered with it.
@@ -86,7 +89,9 @@ class Episode(Ending):
             step tells of it.
     """
 
-    __slots__ = ("_left", "decide", "last_time", "limit", "script", "skips", "stalled", "tape", "unheard", "when")
+    __slots__ = (
+        "_left", "decide", "last_time", "limit", "most_steps", "script", "skips", "stalled", "tape", "unheard", "when",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -111,7 +116,8 @@ class Episode(Ending):
         """
         super().__init__(plan, simulation, driver, seed, around)
         self.when = when
-        self.limit = plan.options.max_steps or -1  # never reached
+        self.most_steps = plan.options.max_steps or inf
+        self.limit = min(self.most_steps, LONGEST_TAPE + 1)
         self.skips, self.unheard, self.stalled = plan.options.skip_forced, False, 0
         self.decide: Callable[..., Any] | None = None
         if when is When.RETURN:
@@ -162,21 +168,19 @@ class Episode(Ending):
             EpisodeOverError, ReentrancyError: No decision is pending.
             BaseException: Whatever the model, a mapping or a policy raises.
         """
-        if self.pending is None:
+        agent = self.pending
+        if agent is None:
             self._hear()
             return
         if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
             self._enter(self.step, action)
             return
         try:
-            agent = self.pending
-            if action is not RULE:
-                check = agent.point.check
-                legal = check(action)
-                if legal is ILLEGAL or agent.mask is not None:
-                    legal = agent.point.checked(action, agent.name, agent.mask)
-                action = legal
-            self.go_on(self.answer(agent, action))
+            check = agent.point.check  # fetched before it is called: calling it at its attribute is slower
+            legal = check(action)
+            if legal is ILLEGAL or agent.mask is not None:
+                legal = action if action is RULE else agent.point.checked(action, agent.name, agent.mask)
+            self.go_on(self.answer(agent, legal))
         except BaseException as error:
             if self.pending is None:
                 self.fail(error)
@@ -235,15 +239,23 @@ class Episode(Ending):
         agent.answered_at = agent.now
         if turn:
             self.turns = turns = self.turns + 1
+            self.tape.append(kept)
             if turns == self.limit:
-                self.decide = Episode._decide_too_late
-            self._keep(kept)
+                self._come_to_limit()
         return reply
+
+    def _come_to_limit(self) -> None:
+        """See to the tape, which is not to grow for ever, and to the last step."""
+        if len(self.tape) > LONGEST_TAPE:
+            self.tape = LOST
+        self.limit = self.most_steps
+        if self.turns == self.limit:
+            self.decide = Episode._decide_too_late
 
     def _keep(self, answer: Any) -> None:
         """Keep an answer for a replay."""
         tape = self.tape
-        if len(tape) == LONGEST_TAPE:
+        if len(tape) >= LONGEST_TAPE:
             tape = self.tape = LOST
         tape.append(answer)
 
@@ -253,10 +265,12 @@ class Episode(Ending):
         Raises:
             BaseException: Whatever the model, a mapping or a policy raises. The episode is then to ``fail``.
         """
-        while reply is not WAIT:
+        while True:
             resume = self.driver.resume  # fetched before it is called: calling it at its attribute is slower
             event, args, kwargs = resume(reply)
             reply = event.arise(self, args, kwargs)
+            if reply is WAIT:
+                return
             event = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
 
     def play(self, actions: Mapping[str, Any], entered: bool = False) -> None:
@@ -293,10 +307,13 @@ class Episode(Ending):
             self.untold = []
             self._left = left
             reply = self._answer_in_round(pending)
-            self.stalled = self.stalled + 1 if reply is WAIT else 0
-            self.go_on(reply)
+            if reply is WAIT:
+                self.stalled += 1
+            else:
+                self.stalled = 0
+                self.go_on(reply)
             if not self.over:
-                self._return(truncate=bool(actions) and self.turns == self.limit)
+                self._return(truncate=bool(actions) and self.turns == self.most_steps)
         except BaseException as error:
             self.fail(error)
             raise

@@ -40,10 +40,13 @@ class Decision(BoundPoint):
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Settle the agent, and wait for its action; or do what is to be done in its stead."""
-        name, name_agent = self.agent, self.name_agent
-        if name_agent is not None:
+        name_agent = self.name_agent
+        if name_agent is None:
+            name = self.agent
+            agent = episode.agents.get(name)
+        else:
             name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
-        agent = episode.agents.get(name) if type(name) is str else None
+            agent = episode.agents.get(name) if type(name) is str else None
         if agent is None or agent.point is not self:
             agent = episode.dispatch(self, name, args, kwargs)
             if type(agent) is not Agent:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
+from numpy import ndarray
 from pettingzoo import AECEnv
 
 from ..core.agent import Agent
 from ..core.episode import Episode, When
 from ..core.plan import Plan
+from ..core.spaces import duplicate
 from ..errors import InvalidActionError, shown
 from ..simulation import RULE
 from .base import View
@@ -91,7 +92,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()
-        if self._leaving or episode.over:
+        if self._leaving:
             self._dead_step(action)
             return
         try:
@@ -125,24 +126,25 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         Raises:
             ResetNeededError: There is no episode, or all agents have taken leave of it.
         """
-        episode = self._session.episode
-        if episode is None:
-            raise self._session.refusal()
-        name, observation = self.agent_selection, None
-        if observe:
-            agent = episode.pending
-            observation = None if agent is None or agent.name != name else agent.observation
-            observation = observation.copy() if type(observation) is np.ndarray else self.observe(name)
-        try:
-            return (
-                observation,
-                self._cumulative_rewards[name],
-                self.terminations[name],
-                self.truncations[name],
-                self.infos[name],
-            )
-        except KeyError:
-            raise episode.refusal() from None
+        agent, observation = self._deciding, None
+        if agent is None:
+            if not self._leaving:
+                raise self._session.refusal()
+            name = self.agent_selection
+            if observe:
+                observation = self.observe(name)
+        else:
+            name = agent.name
+            if observe:
+                observation = agent.observation
+                observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
+        return (
+            observation,
+            self._cumulative_rewards[name],
+            self.terminations[name],
+            self.truncations[name],
+            self.infos[name],
+        )
 
     def observe(self, agent: str) -> Any:
         """The latest observation of an agent, as a copy of the caller's own.
@@ -161,11 +163,13 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     def _resume_from_replay(self) -> None:
         episode = self._running()
         episode.just_ended = []  # they are in the books already
+        self._select_leaving(episode)
 
     def _clear(self) -> None:
         super()._clear()
         self.agents = []
         self._places: dict[str, int] = {}  # of the agents, in the list of agents
+        self._deciding: Agent | None = None  # the agent that is selected for its decision
         self._leaving: list[str] = []  # agents that have ended, and whose None step is to come, the next one last
         self._rewarded: list[str] = []  # agents that the latest step has rewarded
         self.rewards: dict[str, float] = {}
@@ -183,11 +187,12 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     def _select(self, agent: Agent) -> None:
         """Enter a decision that has arisen."""
+        self._deciding = agent
         name = self.agent_selection = agent.name
         if name not in self.rewards:
             self._join(name)
-        self.rewards[name] = reward = agent.reward
-        self._cumulative_rewards[name] += reward
+        # It has had no other reward since its last step.
+        self.rewards[name] = self._cumulative_rewards[name] = agent.reward
         self.infos[name] = presence(agent) if self._padded else agent.info
 
     def _enter_reward(self, agent: Agent) -> None:
@@ -225,9 +230,17 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         if episode.pending is not None:
             self._select(episode.pending)
             self._rewarded.append(episode.pending.name)
-        if self._leaving:
-            self.agent_selection = self._leaving[-1]
+        self._select_leaving(episode)
         episode.just_ended = []
+
+    def _select_leaving(self, episode: Episode) -> None:
+        """Select the next agent that is to take leave, if there is any, and else the one that decides."""
+        if self._leaving:
+            self.agent_selection, self._deciding = self._leaving[-1], None
+        else:
+            self._deciding = episode.pending
+            if self._deciding is not None:
+                self.agent_selection = self._deciding.name
 
     def _dismiss(self, name: str, *, terminated: bool, truncated: bool) -> None:
         """Enter the end of an agent, whose ``None`` step is to come."""
@@ -242,9 +255,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     def _dead_step(self, action: Any) -> None:
         """The step of an agent that has ended."""
-        episode = self._running()
-        if not self._leaving:
-            raise episode.refusal()
         if action is not None and action is not RULE:
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {shown(action)}"
@@ -257,7 +267,4 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         place, mover = self._places.pop(name), self.agents.pop()
         if mover != name:
             self.agents[place], self._places[mover] = mover, place
-        if self._leaving:
-            self.agent_selection = self._leaving[-1]
-        elif episode.pending is not None:
-            self.agent_selection = episode.pending.name
+        self._select_leaving(self._running())

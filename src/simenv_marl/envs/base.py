@@ -287,5 +287,5 @@ def _take_over(view: View, state: dict[str, Any]) -> None:
     view._clear()
 
 
-_OWN = frozenset(("_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))
+_OWN = frozenset(("_deciding", "_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))
 """What each environment has of its own, and no copy takes over."""

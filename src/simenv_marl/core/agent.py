@@ -1,11 +1,11 @@
-"""What an episode knows of one agent, and how an agent is rewarded and observed."""
+"""What an episode knows of one agent: what becomes of its decisions, how it is rewarded and observed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import isfinite
 from numbers import Real
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from weakref import ref
 
 import numpy as np
@@ -13,10 +13,16 @@ from greenlet import getcurrent
 
 from ..errors import MaskError, RewardError, shown
 from ..hooks.stacks import DIFFERENCES, EVALUATING
-from ..simulation import RULE
+from ..simulation import RULE, Sentinel
 from .actions import MASK
 from .bound import BoundPoint, DeferredPolicy
 from .spaces import duplicate
+
+if TYPE_CHECKING:
+    from .episode import Episode
+
+WAIT: Final = Sentinel("WAIT")
+"""Returned in place of a reply to the simulation: the episode waits for an action, or is over."""
 
 _NOTHING: Final[dict[str, Any]] = {}
 """The keyword arguments of calls that have none. It is only ever unpacked."""
@@ -50,14 +56,14 @@ class Agent:
         plugins: The plugins of its environment; None if it has none.
         now, answered_at: The time of its latest decision, and of the decision before.
         entity, rest, kwargs: The arguments of its latest decision: see ``keep``.
-        told: Whether its next info tells of ``rule_action``.
+        tells: Whether its next info tells of ``rule_action``.
         group, notes: What a runner of many episodes keeps of it.
     """
 
     __slots__ = (
         "acted", "answered_at", "asked", "carried", "choices", "clock", "decided", "deferred", "ended", "entity",
         "group", "handed_out", "info", "kwargs", "mask", "memory", "name", "notes", "now", "observation", "offered",
-        "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again", "told",
+        "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again", "tells",
     )  # fmt: skip
 
     def __init__(
@@ -67,7 +73,7 @@ class Agent:
         self.settle = self.settle_again = point.settle
         self.plugins = plugins
         self.deferred = isinstance(policy, DeferredPolicy)
-        self.asked = self.decided = self.acted = self.ended = self.present = self.told = False
+        self.asked = self.decided = self.acted = self.ended = self.present = self.tells = False
         self.reward = self.carried = 0.0
         self.observation: Any = None
         self.handed_out: Any = None
@@ -124,6 +130,40 @@ class Agent:
 
     # -- what becomes of a decision ---------------------------------------------------------------
 
+    @property
+    def deliver(self) -> Callable[..., Any] | None:
+        """Turns a reply into what a call of its decision function returns: see ``BoundPoint``."""
+        return self.point.deliver
+
+    @property
+    def told(self) -> Any:
+        """The event that tells what its rule decides: see ``BoundPoint``."""
+        return self.point.told
+
+    def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Decide: be settled, and wait for an action; or do what is to be done in its stead.
+
+        Where its point has no other agent, the agent itself is the event that crosses from the simulation.
+        """
+        point = self.point
+        if point.agent is None:
+            if self.keep(args, kwargs):
+                episode.remember(self, args[0])
+        elif self.ended:
+            return episode.dispatch(point, self.name, args, kwargs)
+        else:
+            if point.one_entity and args and self.rest and self.rest[0] is not args[0]:
+                point.warn_of_several(self.name)
+            self.rest, self.kwargs = args, kwargs  # what it is called on is no entity that a model would let go
+        episode.latest = self
+        decide = episode.decide
+        if decide is not None:  # in a round, or when the last step has been taken
+            return decide(episode, self, args, kwargs)
+        settle = self.settle_again  # fetched before it is called: calling it at its attribute is slower
+        settle(self, args, kwargs)
+        episode.pending = self
+        return WAIT
+
     def restrict(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
         """Find out the legal actions of a call.
 
@@ -155,7 +195,7 @@ class Agent:
         """
         offered, self.offered = self.offered, None
         self.rule_action = self.point.rule_action(decision, args, kwargs, offered)
-        self.told = self.point.tells and self.rule_action is not None
+        self.tells = self.point.tells and self.rule_action is not None
 
     # -- infos ------------------------------------------------------------------------------------
 
@@ -164,8 +204,8 @@ class Agent:
         info: dict[str, Any] = {} if self.clock is None else self._tell_time()
         if self.mask is not None:
             info[MASK] = duplicate(self.mask)
-        if self.told:
-            info["rule_action"], self.told = duplicate(self.rule_action), False
+        if self.tells:
+            info["rule_action"], self.tells = duplicate(self.rule_action), False
         return info
 
     def unsee(self) -> None:

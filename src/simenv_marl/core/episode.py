@@ -41,11 +41,10 @@ from ..errors import (
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import ILLEGAL, only_choice
-from .agent import Agent
+from .agent import WAIT, Agent
 from .bound import BoundPoint
 from .contexts import Claim
 from .ending import MANY_ROUNDS, Ending
-from .events import WAIT
 from .plan import Plan
 from .rng import GlobalRandom
 from .spaces import duplicate
@@ -324,7 +323,7 @@ class Episode(Ending):
         """See to a decision of an agent that was not met at this point as one of the user's.
 
         Returns:
-            The agent, where it is one of the user's; else the reply of the rule or of its policy, or ``WAIT``.
+            The reply to the simulation, or ``WAIT``.
 
         Raises:
             AgentError: The name is none, or belongs to another point, or to an agent that has ended.
@@ -335,7 +334,7 @@ class Episode(Ending):
         self.latest = agent = self.agent_for(point, name)
         if agent.name in self.answered:
             return self.consult(agent, args, kwargs)
-        return agent
+        return agent.arise(self, args, kwargs)
 
     def consult(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Have a policy answer.

@@ -6,7 +6,8 @@ action, or is over.
 
 | event | what has happened | what becomes of it |
 |---|---|---|
-| ``Decision`` | an agent decides | it is found or joins; it is settled, and the episode waits |
+| ``Agent`` | the one agent of a point decides | it is settled, and the episode waits |
+| ``Decision`` | an agent decides that ``agent=`` names | it is found or joins; and then the same |
 | ``Answered`` | an agent decides for which a policy answers | it is observed, and the policy is asked |
 | ``Removed`` | a function of ``removed_by=`` is called | its agents are settled for the last time and leave |
 | ``Ended`` | the simulation calls ``end_agent`` | that agent is settled for the last time and leaves |
@@ -21,50 +22,29 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from ..decision import DecisionPoint
-from ..simulation import RULE, TRUNCATED, Sentinel
-from .agent import Agent
+from ..simulation import RULE, TRUNCATED
+from .agent import WAIT
 from .bound import BoundPoint
 
 if TYPE_CHECKING:
     from .episode import Episode
 
 
-WAIT: Final = Sentinel("WAIT")
-"""Returned in place of a reply to the simulation: the episode waits for an action, or is over."""
-
-
 class Decision(BoundPoint):
-    """A decision of an agent: the one agent of a point, or the one that ``agent=`` names."""
+    """A decision of the agent that ``agent=`` names, or of the one agent of a point where that is not in the episode."""
 
     __slots__ = ()
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Settle the agent, and wait for its action; or do what is to be done in its stead."""
+        """Find the agent, or let it join."""
         name_agent = self.name_agent
         if name_agent is None:
-            name = self.agent
-            agent = episode.agents.get(name)
-        else:
-            name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
-            agent = episode.agents.get(name) if type(name) is str else None
+            return episode.dispatch(self, self.agent, args, kwargs)
+        name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
+        agent = episode.agents.get(name) if type(name) is str else None
         if agent is None or agent.point is not self:
-            agent = episode.dispatch(self, name, args, kwargs)
-            if type(agent) is not Agent:
-                return agent  # the reply of the rule or of a policy
-        if name_agent is None:
-            if self.one_entity and args and agent.rest and agent.rest[0] is not args[0]:
-                self.warn_of_several(agent.name)
-            agent.rest, agent.kwargs = args, kwargs  # what it is called on is no entity that a model would let go
-        elif agent.keep(args, kwargs):
-            episode.remember(agent, args[0])
-        episode.latest = agent
-        decide = episode.decide
-        if decide is not None:  # in a round, or when the last step has been taken
-            return decide(episode, agent, args, kwargs)
-        settle = agent.settle_again  # fetched before it is called: calling it at its attribute is slower
-        settle(agent, args, kwargs)
-        episode.pending = agent
-        return WAIT
+            return episode.dispatch(self, name, args, kwargs)
+        return agent.arise(episode, args, kwargs)
 
 
 class Answered(BoundPoint):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from ..errors import AgentError, shown
+from ..hooks.hook import Hook
 from .agent import Agent
 from .bound import BoundPoint
 from .plan import Plan
@@ -111,6 +112,17 @@ class Participants:
                         continue
                 announced.append((agent, args))
         return announced
+
+    def crossing(self) -> Mapping[Hook, Any]:
+        """What crosses from the simulation, by hook; where a point has one agent, that agent itself.
+
+        Of points that name an agent at each call it is the point, which finds the agent.
+        """
+        agents, decisions = self.agents, self._plan.decisions
+        alone = {
+            hook: agents[event.agent] for hook, event in decisions.items() if getattr(event, "agent", None) in agents
+        }
+        return {**decisions, **alone} if alone else decisions
 
     def names(self) -> str:
         """The names of the live agents, for messages."""

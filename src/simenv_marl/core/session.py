@@ -217,9 +217,9 @@ class Session:
         self._open = True
         driver, plan = self._usable_driver(), self._plan_of_simulation()
         run = self.simulation.run if self._rng is None else self._rng.around(self.simulation.run)
-        driver.prepare(run, plan.decisions, context)
         seen: Any = WatchedDriver(driver, self) if watches else driver
         episode = Episode(plan, self.simulation, seen, seed, when, (self._rng, self.claim), script)
+        driver.prepare(run, episode.crossing(), context)
         try:
             self.episode = episode  # whenever an interrupt comes from now on, its end is seen to
             episode.begin()

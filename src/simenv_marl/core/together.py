@@ -8,9 +8,8 @@ from typing import Any
 from greenlet import getcurrent
 
 from ..hooks.stacks import EVALUATING
-from .agent import Agent
+from .agent import WAIT, Agent
 from .episode import Episode
-from .events import WAIT
 
 
 def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callable[[int, BaseException], None]) -> None:

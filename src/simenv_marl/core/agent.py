@@ -248,52 +248,53 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
         observe: bool = True,
         last: bool = False,
     ) -> None:
-        if DIFFERENCES and EVALUATING.get(getcurrent()) is not agent:
-            _settle_for(agent, settle, args, kwargs, reward, observe, last)
-            return
-        if reward and agent.decided:
-            agent.reward = checked_reward(agent, reward_mapping(*args, **kwargs))
-        elif reward and not last:  # nothing was done yet that could be rewarded
-            reward_mapping(*args, **kwargs)
-            agent.decided, agent.settle_again = True, again
-        if observe:
-            first, agent.present = not agent.present, True
-            if restricted:
-                agent.restrict(args, kwargs, last=last)
-            agent.info = {} if quiet and agent.clock is None else agent.inform()
-            if masked:
-                agent.observation = point.observe(args, kwargs, agent.mask)
-            else:
-                agent.observation = cast(observation_mapping(*args, **kwargs))
-            if first and point.finite is not None:
-                point.finite(agent.observation)
+        here = getcurrent() if DIFFERENCES else None
+        if here is not None:
+            before, EVALUATING[here] = EVALUATING.get(here), agent
+        try:
+            if reward and agent.decided:
+                agent.reward = checked_reward(agent, reward_mapping(*args, **kwargs))
+            elif reward and not last:  # nothing was done yet that could be rewarded
+                reward_mapping(*args, **kwargs)
+                agent.decided, agent.settle_again = True, again
+            if observe:
+                first, agent.present = not agent.present, True
+                if restricted:
+                    agent.restrict(args, kwargs, last=last)
+                agent.info = {} if quiet and agent.clock is None else agent.inform()
+                if masked:
+                    agent.observation = point.observe(args, kwargs, agent.mask)
+                else:
+                    agent.observation = cast(observation_mapping(*args, **kwargs))
+                if first and point.finite is not None:
+                    point.finite(agent.observation)
+        finally:
+            if here is not None:
+                if before is None:  # no function is called: at the end of the stack none might run
+                    del EVALUATING[here]
+                else:
+                    EVALUATING[here] = before
 
     def settle_quietly(agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        if DIFFERENCES and EVALUATING.get(getcurrent()) is not agent:
-            _settle_for(agent, settle_quietly, args, kwargs)
-            return
-        reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-        if type(reward) is not float or reward - reward != 0.0:
-            reward = checked_reward(agent, reward)
-        agent.reward = reward
-        agent.info = {} if agent.clock is None else agent.inform()
-        agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
+        here = getcurrent() if DIFFERENCES else None
+        if here is not None:
+            before, EVALUATING[here] = EVALUATING.get(here), agent
+        try:
+            reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
+            if type(reward) is not float or reward - reward != 0.0:
+                reward = checked_reward(agent, reward)
+            agent.reward = reward
+            agent.info = {} if agent.clock is None else agent.inform()
+            agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
+        finally:
+            if here is not None:
+                if before is None:  # no function is called: at the end of the stack none might run
+                    del EVALUATING[here]
+                else:
+                    EVALUATING[here] = before
 
     again = settle_quietly if quiet and not masked else settle
     return settle, again
-
-
-def _settle_for(agent: Agent, settle: Settle, *given: Any) -> None:
-    """Settle an agent where differences may ask for whom they are evaluated."""
-    here = getcurrent()
-    before, EVALUATING[here] = EVALUATING.get(here), agent
-    try:
-        settle(agent, *given)
-    finally:
-        if before is None:  # no function is called: at the end of the stack none might run
-            del EVALUATING[here]
-        else:
-            EVALUATING[here] = before
 
 
 def checked_reward(agent: Agent, reward: Any) -> float:

@@ -66,7 +66,7 @@ def _freeze():
 
 @pytest.fixture
 def _collected():
-    """For tests in whose midst no finalizer may run: at the end of the stack none can, and it would swallow an error."""
+    """For tests in whose midst no finalizer may run, as at the end of the stack: it would swallow an error."""
     gc.collect()
     gc.disable()
     yield

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from math import isfinite
 from numbers import Real
 from typing import TYPE_CHECKING, Any, Final
@@ -102,19 +103,12 @@ class Agent:
         Returns:
             Whether the entity is another one than before.
         """
-        self.kwargs = kwargs
-        if args and self.point.agent is None:
-            entity = self.entity
-            if entity is not None and entity() is args[0]:
-                self.rest = args[1:]
-                return False
-            try:
-                self.entity, self.rest = ref(args[0]), args[1:]
-            except TypeError:
-                self.entity, self.rest = None, args
-            return True
-        self.rest = args
-        return False
+        before, self.entity, self.rest, self.kwargs = self.entity, None, args, kwargs
+        if not args or self.point.agent is not None:
+            return False
+        with suppress(TypeError):  # what cannot be referred to weakly
+            self.entity, self.rest = ref(args[0]), args[1:]
+        return self.entity is None or self.entity is not before
 
     def arguments(self) -> tuple[Any, ...] | None:
         """The positional arguments of the latest decision; None where there was none, or the entity is gone."""
@@ -147,7 +141,10 @@ class Agent:
         """
         point = self.point
         if point.agent is None:
-            if self.keep(args, kwargs):
+            entity = self.entity
+            if entity is not None and args and entity() is args[0]:
+                self.rest, self.kwargs = args[1:], kwargs
+            elif self.keep(args, kwargs):
                 episode.remember(self, args[0])
         elif self.ended:
             return episode.dispatch(point, self.name, args, kwargs)

@@ -19,6 +19,7 @@ from ..errors import (
     warn_user,
 )
 from ..simulation import RULE
+from .actions import ILLEGAL
 from .agent import Agent
 from .contexts import Claim, at_work
 from .participants import Participants, listed
@@ -171,9 +172,12 @@ class Ending(Participants):
                 continue
             if agent is None:
                 raise UnknownAgentError(f"there is an action for {shown(name)}, which is no live agent: {self.names()}")
-            if action is not RULE:
-                action = agent.point.checked(action, name, agent.mask if agent is pending else None)
-            checked[name] = action
+            check = agent.point.check
+            legal = check(action)
+            mask = agent.mask if agent is pending else None
+            if legal is ILLEGAL or mask is not None:
+                legal = action if action is RULE else agent.point.checked(action, name, mask)
+            checked[name] = legal
         return checked
 
     def fail(self, error: BaseException) -> None:

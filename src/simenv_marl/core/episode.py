@@ -298,7 +298,7 @@ class Episode(Ending):
         pending, self.pending = self.pending, None
         assert pending is not None
         try:
-            self._keep(duplicate(left))
+            self._keep({name: part if type(part) is int else duplicate(part) for name, part in left.items()})
             self.turns += bool(actions)
             for agent in (*self.agents.values(), *self.just_ended):
                 agent.acted = False
@@ -398,7 +398,8 @@ class Episode(Ending):
 
     def _decide_in_round(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Answer a decision of an agent of the user's with its action of the round, or wait for the next round."""
-        agent.restrict(args, kwargs)
+        if agent.point.legal is not None:
+            agent.restrict(args, kwargs)
         if self.clock is not None:
             agent.now = float(self.clock())
         return self._answer_in_round(agent)
@@ -446,6 +447,6 @@ class Episode(Ending):
                     agent.reward, agent.carried = agent.reward + agent.carried, 0.0
             elif agent in announced and not agent.decided:
                 agent.settle(agent, args, agent.kwargs, reward=False)
-            if agent is not following:
+            if agent.choices is not None and agent is not following:
                 agent.choices = None  # they are asked for again when it decides
         self.pending = following

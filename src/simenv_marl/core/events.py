@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Decision(BoundPoint):
-    """A decision of the agent that ``agent=`` names, or of the one agent of a point where that is not in the episode."""
+    """A decision of the agent that ``agent=`` names, or of the one agent of a point where a policy answers for it."""
 
     __slots__ = ()
 

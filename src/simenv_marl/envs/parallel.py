@@ -7,7 +7,6 @@ from typing import Any
 
 from pettingzoo import ParallelEnv
 
-from ..core.agent import Agent
 from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.spaces import duplicate
@@ -115,20 +114,22 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
 
     def _results(self, episode: Episode) -> Results:
         """What the agents have come to, by agent."""
-        results: Results = {}, {}, {}, {}, {}
-        observations, rewards, terminations, truncations, infos = results
-        terminated, truncated = episode.terminated, episode.truncated
-        for agent in episode.just_ended:
-            name = agent.name
-            observations[name], rewards[name] = self._hand_out(agent), agent.reward
+        ended = {agent.name: agent for agent in episode.just_ended}
+        agents = ended | episode.agents
+        terminations, truncations = dict.fromkeys(agents, episode.terminated), dict.fromkeys(agents, episode.truncated)
+        results: Results = {}, {}, terminations, truncations, {}
+        observations, rewards, _, _, infos = results
+        for name, agent in agents.items():
+            observation = agent.observation
+            if observation is agent.handed_out:  # it could not be observed anew, or never was
+                observation = agent.point.blank() if observation is None else duplicate(observation)
+            else:
+                agent.handed_out = observation  # it is the caller's alone
+            observations[name], rewards[name] = observation, agent.reward
+            infos[name] = info = agent.info
+            info["deciding"], info["acted"] = False, agent.acted
+        for name in ended:
             terminations[name], truncations[name] = True, False
-            infos[name] = info = agent.info
-            info["deciding"], info["acted"] = False, agent.acted
-        for name, agent in episode.agents.items():
-            observations[name], rewards[name] = self._hand_out(agent), agent.reward
-            terminations[name], truncations[name] = terminated, truncated
-            infos[name] = info = agent.info
-            info["deciding"], info["acted"] = False, agent.acted
         if episode.pending is not None:
             episode.pending.info["deciding"] = True
         if self._padded:
@@ -140,13 +141,3 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     def _clear(self) -> None:
         super()._clear()
         self.agents = []
-
-    def _hand_out(self, agent: Agent) -> Any:
-        """The observation of an agent, for the caller alone: each return makes its own."""
-        observation = agent.observation
-        if observation is None:
-            return agent.point.blank()
-        if agent.handed_out is observation:  # it could not be observed anew
-            return duplicate(observation)
-        agent.handed_out = observation
-        return observation

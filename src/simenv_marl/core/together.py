@@ -28,8 +28,9 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
     here, number, together = getcurrent(), 0, not EVALUATING
     agents: list[Agent] = []
     for episode in episodes:
-        if episode.pending is not None:
-            agents.append(episode.pending)
+        agent = episode.pending
+        if agent is not None:
+            agents.append(agent)
         elif episode.unheard:
             together = False
         else:

@@ -57,17 +57,24 @@ def action_check(space: spaces.Space[Any]) -> Check:
 
 def _discrete_check(space: spaces.Discrete) -> Check:
     low, high = int(space.start), int(space.start + space.n)
+    integers = (int, np.integer, np.bool_)
 
     def check(action: Any) -> Any:
         if type(action) is not int:
-            if isinstance(action, np.ndarray) and action.shape == ():
-                action = action[()]
-            if not isinstance(action, (int, np.integer, np.bool_)):
+            scalar = action if isinstance(action, integers) else _scalar(action)
+            if not isinstance(scalar, integers):
                 return ILLEGAL
-            action = int(action)
-        return action if low <= action < high else ILLEGAL
+            action = int(scalar)
+        if low <= action < high:
+            return action
+        return ILLEGAL
 
     return check
+
+
+def _scalar(action: Any) -> Any:
+    """The one element of an array without axes; None for all else."""
+    return action[()] if isinstance(action, np.ndarray) and action.shape == () else None
 
 
 def _box_check(space: spaces.Box) -> Check:

@@ -172,12 +172,14 @@ class Ending(Participants):
                 continue
             if agent is None:
                 raise UnknownAgentError(f"there is an action for {shown(name)}, which is no live agent: {self.names()}")
-            check = agent.point.check
-            legal = check(action)
-            mask = agent.mask if agent is pending else None
-            if legal is ILLEGAL or mask is not None:
-                legal = action if action is RULE else agent.point.checked(action, name, mask)
-            checked[name] = legal
+            if action is not RULE:
+                check = agent.point.check
+                legal = check(action)
+                mask = agent.mask if agent is pending else None
+                if legal is ILLEGAL or mask is not None:
+                    legal = agent.point.checked(action, name, mask)
+                action = legal
+            checked[name] = action
         return checked
 
     def fail(self, error: BaseException) -> None:

@@ -175,11 +175,13 @@ class Episode(Ending):
             self._enter(self.step, action)
             return
         try:
-            check = agent.point.check  # fetched before it is called: calling it at its attribute is slower
-            legal = check(action)
-            if legal is ILLEGAL or agent.mask is not None:
-                legal = action if action is RULE else agent.point.checked(action, agent.name, agent.mask)
-            self.go_on(self.answer(agent, legal))
+            if action is not RULE:
+                check = agent.point.check  # fetched before it is called: calling it at its attribute is slower
+                legal = check(action)
+                if legal is ILLEGAL or agent.mask is not None:
+                    legal = agent.point.checked(action, agent.name, agent.mask)
+                action = legal
+            self.go_on(self.answer(agent, action))
         except BaseException as error:
             if self.pending is None:
                 self.fail(error)
@@ -221,14 +223,16 @@ class Episode(Ending):
         Raises:
             BaseException: Whatever a mapping raises. The decision stays pending.
         """
-        kept = action if type(action) is int or not turn else duplicate(action)  # before a mapping can change it
         try:
             self.pending = None  # while mappings run, an action of theirs is refused
+            kept = action
             if agent.choices is not None:
                 reply = agent.choose(action)
             elif action is RULE:
                 reply = action
             else:
+                if type(action) is not int and turn:
+                    kept = duplicate(action)  # before a mapping can change it
                 convert = agent.point.convert  # fetched before it is called: calling it at its attribute is slower
                 reply = convert(action)
         except BaseException:

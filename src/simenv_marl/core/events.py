@@ -41,7 +41,10 @@ class Decision(BoundPoint):
         if name_agent is None:
             return episode.dispatch(self, self.agent, args, kwargs)
         name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
-        agent = episode.agents.get(name) if type(name) is str else None
+        try:
+            agent = episode.agents.get(name)
+        except TypeError:  # it is no name at all
+            agent = None
         if agent is None or agent.point is not self:
             return episode.dispatch(self, name, args, kwargs)
         return agent.arise(episode, args, kwargs)

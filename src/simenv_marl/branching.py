@@ -9,13 +9,16 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from selectors import EVENT_READ, DefaultSelector
 from typing import Any, Final, NoReturn, TypeVar
 
+import numpy as np
+
 from .core.forking import Standing
 from .core.processes import pack, pack_error, unpack, unpack_error
+from .core.rng import globals_seeded
 from .envs import View
 from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, shown, told
 
@@ -30,13 +33,14 @@ def branch(
     n: int = 1,
     *,
     method: str | None = None,
+    seeds: Sequence[int] | None = None,
     time_limit: float = 600.0,
 ) -> list[Result]:
     """Call a function on exact continuations of an environment that stands in mid-episode.
 
     Each of them stands where ``env`` stands, in everything: the model and its random numbers, the environment's
     generators, wrappers. They are the same bit for bit as long as they are given the same actions. ``env`` itself
-    does not move.
+    does not move. With ``seeds`` the present is the same in all of them, and the chance that lies ahead is not.
 
     Args:
         env: An environment of a single simulation, in any view, in wrappers or not.
@@ -49,6 +53,10 @@ def branch(
             answer as they did, and from there on are asked themselves. None: "fork" where that is possible. It is
             not where the simulation has opened what two processes cannot both go on with: threads, sockets, child
             processes.
+        seeds: A seed for each continuation; the same one gives the same future, by either method. The simulation's
+            ``reseed(seed)`` is called there, on its user's side as ``state`` is; with ``global_rng=True`` the global
+            generators that the simulation finds are seeded. So are, while the function runs, those of the process,
+            Python's, NumPy's and torch's. None: what lies ahead is what lies ahead of ``env``.
         time_limit: After how many seconds a forked continuation is ended.
 
     Returns:
@@ -57,9 +65,10 @@ def branch(
     Raises:
         ResetNeededError: There is no episode that could be continued.
         BranchError: A forked continuation has died, took too long, or has returned what cannot be pickled; it could
-            not go on with what the simulation has opened; or a replay did not come to the same decision.
-        OptionValueError: There is no such method, or not here.
-        BaseException: What the function raises, with a note that says in which continuation.
+            not go on with what the simulation has opened; a replay did not come to the same decision; or there are
+            ``seeds``, and neither a ``reseed`` nor ``global_rng=True``.
+        OptionValueError: There is no such method, or not here; or ``seeds`` are not n non-negative integers.
+        BaseException: What the function or ``reseed`` raises, with a note that says in which continuation.
     """
     view = getattr(env, "unwrapped", env)
     if not isinstance(view, View):
@@ -75,6 +84,9 @@ def branch(
             ' other threads; use "replay"'
         )
     view.check_pending()
+    if seeds is not None:
+        view.check_reseed()
+        function = _in_other_futures(function, _checked_seeds(seeds, n))
     obstacles, loops = view.opened() if forks and method != "replay" else ([], [])
     if obstacles and method == "fork":
         raise BranchError(
@@ -84,6 +96,33 @@ def branch(
     if obstacles or not forks or method == "replay":
         return [_replayed(env, view, function, number) for number in range(n)]
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
+
+
+# -- other futures --------------------------------------------------------------------------------
+
+
+def _checked_seeds(seeds: Any, n: int) -> list[int]:
+    """The seeds as python integers.
+
+    Raises:
+        OptionValueError: They are not n non-negative integers.
+    """
+    given = list(seeds) if isinstance(seeds, (Sequence, np.ndarray)) else []
+    whole = [seed for seed in given if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0]
+    if not len(whole) == len(given) == n:
+        raise OptionValueError(f"seeds must be n = {n} non-negative integers, one for each branch, not {shown(seeds)}")
+    return [int(seed) for seed in whole]
+
+
+def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) -> Callable[[Any, int], Result]:
+    """A function that first draws anew, in its continuation, the chance that lies ahead."""
+
+    def reseed_and_call(env: Any, number: int) -> Result:
+        with globals_seeded(seeds[number]):
+            getattr(env, "unwrapped", env).reseed(seeds[number])
+            return function(env, number)
+
+    return reseed_and_call
 
 
 # -- by replaying ---------------------------------------------------------------------------------

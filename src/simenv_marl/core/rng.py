@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import random
 from _random import Random as Twister
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from ctypes import c_char, memmove, string_at
+from sys import modules
 from threading import get_ident
 from typing import Any, Final, Protocol
 
@@ -187,6 +189,10 @@ class GlobalRandom:
         random.seed(seed)
         np.random.seed(seed % 2**32)
 
+    def begin_anew(self, seed: int) -> None:
+        """Seed the generators, which are in place, for another future."""
+        _seed_globals(seed, _OWN)
+
     def enter(self) -> None:
         """Put the own state in place.
 
@@ -225,3 +231,42 @@ class GlobalRandom:
         if before is not after:
             before.state.save()
             after.state.load()
+
+
+# -- other futures --------------------------------------------------------------------------------
+
+_FUTURES: Final = 2**32 - 1
+"""The key of their streams, which spawning never gives. A model may seed with the bare seed, or spawn from it."""
+
+_OWN: Final = 0
+_PROCESS: Final = 1
+"""Whose generators are seeded. A base that draws from those of the process is not to meet the simulation's numbers."""
+
+
+def _seed_globals(seed: int, whose: int) -> np.random.SeedSequence:
+    """Seed Python's and NumPy's global generators for a future, each with a stream of its own; return one more."""
+    python, numpy, another = np.random.SeedSequence(seed, spawn_key=(_FUTURES, whose)).spawn(3)
+    random.seed(_integer(python))
+    _legacy.set_bit_generator(type(_legacy.get_bit_generator())(numpy))
+    return another
+
+
+def _integer(sequence: np.random.SeedSequence) -> int:
+    return int(sequence.generate_state(1, np.uint64)[0])
+
+
+@contextmanager
+def globals_seeded(seed: int) -> Iterator[None]:
+    """Have the global generators of the process seeded, Python's, NumPy's and torch's if it is there; put them back."""
+    before, drawing = PortableState(), getattr(modules.get("torch"), "default_generator", None)
+    before.save()
+    drawn = None if drawing is None else drawing.get_state()
+    try:
+        another = _seed_globals(seed, _PROCESS)
+        if drawing is not None:
+            drawing.manual_seed(_integer(another))
+        yield
+    finally:
+        before.load()
+        if drawing is not None:
+            drawing.set_state(drawn)

@@ -276,6 +276,40 @@ class Session:
                 found.pop(number, None)
         return list(found.values()), loops
 
+    def check_reseed(self) -> None:
+        """Make sure that the chance that lies ahead can be drawn anew.
+
+        Raises:
+            BranchError: It cannot.
+        """
+        if self._rng is None and not callable(getattr(self.simulation, "reseed", None)):
+            raise BranchError(
+                f"seeds= draws anew what {type(self.simulation).__name__} leaves to chance, and nothing says how: give"
+                " it a method reseed(seed) that seeds its generators in place (simenv_marl.reseed_generators(self, seed)"
+                " finds them), or make the environment with global_rng=True if it draws from Python's or NumPy's global"
+                " ones"
+            )
+
+    def reseed(self, seed: int) -> None:
+        """Draw the chance that lies ahead anew.
+
+        Args:
+            seed: For the simulation's ``reseed``, and for the global generators of its own, if it has them.
+
+        Raises:
+            BaseException: What the simulation's ``reseed`` raises.
+        """
+        reseed = getattr(self.simulation, "reseed", None)
+        with self.at_work():
+            if self._rng is not None:
+                self._rng.begin_anew(seed)
+            if callable(reseed):
+                try:
+                    reseed(seed)
+                except BaseException as error:
+                    annotate(error, f"simenv_marl: while the simulation was reseeded; seed {seed}")
+                    raise
+
     def kept(self) -> dict[str, Any]:
         """What a copy takes over: the latest seed, the generator, and whether the copy is one in mid-episode."""
         return {

@@ -242,6 +242,14 @@ class View:
         """What the simulation has opened that a forked process would share: see ``Session.opened``."""
         return self._session.opened()
 
+    def check_reseed(self) -> None:
+        """Make sure that the chance that lies ahead can be drawn anew: see ``Session.check_reseed``."""
+        self._session.check_reseed()
+
+    def reseed(self, seed: int) -> None:
+        """Draw the chance that lies ahead anew: for ``branch``, see ``Session.reseed``."""
+        self._session.reseed(seed)
+
     def _running(self) -> Episode:
         """The episode that goes on, or has just ended.
 

@@ -285,8 +285,8 @@ class Session:
         if self._rng is None and not callable(getattr(self.simulation, "reseed", None)):
             raise BranchError(
                 f"seeds= draws anew what {type(self.simulation).__name__} leaves to chance, and nothing says how: give"
-                " it a method reseed(seed) that seeds its generators in place (simenv_marl.reseed_generators(self, seed)"
-                " finds them), or make the environment with global_rng=True if it draws from Python's or NumPy's global"
+                " it a method reseed(seed) that seeds its generators in place (simenv_marl.reseed_generators(self,"
+                " seed) finds them), or make the environment with global_rng=True if it draws from Python's or NumPy's global"
                 " ones"
             )
 

@@ -19,6 +19,7 @@ decision through the rooms.
 from . import errors
 from .branching import branch
 from .core.provenance import provenance
+from .core.reseeding import reseed_generators
 from .core.variant import Variant
 from .decision import Definition, decision_points, difference, make_step
 from .envs import (
@@ -95,6 +96,7 @@ __all__ = [
     "record_dataset",
     "register_simulation",
     "remove_handler",
+    "reseed_generators",
     "save_dataset",
     "simulate",
     "simulate_many",

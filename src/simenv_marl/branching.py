@@ -18,7 +18,7 @@ import numpy as np
 
 from .core.forking import Standing
 from .core.processes import pack, pack_error, unpack, unpack_error
-from .core.rng import globals_seeded
+from .core.rng import globals_seeded, is_seed
 from .envs import View
 from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, shown, told
 
@@ -107,11 +107,10 @@ def _checked_seeds(seeds: Any, n: int) -> list[int]:
     Raises:
         OptionValueError: They are not n non-negative integers.
     """
-    given = list(seeds) if isinstance(seeds, (Sequence, np.ndarray)) else []
-    whole = [seed for seed in given if isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0]
-    if not len(whole) == len(given) == n:
+    given: list[Any] = list(seeds) if isinstance(seeds, (Sequence, np.ndarray)) else [None]
+    if len(given) != n or not all(map(is_seed, given)):
         raise OptionValueError(f"seeds must be n = {n} non-negative integers, one for each branch, not {shown(seeds)}")
-    return [int(seed) for seed in whole]
+    return [int(seed) for seed in given]
 
 
 def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) -> Callable[[Any, int], Result]:

@@ -240,19 +240,50 @@ _FUTURES: Final = 2**32 - 1
 
 _OWN: Final = 0
 _PROCESS: Final = 1
+HELD: Final = 2
 """Whose generators are seeded. A base that draws from those of the process is not to meet the simulation's numbers."""
+
+SHARED: Final = (_python, _numpy)
+"""The generators behind the functions of ``random`` and ``numpy.random``."""
+
+
+def is_seed(value: Any) -> bool:
+    """Whether a value is a non-negative integer."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 0)
+
+
+def streams(seed: int, whose: int, number: int) -> list[np.random.SeedSequence]:
+    """What so many generators are seeded with for a future."""
+    return np.random.SeedSequence(int(seed), spawn_key=(_FUTURES, whose)).spawn(number)
+
+
+def reseed_one(generator: Any, stream: np.random.SeedSequence) -> None:
+    """Seed a generator where it is, for all that refer to it.
+
+    Args:
+        generator: A ``random.Random``, or NumPy's ``Generator``, ``RandomState`` or ``BitGenerator``.
+        stream: With what.
+    """
+    if isinstance(generator, random.Random):
+        generator.seed(_integer(stream))
+        return
+    legacy = isinstance(generator, np.random.RandomState)
+    bits = getattr(generator, "_bit_generator" if legacy else "bit_generator", generator)
+    bits.__setstate__(type(bits)(stream).__getstate__())  # with what it spawns from, where NumPy is new enough
+    if legacy:
+        generator.set_state(bits.state)  # which forgets the second normally distributed number
+
+
+def _integer(stream: np.random.SeedSequence) -> int:
+    return int(stream.generate_state(1, np.uint64)[0])
 
 
 def _seed_globals(seed: int, whose: int) -> np.random.SeedSequence:
     """Seed Python's and NumPy's global generators for a future, each with a stream of its own; return one more."""
-    python, numpy, another = np.random.SeedSequence(seed, spawn_key=(_FUTURES, whose)).spawn(3)
-    random.seed(_integer(python))
-    _legacy.set_bit_generator(type(_legacy.get_bit_generator())(numpy))
+    python, numpy, another = streams(seed, whose, 3)
+    reseed_one(_python, python)
+    _legacy.set_bit_generator(type(_legacy.get_bit_generator())(numpy))  # the one that is there is left as it is
     return another
-
-
-def _integer(sequence: np.random.SeedSequence) -> int:
-    return int(sequence.generate_state(1, np.uint64)[0])
 
 
 @contextmanager

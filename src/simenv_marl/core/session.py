@@ -27,7 +27,7 @@ from .ending import refusal
 from .episode import LONGEST_TAPE, LOST, Episode, When
 from .forking import loops_on, sockets_of
 from .plan import Plan
-from .rng import GlobalRandom
+from .rng import GlobalRandom, is_seed
 from .spaces import same
 from .switch import BaseDriver
 
@@ -286,8 +286,8 @@ class Session:
             raise BranchError(
                 f"seeds= draws anew what {type(self.simulation).__name__} leaves to chance, and nothing says how: give"
                 " it a method reseed(seed) that seeds its generators in place (simenv_marl.reseed_generators(self,"
-                " seed) finds them), or make the environment with global_rng=True if it draws from Python's or NumPy's global"
-                " ones"
+                " seed) finds them), or make the environment with global_rng=True if it draws from Python's or NumPy's"
+                " global ones"
             )
 
     def reseed(self, seed: int) -> None:
@@ -432,7 +432,7 @@ def checked_seed(seed: Any) -> int | None:
     """
     if seed is None:
         return None
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+    if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer or None, not {shown(seed)}")
     return int(seed)
 

@@ -1,0 +1,170 @@
+"""``reseed_generators``: the generators that a simulation holds are found and seeded in place."""
+
+import functools
+import pickle
+import random
+from collections import deque
+from types import SimpleNamespace
+
+import mesa
+import numpy as np
+import pytest
+import simpy
+from examples.wolf_sheep.env import Meadow
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simenv_marl import OptionValueError, SimulationError, reseed_generators
+from tests.core.test_global_rng import world
+
+
+class Slotted:
+    __slots__ = ("__weakref__", "chance")
+
+    def __init__(self, chance):
+        self.chance = chance
+
+
+class Crowd:
+    """Has generators of all kinds, in all places."""
+
+    def __init__(self, seed):
+        def wait(generator):
+            while True:
+                yield generator.random()
+
+        self.seed = seed
+        chances = [random.Random(seed + number) for number in range(9)]
+        self.chance, self.legacy = chances[0], np.random.RandomState(seed)
+        self.number, self.name, self.weights = 3, "crowd", np.zeros(4)
+        self.kinds = [np.random.Generator(kind(seed)) for kind in (np.random.PCG64, np.random.MT19937, np.random.SFC64)]
+        self.bits = np.random.Philox(seed)
+        self.by_name = {"one": Slotted(chances[1]), Slotted(chances[2]): (chances[3],)}
+        self.draw, self.normal = chances[4].random, np.random.default_rng(seed + 9).normal
+        self.later = functools.partial(chances[5].gauss, 0.0)
+        self.queue, self.some = deque([chances[6]]), {Slotted(chances[7])}
+        self.waiting = wait(chances[8])
+        next(self.waiting)
+        self.itself, self.module, self.kind, self.function = self, np.random, Crowd, reseed_generators
+        self.shared = SimpleNamespace(same=self.chance)
+        self.all = chances
+
+    def drawn(self):
+        many = [chance.random() for chance in self.all]
+        many += [self.legacy.standard_normal(), self.legacy.random(), self.bits.random_raw(), self.normal()]
+        many += [generator.random() for generator in self.kinds] + [self.draw(), self.later(1.0), next(self.waiting)]
+        return [*many, self.shared.same.random()]
+
+
+HELD = 9 + 1 + 3 + 1 + 1
+
+
+def test_all_are_found_and_each_has_numbers_of_its_own():
+    crowd = Crowd(1)
+    assert reseed_generators(crowd, 5) == HELD
+    drawn = crowd.drawn()
+    assert len(set(drawn)) == len(drawn)
+    assert set(drawn).isdisjoint(Crowd(1).drawn())
+
+
+@given(st.integers(0, 2**80), st.integers(0, 7))
+def test_the_same_seed_gives_the_same_states_whatever_was_drawn_before(seed, before):
+    one, other = Crowd(1), Crowd(2)
+    for _ in range(before):
+        other.drawn()
+    other.legacy.standard_normal()
+    other.chance.gauss(0, 1)
+    for crowd in (one, other):
+        reseed_generators(crowd, seed)
+    assert one.drawn() == other.drawn()
+    reseed_generators(one, seed + 1)
+    assert set(one.drawn()).isdisjoint(other.drawn())
+
+
+@pytest.mark.parametrize("kind", [np.random.PCG64, np.random.MT19937, np.random.Philox])
+def test_what_is_spawned_is_another_one_too(kind):
+    """Where NumPy can put that back into a generator at all."""
+    generator = np.random.Generator(kind(1))
+    spawned = generator.spawn(1)[0].random()
+    generator = np.random.Generator(kind(1))
+    reseed_generators(generator, 5)
+    if not isinstance(kind(1).__getstate__(), dict):
+        assert generator.spawn(1)[0].random() != spawned
+    assert generator.bit_generator.random_raw() != kind(1).random_raw()
+
+
+def test_streams_are_not_those_that_a_model_makes_of_the_same_seed():
+    one, other, legacy = random.Random(), np.random.default_rng(), np.random.RandomState()
+    reseed_generators([one, other, legacy], 7)
+    drawn = {one.random(), other.random(), legacy.random()}
+    sequence = np.random.SeedSequence(7)
+    plain = [np.random.default_rng(part).random() for part in (7, *sequence.spawn(4))]
+    assert drawn.isdisjoint([random.Random(7).random(), np.random.RandomState(7).random(), *plain])
+
+
+def test_the_models_of_mesa():
+    class Town(mesa.Model):
+        def __init__(self, seed):
+            super().__init__(seed=seed)
+            self.people = mesa.Agent.create_agents(self, 20)
+
+    town, other = Town(1), Town(2)
+    other.people.shuffle_do("remove")
+    assert reseed_generators(town, 3) == reseed_generators(other, 3) == 2
+    assert town.people.random is town.random
+    assert [agent.random.random() for agent in town.people] == [other.random.random() for _ in range(20)]
+    assert town.rng.random() == other.rng.random()
+
+
+def test_wolves_and_sheep():
+    one, other = Meadow(), Meadow()
+    one.reset(seed=1)
+    other.reset(seed=1)
+    before = one.model.random.getstate()
+    assert reseed_generators(one, 4) == reseed_generators(other.model, 4)
+    assert one.model.random.getstate() == other.model.random.getstate() != before
+    assert one.model.agents.random is one.model.random
+
+
+def test_what_processes_of_simpy_hold():
+    def customer(environment, chance, log):
+        while True:
+            log.append(chance.random())
+            yield environment.timeout(1)
+
+    logs = [], []
+    for seed, log in enumerate(logs):
+        environment = simpy.Environment()
+        environment.process(customer(environment, random.Random(seed), log))
+        environment.run(until=seed + 1)
+        assert reseed_generators(environment, 9) == 1
+        del log[:]
+        environment.run(until=seed + 4)
+    assert logs[0] == logs[1]
+
+
+def test_the_global_generators_are_left_alone():
+    model, before = SimpleNamespace(draw=random.random, numpy=np.random.mtrand._rand, own=random.Random()), world()
+    assert reseed_generators(model, 3) == 1
+    assert world() == before
+
+
+@pytest.mark.parametrize("model", [object(), [], SimpleNamespace(random=random, draw=np.random.random), SimpleNamespace(
+    chance=random.SystemRandom(), kind=random.Random, make=np.random.default_rng, function=world,
+)])  # fmt: skip
+def test_where_there_are_none_it_says_what_to_do(model):
+    with pytest.raises(SimulationError, match=r"no random generator[\s\S]*attribute[\s\S]*global_rng=True"):
+        reseed_generators(model, 3)
+
+
+@pytest.mark.parametrize("seed", [None, -1, True, 1.0, "1"])
+def test_seeds_are_integers(seed):
+    with pytest.raises(OptionValueError, match="seed must be a non-negative integer"):
+        reseed_generators(random.Random(), seed)
+
+
+def test_integers_of_numpy_are_seeds():
+    one, other = random.Random(), random.Random()
+    reseed_generators(one, np.int64(7))
+    reseed_generators(other, 7)
+    assert pickle.dumps(one) == pickle.dumps(other)

@@ -194,6 +194,10 @@ class GreenhouseSim(SimulationInterface):
                 return None
         return TRUNCATED if greenhouse.alive else None
 
+    def reseed(self, seed: int) -> None:
+        """Draw the weather that lies ahead anew."""
+        self.greenhouse.random.seed(seed)
+
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
         """Whose decision will be called for: either is the greenhouse's."""
         return [(self.greenhouse,)]

@@ -36,7 +36,7 @@ from mesa.examples.advanced.wolf_sheep import model as wolf_sheep
 from mesa.examples.advanced.wolf_sheep.agents import GrassPatch, Sheep, Wolf
 from numpy.typing import NDArray
 
-from simenv_marl import TRUNCATED, Definition, SimulationInterface, make_step
+from simenv_marl import TRUNCATED, Definition, SimulationInterface, make_step, reseed_generators
 
 TICKS: Final = 200
 """After how many ticks an episode is truncated."""
@@ -170,6 +170,10 @@ class Meadow(SimulationInterface):
                 return None
             self._runner.run_for(1)
         return TRUNCATED
+
+    def reseed(self, seed: int) -> None:
+        """Draw anew what the animals leave to chance: all of them, and the grass, draw from the model's generators."""
+        reseed_generators(self, seed)
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
         """Whose decisions will be called for: those of all sheep that are alive."""

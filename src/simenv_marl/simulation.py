@@ -50,6 +50,8 @@ class SimulationInterface(ABC):
       licences). Called once for each ``reset`` that has succeeded: before the next one, when the environment is
       closed, or when it is gone.
     - ``time(self)``: its clock, from which ``info["time"]`` and ``info["elapsed"]`` come.
+    - ``reseed(self, seed)``: seeds its generators in place, so that the chance that lies ahead is drawn anew: for
+      ``branch`` with ``seeds``. ``reseed_generators(self, seed)`` does it for the usual cases.
     - ``state(self)``: all that a centralised critic may see, as an array.
     - ``render(self, mode)``: a picture of the present state, for a ``mode`` out of ``render_modes``; with
       ``render_fps``, how many of them make a second of a film (4).

@@ -19,6 +19,7 @@ from examples.greenhouse_coop.env import (
     env,
     exchange_air,
     observe,
+    parallel_env,
     raw_env,
     to_litres,
     ventilation_env,
@@ -30,7 +31,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.test import api_test, seed_test
 
-from simenv_marl import RULE, TRUNCATED, InvalidActionError
+from simenv_marl import RULE, TRUNCATED, InvalidActionError, branch
 
 ROOT = Path(__file__).parents[2]
 UNDECORATED = vars(Greenhouse)["update_air_exchange"], vars(Greenhouse)["choose_water_amount"]
@@ -503,3 +504,19 @@ def test_senseless_options_are_refused(arguments, capsys):
     with pytest.raises(SystemExit):
         train.main(arguments)
     assert "must be at least 1" in capsys.readouterr().err
+
+
+def test_the_weather_that_lies_ahead_can_be_drawn_anew():
+    def ten_days(env, number):
+        for _ in range(10):
+            env.step(dict.fromkeys(env.agents, RULE))
+        greenhouse = env.simulation.greenhouse
+        return greenhouse.temp, greenhouse.humidity, [plant.req_water for plant in greenhouse.pots]
+
+    env = parallel_env()
+    env.reset(seed=1)
+    env.step(dict.fromkeys(env.agents, RULE))
+    forked, replayed = (branch(env, ten_days, 3, method=method, seeds=[1, 2, 1]) for method in ("fork", "replay"))
+    assert forked == replayed
+    assert forked[0] == forked[2] != forked[1] != branch(env, ten_days)[0]
+    assert forked[0][2] == forked[1][2]  # the plants are what they are

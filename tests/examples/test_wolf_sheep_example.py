@@ -9,7 +9,7 @@ from examples.wolf_sheep.env import DIRECTIONS, MOVE, Meadow, cells, go, look, n
 from gymnasium.utils.env_checker import check_env
 from mesa.examples.advanced.wolf_sheep.agents import GrassPatch, Sheep, Wolf
 
-from simenv_marl import RULE, aec_env, collect_episodes, joint_env, simulate_many
+from simenv_marl import RULE, aec_env, branch, collect_episodes, joint_env, simulate_many
 from tests.worlds.models import play
 
 SMALL = {"width": 8, "height": 8, "initial_sheep": 20, "initial_wolves": 5}
@@ -260,3 +260,18 @@ def test_only_wolves_two_steps_away_or_in_its_own_cell_catch_a_sheep():
     assert eaten.sum() > 30
     assert (beside[last[eaten]] > 0).all()
     assert (beside == 0).sum() > 30  # it is not so everywhere
+
+
+def test_the_future_of_a_meadow_can_be_drawn_anew():
+    def next_days(env, number):
+        for _ in range(300):
+            env.step(None if env.terminations[env.agent_selection] else RULE)
+        return [(sheep.unique_id, sheep.cell.coordinate, sheep.energy) for sheep in env.simulation.sheep]
+
+    env = aec_env(Meadow)
+    env.reset(seed=1)
+    for _ in range(50):
+        env.step(RULE)
+    forked, replayed = (branch(env, next_days, 3, method=method, seeds=[1, 2, 1]) for method in ("fork", "replay"))
+    assert forked == replayed
+    assert forked[0] == forked[2] != forked[1] != branch(env, next_days)[0]

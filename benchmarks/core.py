@@ -22,6 +22,7 @@ SECTIONS = (
     "vector",
     "suspended",
     "many",
+    "branches",
     "wolf_sheep",
     "greenhouse",
 )

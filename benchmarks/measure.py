@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -107,6 +108,15 @@ class Elsewhere:
     def close(self) -> None:
         """End the process."""
         self._process.communicate()
+
+
+def alone(section: str, *arguments: str, cores: str | None = None) -> Any:
+    """Measure something in a process that has done nothing before: a section's, which prints JSON."""
+    command = [sys.executable, "-m", f"benchmarks.{section}", *arguments]
+    if cores is not None:
+        command = ["taskset", "-c", cores, *command]
+    done = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout)
 
 
 def serve(contenders: Mapping[str, Contender]) -> None:

@@ -10,7 +10,6 @@ import gc
 import json
 import os
 import queue
-import subprocess
 import sys
 import threading
 import time
@@ -23,7 +22,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv
 
 from benchmarks.hand_written import TemplateEnv
-from benchmarks.measure import ROOT, Section, ratio, side_by_side
+from benchmarks.measure import Section, alone, ratio, side_by_side
 from benchmarks.noop import Alone, Model
 from benchmarks.vector import ours, steps
 from simenv_marl import vector_env
@@ -38,8 +37,8 @@ def measure(rounds: int, number: int) -> Section:
     rounds = max(3, rounds // 3)
     _beside_threads(section, rounds, number)
     _beside_processes(section, rounds, number)
-    section.ratio("KiB of memory for each of 10,000 suspended simulations", _alone("memory"), bar=10, aim=9)
-    speedup, one, two = _alone("cores", str(min(rounds, 9)), cores="0,1")
+    section.ratio("KiB of memory for each of 10,000 suspended simulations", alone("suspended", "memory"), bar=10, aim=9)
+    speedup, one, two = alone("suspended", "cores", str(min(rounds, 9)), cores="0,1")
     section.ratio(
         f"two workers on two cores: steps per second / one process, {MICROSECONDS:g} us per decision",
         speedup,
@@ -155,15 +154,6 @@ class Busy(Alone):
             while clock() < until:
                 pass
             model.left()
-
-
-def _alone(what: str, *arguments: str, cores: str | None = None) -> Any:
-    """Measure something in a process that has done nothing before."""
-    command = [sys.executable, "-m", "benchmarks.suspended", what, *arguments]
-    if cores is not None:
-        command = ["taskset", "-c", cores, *command]
-    done = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(done.stdout)
 
 
 def memory(number: int = 10_000) -> float:

@@ -1,0 +1,128 @@
+"""What a branch costs beside the least that could do the same, and what two cores bring.
+
+Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only branches``. Times are the wall clock's, as
+branches are processes. The branches on two cores are measured in a process of their own that may use two.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from benchmarks.measure import Contender, Section, alone, ratio, side_by_side
+from benchmarks.noop import Alone, Model
+from simenv_marl import branch, single_env
+
+BRANCHES, STEPS = 20, 100
+
+MANY, MILLISECONDS = 64, 10.0
+"""Branches that are spread over two cores, and what each of them takes."""
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure in so many rounds."""
+    section = Section("Branches", f"milliseconds per branch of {STEPS} steps")
+    rounds = max(3, rounds)
+    env = single_env(Alone, Model.left)
+    env.reset(seed=0)
+    contenders: dict[str, Contender] = {
+        "branch": timed_branches(lambda: branch(env, some_steps, BRANCHES, method="fork")),
+        "a bare fork and a pipe": timed_branches(lambda: [bare(env, number) for number in range(BRANCHES)]),
+        "replay": timed_branches(lambda: branch(env, some_steps, BRANCHES, method="replay")),
+    }
+    times = side_by_side(contenders, rounds)
+    section.ratio(
+        "a branch / a bare os.fork, a pipe and the steps themselves",
+        ratio(times, "branch", "a bare fork and a pipe"),
+        bar=1.6,
+        aim=1.3,
+    )
+    section.times(times)
+    env.close()
+    speedup, one, two = alone("branches", str(min(rounds, 9)), cores="0,1")
+    section.ratio(
+        f"{MANY} branches of {MILLISECONDS:g} ms of model each: one after the other / on two cores",
+        speedup,
+        bar=1.7,
+        aim=1.9,
+        at_least=True,
+    )
+    section.time(f"one after the other, {MILLISECONDS:g} ms each", one)
+    section.time(f"on two cores, {MILLISECONDS:g} ms each", two)
+    section.remarks.append("Branches on two cores are measured in a process that may use two, all else on one.")
+    return section
+
+
+def some_steps(env: Any, number: int) -> float:
+    """What is done in each branch."""
+    step, total = env.step, 0.0
+    for _ in range(STEPS):
+        total += step(0)[1]
+    return total
+
+
+def timed_branches(run: Callable[[], Any], number: int = BRANCHES) -> Contender:
+    """A contender of so many branches."""
+
+    def timed() -> float:
+        start = time.perf_counter()
+        run()
+        return (time.perf_counter() - start) / number * 1e3
+
+    return timed
+
+
+def bare(env: Any, number: int) -> Any:
+    """The same in a process that is forked by hand, and answers through a pipe."""
+    reading, writing = os.pipe()
+    process = os.fork()
+    if process == 0:
+        os.write(writing, pickle.dumps(some_steps(env, number)))
+        os._exit(0)
+    os.close(writing)
+    received = b""
+    while chunk := os.read(reading, 1 << 16):
+        received += chunk
+    os.close(reading)
+    os.waitpid(process, 0)
+    return pickle.loads(received)
+
+
+# -- in a process of its own ----------------------------------------------------------------------
+
+
+class Busy(Alone):
+    """One agent, whose simulation takes its time."""
+
+    def run(self) -> None:
+        model, clock = self.model, time.thread_time_ns
+        while True:
+            until = clock() + int(MILLISECONDS * 1e6)
+            while clock() < until:
+                pass
+            model.left()
+
+
+def cores(rounds: int) -> tuple[float, float, float]:
+    """How much faster branches are on two cores than one after the other; and the milliseconds of both."""
+    env = single_env(Busy, Model.left)
+    env.reset(seed=0)
+    both = os.sched_getaffinity(0)
+
+    def run(cores: set[int]) -> None:
+        os.sched_setaffinity(0, cores)
+        branch(env, lambda twin, number: twin.step(0)[1], MANY, method="fork")
+        os.sched_setaffinity(0, both)
+
+    contenders = {"one": timed_branches(lambda: run({min(both)}), MANY), "two": timed_branches(lambda: run(both), MANY)}
+    times = side_by_side(contenders, rounds)
+    return ratio(times, "one", "two"), *(sorted(values)[len(values) // 2] for values in times.values())
+
+
+if __name__ == "__main__":
+    print(json.dumps(cores(int(sys.argv[1]))))

@@ -40,7 +40,7 @@ from simenv_marl import (
     parallel_env,
     single_env,
 )
-from simenv_marl.core import episode
+from simenv_marl.core import episode, forking
 from simenv_marl.core.forking import loops_on
 from tests.worlds import filing
 from tests.worlds.copied import Walk
@@ -303,6 +303,10 @@ def test_a_branch_that_dies_says_so_and_leaves_the_environment_whole(function, m
         branch(env, function, 2, method="fork")
     assert env.step(1)[2] is False
     assert children() == before
+
+
+def test_a_time_limit_may_be_infinite():
+    assert branch(going_on(), lambda twin, number: number, 2, method="fork", time_limit=float("inf")) == [0, 1]
 
 
 def test_an_error_that_cannot_be_pickled():
@@ -704,6 +708,38 @@ def test_a_duplicate_shares_its_offset_in_a_branch_too(tmp_path):
         env.step(1)
         found = branch(env, filing.left, 2, method="fork")
     assert found[0] == found[1] == filing.left(env) == list("abacdbefc")
+
+
+@pytest.mark.parametrize("largest", [0, forking.LARGEST])
+@pytest.mark.parametrize("modes", [["w"], ["a", "w"], ["r+"], ["a", "r"]])
+def test_copies_of_files_are_what_they_were(tmp_path, monkeypatch, modes, largest):
+    """In size, place and contents, in memory or on a disk; and the file itself stays what it is."""
+    monkeypatch.setattr(forking, "LARGEST", largest)
+    path = tmp_path / "letters"
+
+    class Model(Holding):
+        def run(self):
+            path.write_text("abcdefghij")
+            files = [open(path, mode) for mode in modes]  # noqa: SIM115 - closed below
+            files[-1].seek(4)
+            for number in range(6):
+                filing.choose()
+                for file in files:
+                    if file.writable():
+                        file.write(f"{number}line")
+                        file.flush()
+                    self.log += [file.tell(), os.fstat(file.fileno()).st_size, file.read(3) if file.readable() else ""]
+            for file in files:
+                file.close()
+
+    env = single_env(Model, filing.choose)
+    env.reset()
+    for _ in range(3):
+        before = path.read_text()
+        found = branch(env, filing.left, 2, method="fork")
+        assert path.read_text() == before
+        env.step(1)
+    assert found[0] == found[1] == filing.left(env)
 
 
 def test_the_standard_streams_stay_what_they_are(tmp_path):

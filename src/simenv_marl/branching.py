@@ -5,19 +5,19 @@ from __future__ import annotations
 import copy
 import os
 import pickle
+import select
 import signal
 import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from selectors import EVENT_READ, DefaultSelector
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 
 from .core.forking import Standing
-from .core.processes import pack, pack_error, unpack, unpack_error
+from .core.processes import pack_error, pack_plainly, unpack, unpack_error
 from .core.rng import globals_seeded, is_seed
 from .envs import View
 from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, shown, told
@@ -143,6 +143,10 @@ def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], numb
 # -- by forking -----------------------------------------------------------------------------------
 
 
+_A_WHILE: Final = 3600.0
+"""For how many seconds is waited at once: ``poll`` takes no more than some weeks, and a time limit may be infinite."""
+
+
 class _Child:
     """A process with a continuation, as its parent sees it."""
 
@@ -172,31 +176,30 @@ def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: f
     results: list[Any] = [None] * n
     children: dict[int, _Child] = {}
     at_once = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    started = 0
-    with DefaultSelector() as selector:
-        try:
-            while started < n or children:
-                while started < n and len(children) < at_once:
-                    child = _fork(env, function, started, list(children), time_limit)
-                    children[child.pipe] = child
-                    selector.register(child.pipe, EVENT_READ)
-                    started += 1
-                first = min(child.deadline for child in children.values())
-                ready = selector.select(max(0.0, first - time.monotonic()))
-                if not ready:
-                    late = min(children.values(), key=lambda child: child.deadline)
-                    raise BranchError(f"branch {late.number} was ended: it took longer than {time_limit} s")
-                for key, _ in ready:
-                    child = children[key.fd]
-                    chunk = os.read(child.pipe, 1 << 16)
-                    child.received += chunk
-                    if not chunk:
-                        selector.unregister(child.pipe)
-                        del children[child.pipe]
-                        results[child.number] = _result(child)
-        finally:
-            for child in children.values():
-                child.end()
+    started, waiting = 0, select.poll()
+    try:
+        while started < n or children:
+            while started < n and len(children) < at_once:
+                child = _fork(env, function, started, list(children), time_limit)
+                children[child.pipe] = child
+                waiting.register(child.pipe, select.POLLIN)
+                started += 1
+            first = next(iter(children.values()))  # they all have the same time, and the dict the order of their starts
+            left = first.deadline - time.monotonic()
+            ready = waiting.poll(min(max(left, 0.0), _A_WHILE) * 1000)
+            if not ready and left <= _A_WHILE:
+                raise BranchError(f"branch {first.number} was ended: it took longer than {time_limit} s")
+            for pipe, _ in ready:
+                child = children[pipe]
+                chunk = os.read(pipe, 1 << 16)
+                child.received += chunk
+                if not chunk:
+                    waiting.unregister(pipe)
+                    del children[pipe]
+                    results[child.number] = _result(child)
+    finally:
+        for child in children.values():
+            child.end()
     return results
 
 
@@ -205,15 +208,23 @@ def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: lis
         with suppress(Exception):  # what is in it would be written by both processes
             stream.flush()
     reading, writing = os.pipe()
-    with warnings.catch_warnings():
-        # Python warns of forks beside threads: locks that they hold are never released in the child. It does no more
-        # than the function does, and has a time limit.
-        warnings.simplefilter("ignore", DeprecationWarning)
+    with _unwarned():
         process = os.fork()
     if process == 0:
         _be_child(env, function, number, [reading, *pipes], writing)
     os.close(writing)
     return _Child(number, process, reading, time_limit)
+
+
+def _unwarned() -> AbstractContextManager[Any]:
+    """Say nothing of a fork beside threads.
+
+    Python warns of it from 3.12 on: locks that threads hold are never released in the child. It does no more than the
+    function does, and has a time limit.
+    """
+    if sys.version_info < (3, 12):
+        return nullcontext()
+    return warnings.catch_warnings(action="ignore", category=DeprecationWarning)
 
 
 def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others: list[int], pipe: int) -> NoReturn:
@@ -239,11 +250,13 @@ def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others
 
 def _answer(value: Any) -> bytes:
     try:
-        parcel = pack(value)
-        unpack(parcel)  # what can be pickled cannot always be made again
+        return pack_plainly(value)
     except Exception as error:
-        raise BranchError(f"it has returned what cannot be pickled ({told(error)})") from error
-    return parcel
+        raise _unpicklable(error) from error
+
+
+def _unpicklable(error: Exception) -> BranchError:
+    return BranchError(f"it has returned what cannot be pickled ({told(error)})")
 
 
 def _result(child: _Child) -> Any:
@@ -257,8 +270,13 @@ def _result(child: _Child) -> Any:
         raise BranchError(f"branch {number} has died without an answer, {how}")
     answered, parcel = pickle.loads(child.received)
     if answered:
-        return unpack(parcel)
-    error = unpack_error(parcel)
+        try:
+            return unpack(parcel)
+        except Exception as problem:  # what can be pickled cannot always be made again
+            error: BaseException = _unpicklable(problem)
+            error.__cause__ = problem
+    else:
+        error = unpack_error(parcel)
     if not isinstance(error, Exception):  # which is not to be raised here, as an exit or an interrupt
         raise BranchError(f"branch {number} has raised {told(error)}") from error
     if type(error) is WorkerError:

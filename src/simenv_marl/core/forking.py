@@ -35,6 +35,9 @@ LASTING: Final = (
 )
 """The flags of an open file that say how it is read and written, and not how it is found or made."""
 
+LARGEST: Final = 1 << 24
+"""How many bytes a file has at most that is copied into memory: it takes a disk a millisecond to let go of a file."""
+
 Identity = tuple[int, int]
 """Device and inode."""
 
@@ -116,9 +119,9 @@ class _File:
     opened: tuple[_Opened, ...]
 
     @property
-    def written(self) -> bool:
-        """Whether it can be written by one of them."""
-        return any(opened.flags & os.O_ACCMODE != os.O_RDONLY for opened in self.opened)
+    def modes(self) -> set[int]:
+        """For what: ``O_RDONLY``, ``O_WRONLY``, ``O_RDWR``."""
+        return {opened.flags & os.O_ACCMODE for opened in self.opened}
 
 
 class Standing:
@@ -136,6 +139,7 @@ class Standing:
         self._python, self._loops = random.getstate(), loops
         self._files = list(_files())
         self._paths = {os.path.realpath(_path(number)) for number in _numbers(self._files)}
+        self._folders = list(_temporary_folders())
 
     def resume(self) -> None:
         """Have this forked process go on by itself.
@@ -148,7 +152,11 @@ class Standing:
             _reopen(file)
         for loop in self._loops:
             _rebuild(loop)
-        _keep_temporary(self._paths)
+        for end, folder in self._folders:
+            end.detach()
+            folder._rmtree = _delete_nothing
+        if self._paths:
+            _keep_temporary_files(self._paths)
 
 
 def _numbers(files: list[_File]) -> Iterator[int]:
@@ -211,9 +219,8 @@ def _reopen(file: _File) -> None:
     if not numbers:
         return
     path, copy = _path(numbers[0]), None
-    if file.written:
-        copy = tempfile.TemporaryFile()  # noqa: SIM115 - the descriptors below keep it
-        shutil.copyfile(path, _path(copy.fileno()))
+    if file.modes != {os.O_RDONLY}:
+        copy = _copied(path, os.fstat(numbers[0]).st_size, file)
         path = _path(copy.fileno())
     for opened in file.opened:
         again = os.open(path, opened.flags)
@@ -225,13 +232,28 @@ def _reopen(file: _File) -> None:
         copy.close()
 
 
-def _keep_temporary(paths: set[str]) -> None:
-    """Delete nothing at its end that the parent still has: directories and named files for a while."""
+def _copied(path: str, size: int, file: _File) -> Any:
+    """A copy of an open file, which is gone when it is closed."""
+    direct = any(opened.flags & getattr(os, "O_DIRECT", 0) for opened in file.opened)  # which memory may not know
+    in_memory = size <= LARGEST and not direct and hasattr(os, "memfd_create")
+    copy: Any = os.fdopen(os.memfd_create("branch"), "wb") if in_memory else tempfile.TemporaryFile()  # noqa: SIM115
+    if file.modes == {os.O_WRONLY}:  # what stands in it is read by none
+        os.truncate(copy.fileno(), size)
+    else:
+        shutil.copyfile(path, _path(copy.fileno()))
+    return copy
+
+
+def _temporary_folders() -> Iterator[tuple[Any, Any]]:
+    """Directories for a while, which a forked process must not delete, each with what deletes it at its end."""
     for end in list(finalize._registry):  # type: ignore[attr-defined]
         held = end.peek()
         if held is not None and isinstance(held[0], tempfile.TemporaryDirectory):
-            end.detach()
-            held[0]._rmtree = _delete_nothing  # type: ignore[attr-defined]
+            yield end, held[0]
+
+
+def _keep_temporary_files(paths: set[str]) -> None:
+    """Delete none of some named files for a while when it is closed."""
     closer: Any = tempfile._TemporaryFileCloser  # type: ignore[attr-defined]
     for name in {"close", "cleanup"} & vars(closer).keys():
         setattr(closer, name, _keeping(getattr(closer, name), paths))

@@ -105,7 +105,7 @@ def test_streams_are_not_those_that_a_model_makes_of_the_same_seed():
 def test_the_models_of_mesa():
     class Town(mesa.Model):
         def __init__(self, seed):
-            super().__init__(seed=seed)
+            super().__init__(rng=seed)
             self.people = mesa.Agent.create_agents(self, 20)
 
     town, other = Town(1), Town(2)

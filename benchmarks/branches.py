@@ -9,16 +9,20 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import random
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.measure import Contender, Section, alone, ratio, side_by_side
 from benchmarks.noop import Alone, Model
-from simenv_marl import branch, single_env
+from simenv_marl import branch, reseed_generators, single_env
 
-BRANCHES, STEPS = 20, 100
+BRANCHES, STEPS = 20, 10
 
 MANY, MILLISECONDS = 64, 10.0
 """Branches that are spread over two cores, and what each of them takes."""
@@ -28,20 +32,23 @@ def measure(rounds: int, number: int) -> Section:
     """Measure in so many rounds."""
     section = Section("Branches", f"milliseconds per branch of {STEPS} steps")
     rounds = max(3, rounds)
-    env = single_env(Alone, Model.left)
+    env = single_env(Chancy, Model.left)
     env.reset(seed=0)
     contenders: dict[str, Contender] = {
         "branch": timed_branches(lambda: branch(env, some_steps, BRANCHES, method="fork")),
         "a bare fork and a pipe": timed_branches(lambda: [bare(env, number) for number in range(BRANCHES)]),
+        "branch, another future": timed_branches(
+            lambda: branch(env, some_steps, BRANCHES, method="fork", seeds=range(BRANCHES))
+        ),
+        "branch, beside open files": timed_branches(lambda: beside_open_files(env)),
         "replay": timed_branches(lambda: branch(env, some_steps, BRANCHES, method="replay")),
     }
     times = side_by_side(contenders, rounds)
-    section.ratio(
-        "a branch / a bare os.fork, a pipe and the steps themselves",
-        ratio(times, "branch", "a bare fork and a pipe"),
-        bar=1.6,
-        aim=1.3,
-    )
+    least = "a bare fork and a pipe"
+    ours = "a branch / a bare os.fork, a pipe and the steps themselves"
+    section.ratio(ours, ratio(times, "branch", least), bar=1.6, aim=1.3)
+    section.ratio("the same with seeds, another future in each", ratio(times, "branch, another future", least))
+    section.ratio("the same with three files of 100 KiB open", ratio(times, "branch, beside open files", least))
     section.times(times)
     env.close()
     speedup, one, two = alone("branches", str(min(rounds, 9)), cores="0,1")
@@ -58,12 +65,33 @@ def measure(rounds: int, number: int) -> Section:
     return section
 
 
+class Chancy(Alone):
+    """One agent, whose simulation has a generator."""
+
+    def reset(self, seed: int | None = None) -> None:
+        super().reset()
+        self.random = random.Random(seed)
+
+    def reseed(self, seed: int) -> None:
+        reseed_generators(self, seed)
+
+
 def some_steps(env: Any, number: int) -> float:
     """What is done in each branch."""
     step, total = env.step, 0.0
     for _ in range(STEPS):
         total += step(0)[1]
     return total
+
+
+def beside_open_files(env: Any) -> None:
+    """Branches while files are open: one that is read, a log, and one that is both read and written."""
+    with TemporaryDirectory() as folder, ExitStack() as files:
+        for mode in ("r", "a", "r+"):
+            path = Path(folder, mode)
+            path.write_bytes(bytes(100 << 10))
+            files.enter_context(path.open(mode))
+        branch(env, some_steps, BRANCHES, method="fork")
 
 
 def timed_branches(run: Callable[[], Any], number: int = BRANCHES) -> Contender:

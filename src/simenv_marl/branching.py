@@ -18,7 +18,7 @@ import numpy as np
 
 from .core.forking import Standing
 from .core.processes import pack_error, pack_plainly, unpack, unpack_error
-from .core.rng import globals_seeded, is_seed
+from .core.rng import is_seed, process_kept, seed_process
 from .envs import View
 from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, shown, told
 
@@ -94,7 +94,8 @@ def branch(
             ' method="replay"'
         )
     if obstacles or not forks or method == "replay":
-        return [_replayed(env, view, function, number) for number in range(n)]
+        around = nullcontext if seeds is None else process_kept
+        return [_replayed(env, view, function, number, around) for number in range(n)]
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
 
 
@@ -117,9 +118,9 @@ def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) 
     """A function that first draws anew, in its continuation, the chance that lies ahead."""
 
     def reseed_and_call(env: Any, number: int) -> Result:
-        with globals_seeded(seeds[number]):
-            getattr(env, "unwrapped", env).reseed(seeds[number])
-            return function(env, number)
+        seed_process(seeds[number])
+        getattr(env, "unwrapped", env).reseed(seeds[number])
+        return function(env, number)
 
     return reseed_and_call
 
@@ -127,11 +128,18 @@ def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) 
 # -- by replaying ---------------------------------------------------------------------------------
 
 
-def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
+def _replayed(
+    env: Any,
+    view: View,
+    function: Callable[[Any, int], Result],
+    number: int,
+    around: Callable[[], AbstractContextManager[None]],
+) -> Result:
     twin = view.replayed()
     try:
         # Of the wrappers around it each is copied, with all that it remembers.
-        result = function(copy.deepcopy(env, {id(view): twin}), number)
+        with around():
+            result = function(copy.deepcopy(env, {id(view): twin}), number)
     except BaseException as error:
         annotate(error, f"simenv_marl: in branch {number}")
         close_after(error, twin.close, "the branch")

@@ -286,18 +286,26 @@ def _seed_globals(seed: int, whose: int) -> np.random.SeedSequence:
     return another
 
 
+def seed_process(seed: int) -> None:
+    """Seed the global generators of the process for a future: Python's, NumPy's, and torch's if it is there."""
+    another, torchs = _seed_globals(seed, _PROCESS), _generator_of_torch()
+    if torchs is not None:
+        torchs.manual_seed(_integer(another))
+
+
 @contextmanager
-def globals_seeded(seed: int) -> Iterator[None]:
-    """Have the global generators of the process seeded, Python's, NumPy's and torch's if it is there; put them back."""
-    before, drawing = PortableState(), getattr(modules.get("torch"), "default_generator", None)
+def process_kept() -> Iterator[None]:
+    """Put the global generators of the process back to where they were."""
+    before, torchs = PortableState(), _generator_of_torch()
     before.save()
-    drawn = None if drawing is None else drawing.get_state()
+    drawn = None if torchs is None else torchs.get_state()
     try:
-        another = _seed_globals(seed, _PROCESS)
-        if drawing is not None:
-            drawing.manual_seed(_integer(another))
         yield
     finally:
         before.load()
-        if drawing is not None:
-            drawing.set_state(drawn)
+        if torchs is not None:
+            torchs.set_state(drawn)
+
+
+def _generator_of_torch() -> Any:
+    return getattr(modules.get("torch"), "default_generator", None)

@@ -42,7 +42,7 @@ from simenv_marl import (
 )
 from simenv_marl.core import episode, forking
 from simenv_marl.core.forking import loops_on
-from tests.worlds import filing
+from tests.worlds import exactness, filing
 from tests.worlds.copied import Walk
 from tests.worlds.filing import Archive
 from tests.worlds.many_worlds import Being, beings
@@ -539,6 +539,13 @@ def test_files_and_global_generators_go_on_exactly(seed, taken):
     own = filing.left(env)
     assert found[0] == found[1] == own
     env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.* draws from the global generator")
+def test_branches_of_random_worlds_are_exact():
+    """For a larger number: ``python -m tests.worlds.exactness 10000``."""
+    differ, number = exactness.differing(150)
+    assert (differ, number >= 150) == (0, True)
 
 
 class Holding:

@@ -26,8 +26,9 @@ from simenv_marl import (
 from tests.core.test_global_rng import world
 from tests.test_branch import METHODS, POINTS, move, rest_of, short
 from tests.worlds.copied import Walk
+from tests.worlds.exactness import advance, is_over, rest_of_yard
 from tests.worlds.random_worlds import POINTS as POINTS_OF_YARD
-from tests.worlds.random_worlds import Yard, advised, designs, outcome
+from tests.worlds.random_worlds import Yard, designs
 from tests.worlds.random_worlds import seeds as yard_seeds
 
 VIEWS = pytest.mark.parametrize(
@@ -228,29 +229,16 @@ class Reopened(Yard):
 @settings(max_examples=40)
 @given(designs, yard_seeds, st.integers(0, 20), st.lists(st.integers(0, 2), min_size=3, max_size=3))
 def test_random_worlds_have_the_same_futures_by_either_method_and_driver(design, seed, taken, futures):
-    def finish(env, number=0):
-        told = []
-        for agent in env.agent_iter():
-            observation, reward, terminated, truncated, _ = env.last()
-            told.append((agent, observation.tolist(), reward, terminated, truncated))
-            env.step(None if terminated or truncated else advised(observation))
-        return told, outcome(env.simulation)
-
     env, threaded = (aec_env(lambda: Reopened(design), POINTS_OF_YARD, driver=d) for d in ("greenlet", "thread"))
     for each in (env, threaded):
         each.reset(seed=seed)
-    for _ in range(taken):
-        ended = env.terminations[env.agent_selection] or env.truncations[env.agent_selection]
-        action = None if ended else advised(env.last()[0])
-        env.step(action)
-        threaded.step(action)
-        if env._session.episode.pending is None:  # it is over, and only to be told
-            threaded.close()
-            return
-    found = branch(env, finish, 3, method="fork", seeds=futures)
-    assert found == branch(env, finish, 3, method="replay", seeds=futures) == branch(threaded, finish, 3, seeds=futures)
-    assert [found[futures.index(future)] for future in futures] == found
-    assert branch(env, finish) == branch(threaded, finish) == [finish(env)]
+        advance(each, taken)
+    if not is_over(env):
+        found = branch(env, rest_of_yard, 3, method="fork", seeds=futures)
+        assert found == branch(env, rest_of_yard, 3, method="replay", seeds=futures)
+        assert found == branch(threaded, rest_of_yard, 3, seeds=futures)
+        assert [found[futures.index(future)] for future in futures] == found
+        assert branch(env, rest_of_yard) == branch(threaded, rest_of_yard) == [rest_of_yard(env)]
     threaded.close()
 
 

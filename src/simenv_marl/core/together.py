@@ -8,7 +8,7 @@ from typing import Any
 from greenlet import getcurrent
 
 from ..hooks.stacks import EVALUATING
-from .agent import WAIT, Agent
+from .agent import WAIT
 from .episode import Episode
 
 
@@ -18,26 +18,21 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
     All of them move before any is settled: what one loop needs so stays in the processor's caches.
 
     Args:
-        episodes: The episodes; in each a decision is pending.
+        episodes: The episodes, of one plan; in each a decision is pending.
         actions: An action for each, checked.
         blame: Called where something raises: with the number of the episode, and the error.
 
     Raises:
         BaseException: As ``Episode.step``. The other episodes have moved or not, and can be closed.
     """
-    here, number, together = getcurrent(), 0, not EVALUATING
-    agents: list[Agent] = []
-    for episode in episodes:
-        agent = episode.pending
-        if agent is not None:
-            agents.append(agent)
-        elif episode.unheard:
-            together = False
-        else:
-            blame(episodes.index(episode), error := episode.refusal())
+    agents: list[Any] = [episode.pending for episode in episodes]
+    for number, agent in enumerate(agents) if None in agents else ():
+        if agent is None and not episodes[number].unheard:
+            blame(number, error := episodes[number].refusal())
             raise error
-        if episode.driver.caller is not here or episode.plugins is not None:
-            together = False
+    callers = {episode.driver.caller for episode in episodes}
+    together = callers == {getcurrent()} and not EVALUATING and None not in agents and episodes[0].plugins is None
+    number = 0
     event: Any = None
     events: Any = []
     try:

@@ -193,7 +193,9 @@ class Row:
         """
         told: Told = []
         begun = {number: self._again(number) for number in sorted(self.ended)}
-        moving = [number for number in range(len(self.sessions)) if number not in begun]
+        moving: Sequence[int] = range(len(self.sessions))
+        if begun:
+            moving = [number for number in moving if number not in begun]
         episodes: list[Any] = [self.sessions[number].episode for number in moving]
         if None in episodes:  # its view was closed
             raise self.sessions[moving[episodes.index(None)]].refusal()
@@ -222,7 +224,8 @@ class Row:
                 observed[number], rewards[number] = seen[place], earned[place]
         else:
             observed[:], rewards = seen, earned
-        for number, episode, info in zip(moving, episodes, news, strict=True):
+        eventful = any(news) or None in [episode.pending for episode in episodes]
+        for number, episode, info in zip(moving, episodes, news, strict=True) if eventful else ():
             if episode.pending is None:
                 ended = self._end_of(episode)
                 if ended is not None:
@@ -252,7 +255,7 @@ class Row:
             return True, False
         return (episode.terminated, episode.truncated) if episode.over else None
 
-    def _move(self, moving: list[int], episodes: list[Episode], actions: Sequence[Any], first: int) -> None:
+    def _move(self, moving: Sequence[int], episodes: list[Episode], actions: Sequence[Any], first: int) -> None:
         joint = self._common.joint
         if joint is None:
             own = actions if len(moving) == len(actions) else [actions[number] for number in moving]

@@ -43,6 +43,7 @@ class Agent:
         decided: Whether its reward mapping was asked in this episode; the first value is dropped.
         acted: Whether an action of its user was used in the latest round.
         ended: Whether its episode has ended before the simulation's.
+        led: Whether its decisions are none of its user's any more.
         present: Whether its latest info comes from an observation; False where there was nothing to observe.
         reward: The reward of its action before, as of its latest decision or its end.
         asked: Whether its user was asked for an action in this episode, where forced moves are skipped.
@@ -63,7 +64,7 @@ class Agent:
 
     __slots__ = (
         "acted", "answered_at", "asked", "carried", "choices", "clock", "decided", "deferred", "ended", "entity",
-        "group", "handed_out", "info", "kwargs", "mask", "memory", "name", "notes", "now", "observation", "offered",
+        "group", "handed_out", "info", "kwargs", "led", "mask", "memory", "name", "notes", "now", "observation", "offered",
         "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again", "tells",
     )  # fmt: skip
 
@@ -74,7 +75,7 @@ class Agent:
         self.settle = self.settle_again = point.settle
         self.plugins = plugins
         self.deferred = isinstance(policy, DeferredPolicy)
-        self.asked = self.decided = self.acted = self.ended = self.present = self.tells = False
+        self.asked = self.decided = self.acted = self.ended = self.led = self.present = self.tells = False
         self.reward = self.carried = 0.0
         self.observation: Any = None
         self.handed_out: Any = None
@@ -146,7 +147,7 @@ class Agent:
                 self.rest, self.kwargs = args[1:], kwargs
             elif self.keep(args, kwargs):
                 episode.remember(self, args[0])
-        elif self.ended:
+        elif self.led:
             return episode.dispatch(point, self.name, args, kwargs)
         else:
             if point.one_entity and args and self.rest and self.rest[0] is not args[0]:

@@ -133,7 +133,7 @@ class Participants:
         latest = self.latest
         self.conclude(agent)
         self.latest = latest  # after whose decision the model goes on
-        agent.ended = True
+        agent.ended = agent.led = True
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
         self.done = agent.name == self._plan.one_agent

@@ -64,8 +64,9 @@ class Agent:
 
     __slots__ = (
         "acted", "answered_at", "asked", "carried", "choices", "clock", "decided", "deferred", "ended", "entity",
-        "group", "handed_out", "info", "kwargs", "led", "mask", "memory", "name", "notes", "now", "observation", "offered",
-        "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again", "tells",
+        "group", "handed_out", "info", "kwargs", "led", "mask", "memory", "name", "notes", "now", "observation",
+        "offered", "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again",
+        "tells",
     )  # fmt: skip
 
     def __init__(

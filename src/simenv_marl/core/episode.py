@@ -172,7 +172,7 @@ class Episode(Ending):
             self._hear()
             return
         if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
-            self._enter(self.step, action)
+            self._enter(Episode.step, action)
             return
         try:
             if action is not RULE:
@@ -195,19 +195,19 @@ class Episode(Ending):
             raise self.refusal()
         self.unheard = False
 
-    def _enter(self, move: Callable[[Any, bool], None], given: Any) -> None:
+    def _enter(self, move: Callable[[Episode, Any, bool], None], given: Any) -> None:
         """Make a move at work."""
         here = getcurrent()
         if here is not self.driver.caller or EVALUATING:
             with self.at_work():
-                move(given, True)
+                move(self, given, True)
             return
         assert self.plugins is not None
         EVALUATING[here] = self.plugins  # as ``at_work`` does it, where nothing else is to be seen to
         try:
-            move(given, True)
+            move(self, given, True)
         finally:
-            EVALUATING.pop(here, None)
+            del EVALUATING[here]
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
         """Turn an agent's action into the reply that the simulation gets, and let go of what only the decision needed.
@@ -296,7 +296,7 @@ class Episode(Ending):
             self._hear()
             return
         if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
-            self._enter(self.play, actions)
+            self._enter(Episode.play, actions)
             return
         left = self.check(actions)
         pending, self.pending = self.pending, None

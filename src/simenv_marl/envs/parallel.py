@@ -114,8 +114,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
 
     def _results(self, episode: Episode) -> Results:
         """What the agents have come to, by agent."""
-        ended = {agent.name: agent for agent in episode.just_ended}
-        agents = ended | episode.agents
+        agents, ended = episode.agents, episode.just_ended
+        if ended:
+            agents = {agent.name: agent for agent in ended} | agents
         terminations, truncations = dict.fromkeys(agents, episode.terminated), dict.fromkeys(agents, episode.truncated)
         results: Results = {}, {}, terminations, truncations, {}
         observations, rewards, _, _, infos = results
@@ -128,8 +129,8 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             observations[name], rewards[name] = observation, agent.reward
             infos[name] = info = agent.info
             info["deciding"], info["acted"] = False, agent.acted
-        for name in ended:
-            terminations[name], truncations[name] = True, False
+        for agent in ended:
+            terminations[agent.name], truncations[agent.name] = True, False
         if episode.pending is not None:
             episode.pending.info["deciding"] = True
         if self._padded:

@@ -137,6 +137,7 @@ def _replayed(
 ) -> Result:
     twin = view.replayed()
     try:
+        twin.begin_branch()
         # Of the wrappers around it each is copied, with all that it remembers.
         with around():
             result = function(copy.deepcopy(env, {id(view): twin}), number)
@@ -175,6 +176,7 @@ def _standing_alike(function: Callable[[Any, int], Result], standing: Standing) 
 
     def resume_and_call(env: Any, number: int) -> Result:
         standing.resume()
+        getattr(env, "unwrapped", env).begin_branch()
         return function(env, number)
 
     return resume_and_call

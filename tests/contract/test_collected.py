@@ -255,6 +255,21 @@ def test_shapes_and_dtypes():
     assert "6 decisions" in repr(found)
 
 
+def test_times_are_kept_where_a_policy_takes_the_infos():
+    class Timed(Script):
+        def time(self):
+            return len(self.log) * 2
+
+    def asked(observations, infos):
+        assert [info.pop("time") for info in infos] in ([0, 0, 0], [2, 2, 2])
+        return ones(observations)
+
+    ant = decision(agent="ant_0")
+    main = lambda simulation: simulation.log.extend(ant() for _ in range(2))  # noqa: E731
+    found = collect_episodes(lambda: Timed(main), {ant: asked}, seeds=range(3))[ant]
+    assert found.times.tolist() == [0, 2] * 3
+
+
 def test_policies_can_tell_decisions_apart():
     ant = decision(agent="ant_0")
     bee = decision(agent="bee_0", observation_space=spaces.Discrete(3), observation_space_mapping=lambda: 1)

@@ -15,6 +15,7 @@ Each module imports only from those below it::
     children                    the threads that a simulation starts
     contexts                    what is around all that runs for an environment on its user's side
     agent                       what an episode knows of one agent; rewards and observations
+    asking                      policies that are given the environment
     bound                       decision points under an environment's definitions
     variant                     a model with all that an experiment changes, under one name
     points                      what ``points=`` names

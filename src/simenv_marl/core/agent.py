@@ -16,6 +16,7 @@ from ..errors import MaskError, RewardError, shown
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import MASK
+from .asking import AskingPolicy
 from .bound import BoundPoint, DeferredPolicy
 from .spaces import duplicate
 
@@ -37,6 +38,8 @@ class Agent:
         point: The decision point at which it decides.
         policy: The policy that answers for it; None: the environment's user.
         deferred: Whether that policy answers many decisions at once, and so an episode waits for it.
+        looks: Whether that policy is given the environment.
+        consultations: How often such a policy was asked at once.
         clock: Returns the simulation's time; None where it has none.
         settle: Rewards and observes the agent: see ``settling``.
         settle_again: The same once it has decided before.
@@ -63,19 +66,20 @@ class Agent:
     """
 
     __slots__ = (
-        "acted", "answered_at", "asked", "carried", "choices", "clock", "decided", "deferred", "ended", "entity",
-        "group", "handed_out", "info", "kwargs", "led", "mask", "memory", "name", "notes", "now", "observation",
-        "offered", "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle", "settle_again",
-        "tells",
+        "acted", "answered_at", "asked", "carried", "choices", "clock", "consultations", "decided", "deferred", "ended",
+        "entity", "group", "handed_out", "info", "kwargs", "led", "looks", "mask", "memory", "name", "notes", "now",
+        "observation", "offered", "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle",
+        "settle_again", "tells",
     )  # fmt: skip
 
     def __init__(
         self, name: str, point: BoundPoint, policy: Any, clock: Callable[[], float] | None, plugins: Any
     ) -> None:
-        self.name, self.point, self.policy, self.clock = name, point, policy, clock
+        self.name, self.point, self.clock = name, point, clock
+        self.follow(policy)
+        self.consultations = 0
         self.settle = self.settle_again = point.settle
         self.plugins = plugins
-        self.deferred = isinstance(policy, DeferredPolicy)
         self.asked = self.decided = self.acted = self.ended = self.led = self.present = self.tells = False
         self.reward = self.carried = 0.0
         self.observation: Any = None
@@ -93,6 +97,11 @@ class Agent:
         self.entity: Any = None
         self.rest: tuple[Any, ...] | None = None
         self.kwargs: dict[str, Any] = _NOTHING
+
+    def follow(self, policy: Any) -> None:
+        """Have a policy answer for it; None: the environment's user."""
+        self.policy = policy
+        self.deferred, self.looks = isinstance(policy, DeferredPolicy), isinstance(policy, AskingPolicy)
 
     # -- the arguments of its decision ------------------------------------------------------------
 

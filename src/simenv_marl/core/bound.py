@@ -25,6 +25,10 @@ Policy = Callable[[Any, dict[str, Any]], Any]
 class DeferredPolicy:
     """A policy that answers many decisions at once: an episode waits for it as it waits for its user."""
 
+    def alone(self, episode: Any, agent: Any) -> Any:
+        """Answer a decision at once, of an episode that is a branch and waits for one agent alone."""
+        raise NotImplementedError
+
 
 MAPPINGS: Final = (
     "observation_space_mapping", "action_space_mapping", "reward_mapping", "apply", "choices", "rule_action_mapping",
@@ -35,19 +39,24 @@ MAPPINGS: Final = (
 
 def asks_for_simulation(function: Any) -> bool:
     """Whether a mapping has a keyword-only parameter ``_simulation``."""
+    return asks_for(function, "_simulation")
+
+
+def asks_for(function: Any, name: str) -> bool:
+    """Whether a function has a keyword-only parameter of a name."""
     if not callable(function):
         return False
     if type(function) is FunctionType and not hasattr(function, "__wrapped__"):
         code = function.__code__
-        return "_simulation" in code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
+        return name in code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
     try:
-        parameter = inspect.signature(function).parameters.get("_simulation")
+        parameter = inspect.signature(function).parameters.get(name)
     except (TypeError, ValueError):
         return False
     if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
         return False
     own = inspect.signature(function, follow_wrapped=False).parameters  # what is wrapped may be given it by the wrapper
-    return "_simulation" in own or any(p.kind is p.VAR_KEYWORD for p in own.values())
+    return name in own or any(p.kind is p.VAR_KEYWORD for p in own.values())
 
 
 def given_simulation(definition: Definition, simulation: Any) -> Definition:

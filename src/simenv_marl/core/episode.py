@@ -80,7 +80,6 @@ class Episode(Ending):
         tape: What the user and policies have answered, in that order; ``LOST`` where that is not kept.
         most_steps: The step with which the episode is truncated; infinity where none is.
         limit: The next number of turns at which something is to be seen to: see ``_come_to_limit``.
-        script: The answers of another episode's tape that are yet to be given again; None where there were none.
         last_time: The time at the latest step of a joint view.
         skips: Whether decisions with one legal action are answered with it.
         stalled: How many rounds have had no action for the pending agent since the simulation last moved.
@@ -89,7 +88,7 @@ class Episode(Ending):
     """
 
     __slots__ = (
-        "_left", "decide", "last_time", "limit", "most_steps", "script", "skips", "stalled", "tape", "unheard", "when",
+        "_left", "decide", "last_time", "limit", "most_steps", "skips", "stalled", "tape", "unheard", "when",
     )  # fmt: skip
 
     def __init__(
@@ -100,7 +99,7 @@ class Episode(Ending):
         seed: int,
         when: When,
         around: tuple[GlobalRandom | None, Claim | None],
-        script: Iterable[Any] = (),
+        script: Iterable[Any] | None = None,
     ) -> None:
         """Prepare an episode of a simulation that has been reset.
 
@@ -111,7 +110,7 @@ class Episode(Ending):
             seed: What it was reset with.
             when: When agents are settled.
             around: What ``at_work`` is to put around all that runs for the environment.
-            script: The tape of another episode, which is to be replayed.
+            script: The tape of another episode, which is to be replayed; None: it is an episode of its own.
         """
         super().__init__(plan, simulation, driver, seed, around)
         self.when = when
@@ -124,8 +123,8 @@ class Episode(Ending):
         elif self.skips:
             self.decide = Episode._decide_unless_forced
         self.last_time: float | None = None
-        self.tape: Any = LOST if plan.unanswered else []
-        self.script: deque[Any] | None = deque(script) or None
+        self.tape: Any = LOST if plan.unanswered and not plan.looked_into else []
+        self.script = None if script is None else deque(script)
         self._left: dict[str, Any] = {}  # the actions of a round that are not used yet
 
     def begin(self) -> None:
@@ -138,7 +137,7 @@ class Episode(Ending):
         with self.at_work():
             try:
                 self.go_on(None)
-                if not self.over and self.when is not When.NEVER:
+                if not self.over and self.when is not When.NEVER and self.consulted is None:
                     self._return(settle=self.when is When.RETURN)
                     for agent in self.agents.values() if self.skips else ():
                         agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # a reset tells no rewards
@@ -315,7 +314,7 @@ class Episode(Ending):
             else:
                 self.stalled = 0
                 self.go_on(reply)
-            if not self.over:
+            if not self.over and self.consulted is None:  # else a replay has come to where the other episode stands
                 self._return(truncate=bool(actions) and self.turns == self.most_steps)
         except BaseException as error:
             self.fail(error)
@@ -359,14 +358,29 @@ class Episode(Ending):
         forced = self._forced(agent) if self.skips else None
         if forced is not None:
             return self._answer_forced(agent, forced)
-        if agent.deferred:
-            self.pending = agent
-            return WAIT
-        action = self.script.popleft() if self.script else agent.policy(agent.observation, agent.info)
+        if self.script is None and not (agent.deferred or agent.looks):
+            action = agent.policy(agent.observation, agent.info)
+        else:
+            action = self.ask(agent, args, kwargs)
+            if action is WAIT:
+                self.pending = agent
+                return WAIT
         self._keep(duplicate(action))
         if action is not RULE:
             action = agent.point.checked(action, agent.name, agent.mask)
         return self.answer(agent, action, False)
+
+    def single_out(self, agent: Agent) -> None:
+        """Wait for the agent alone that is consulted; it is rewarded from now on, and ends as in a single view."""
+        if list(self.agents.values()) != [agent]:
+            self.most_steps = self.limit = inf  # what counts are the steps of others
+        super().single_out(agent)
+        self.when, self.decide = When.DECISION, Episode._decide_unless_forced if self.skips else None
+        self.begun, self.untold, self._left, agent.asked = True, [], {}, True
+        if not agent.decided:  # nothing was done yet that could be rewarded
+            with self.at_work():
+                agent.settle(agent, agent.arguments(), agent.kwargs, observe=False)
+        self.consulted, self.pending = None, agent
 
     # -- decisions --------------------------------------------------------------------------------
 

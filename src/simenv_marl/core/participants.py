@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from ..errors import AgentError, shown
 from ..hooks.hook import Hook
-from .agent import Agent
+from ..simulation import RULE
+from .agent import WAIT, Agent
 from .bound import BoundPoint
 from .plan import Plan
+from .roster import declared_agents, two_arguments
 
 
 class Participants:
@@ -21,6 +24,8 @@ class Participants:
         ended: The agents of the environment whose episode has ended before the simulation's, by name.
         just_ended: Those of them whose end no view has entered yet.
         done: Whether the one agent of the environment has ended, and so nothing is left to ask for.
+        script: The answers of another episode's tape that are yet to be given again; None where none are, or no more.
+        consulted: The agent whose policy is asked just now, and is given the environment; None while none is.
         latest: The agent whose decision was the latest, for those who read an error's notes.
         clock: Returns the simulation's time; None where it has none.
     """
@@ -32,10 +37,12 @@ class Participants:
         "agents",
         "answered",
         "clock",
+        "consulted",
         "done",
         "ended",
         "just_ended",
         "latest",
+        "script",
     )
 
     def __init__(self, plan: Plan, simulation: Any, clock: Callable[[], float] | None) -> None:
@@ -48,6 +55,8 @@ class Participants:
         self.ended: dict[str, Agent] = {}
         self.just_ended: list[Agent] = []
         self.latest: Agent | None = None
+        self.script: deque[Any] | None = None
+        self.consulted: Agent | None = None
         self.done = False
         self._entities: dict[tuple[BoundPoint, int], Agent] = {}
 
@@ -112,6 +121,69 @@ class Participants:
                         continue
                 announced.append((agent, args))
         return announced
+
+    def ask(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Ask a policy that is to be given the environment, or answers many at once; or find what it has answered.
+
+        Returns:
+            ``WAIT`` where it is asked later, and where a replay has come to where the other episode stands.
+
+        Raises:
+            BaseException: What the policy raises.
+        """
+        if agent.deferred and not self.alone:
+            return WAIT
+        if agent.looks:
+            agent.consultations += 1
+            if agent.keep(args, kwargs):
+                self.remember(agent, args[0])
+        if self.script:
+            return self.script.popleft()
+        self.consulted = agent
+        if self.script is not None:
+            return WAIT
+        try:
+            if agent.deferred:
+                return agent.policy.alone(self, agent)
+            return agent.policy(agent.observation, agent.info)
+        finally:
+            self.consulted = None
+
+    def single_out(self, agent: Agent) -> None:
+        """Have one agent be the only one of the environment, in a branch.
+
+        All others are left to their policies; those without one to their rule.
+        """
+        plan = self._plan = self._plan.for_one(agent.name)
+        for name, other in self.agents.items():
+            if other is not agent:
+                self.answered[name], other.led = other, True
+                other.follow(plan.policy_of(name, other.point))
+        self.answered.pop(agent.name, None)
+        self.agents, self.just_ended, self.done = {agent.name: agent}, [], False
+        agent.follow(None)
+
+    def leave_to(self, others: Mapping[str, Any]) -> None:
+        """In a branch: have policies, by agent, answer for agents that are not its user's and have none."""
+        led = {name: self.answered.get(name) for name, policy in others.items() if policy is not RULE}
+        led = {name: agent for name, agent in led.items() if agent is None or agent.policy is RULE}
+        self._plan = self._plan.led_by({name: two_arguments(others[name]) for name in led if name not in self.agents})
+        for name, agent in led.items():
+            if agent is not None:
+                agent.follow(self._plan.policies[name])
+
+    def may_be(self, name: Any) -> bool:
+        """Whether there is an agent of that name, or may be one."""
+        plan = self._plan
+        declared = plan.options.possible_agents
+        open_to_all = declared is None and any(point.agent is None for point in plan.points)
+        known = (self.agents, self.answered, plan.roster, plan.policies, declared_agents(declared))
+        return any(name in names for names in known) or (open_to_all and isinstance(name, str))
+
+    @property
+    def alone(self) -> bool:
+        """Whether one agent is singled out."""
+        return self._plan.alone
 
     def crossing(self) -> Mapping[Hook, Any]:
         """What crosses from the simulation, by hook; where a point has one agent, that agent itself.

@@ -26,6 +26,7 @@ from ..hooks.plugins import Plugins
 from ..hooks.stacks import outside_simulation
 from ..simulation import RULE, SimulationInterface
 from .agent import settling
+from .asking import AskingPolicy, given_session
 from .bound import BoundPoint, DeferredPolicy, given_simulation
 from .drivers import Spare
 from .events import Answered, Decision, Ended, Removed, Told
@@ -58,7 +59,9 @@ class Plan:
         events: By decision point, what crosses from the simulation when it is called.
         decisions: The same by the point's hook, for drivers.
         policies: By name: the policies of agents that are no agents of the environment.
-        asks: Whether some mapping asks for the simulation.
+        asks: Whether some mapping asks for the simulation, or some policy for the environment.
+        looked_into: Whether some policy asks for the environment, and may branch it.
+        alone: Whether it is the plan of a branch that waits for one agent alone.
         wanted: The agents that ``policies`` and ``possible_agents`` name. Those that do not appear in an episode are
             warned of, once, and taken out.
         one_agent: The name of the one agent that the environment's user answers for; None where there may be more.
@@ -105,7 +108,9 @@ class Plan:
         self.hooks: list[Hook] = [point.point.hook for point in self._everything]
         self.plugins = Plugins(options.plugins) if options.plugins else None
         self.wanted = {*self.policies, *declared_agents(options.possible_agents)}
-        self.asks = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
+        mappings = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
+        self.looked_into = any(isinstance(p, AskingPolicy) for p in (*by_point.values(), *self.policies.values()))
+        self.asks, self.alone = mappings or self.looked_into, False
         self._bind_points(first=True)
 
     def _bind_points(self, *, first: bool) -> None:
@@ -148,14 +153,33 @@ class Plan:
             self._single_out(options.agent)
         self.one_agent = self.active[0].agent or options.agent if len(self.active) == 1 else None
 
-    def with_simulation(self, simulation: Any) -> Plan:
-        """The same plan, with a simulation given to those mappings that ask for it."""
-        made = Plan.__new__(Plan)
-        vars(made).update(vars(self))
+    def with_simulation(self, simulation: Any, session: Any) -> Plan:
+        """The same plan, with a simulation, and its session, given to those mappings and policies that ask for it."""
+        made = self._copied()
         made._everything = [
             replace(point, definition=given_simulation(point.definition, simulation)) for point in self._everything
         ]
+        made._by_point = {key: given_session(policy, session) for key, policy in self._by_point.items()}
+        made.policies = {key: given_session(policy, session) for key, policy in self.policies.items()}
         made._bind_points(first=False)
+        return made
+
+    def for_one(self, agent: str) -> Plan:
+        """The same plan, for a branch that waits for one agent alone: who has no policy is left to its rule."""
+        made = self._copied()
+        made.unanswered, made.rewarded, made.alone = True, False, True
+        made.one_agent, made.wanted = agent, set()
+        return made
+
+    def led_by(self, policies: Mapping[str, Any]) -> Plan:
+        """The same plan, for a branch in which policies, by agent, answer for agents that have none."""
+        made = self._copied()
+        made.policies = {**policies, **self.policies}
+        return made
+
+    def _copied(self) -> Plan:
+        made = Plan.__new__(Plan)
+        vars(made).update(vars(self))
         return made
 
     def _bind(self, named: NamedPoint, agent: str | None, policy: Any) -> None:

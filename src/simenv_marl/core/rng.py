@@ -216,6 +216,11 @@ class GlobalRandom:
         if self._owner not in _owners:
             self._owner.threads.clear()
 
+    def step_out(self) -> None:
+        """Put back the state that was in place before all that is under way."""
+        while _owners[-1] is self._owner:
+            self.leave()
+
     def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
         """What the simulation's stack runs. The state is in place, whatever thread that is, while its user waits."""
         threads = self._owner.threads

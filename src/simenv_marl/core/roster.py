@@ -8,7 +8,8 @@ from typing import Any
 
 from ..decision import DecisionPoint, unwrapped
 from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, shown
-from ..simulation import RULE, positional
+from ..simulation import RULE
+from .asking import AskingPolicy, asks_for_environment, takes_info
 from .bound import BoundPoint, Policy
 from .points import NamedPoint, find_point
 
@@ -119,8 +120,7 @@ def _is_path(key: Any) -> bool:
 
 
 def two_arguments(policy: Callable[..., Any]) -> Policy:
-    """Let a policy be called with observation and info, whether it takes the info or not."""
-    parameters = positional(policy)
-    if len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info"):
-        return policy
-    return lambda observation, info: policy(observation)
+    """Let a policy be called with observation and info, whether it takes the info or not, or the environment."""
+    if asks_for_environment(policy):
+        return AskingPolicy(policy)
+    return policy if takes_info(policy) else lambda observation, info: policy(observation)

@@ -141,7 +141,7 @@ class Session:
         seed: int | None,
         options: dict[str, Any] | None,
         when: When,
-        script: Iterable[Any] = (),
+        script: Iterable[Any] | None = None,
     ) -> Episode:
         """End the episode that runs, reset the simulation, and run it to its first decision.
 
@@ -149,7 +149,7 @@ class Session:
             seed: The seed to reset it with; None: one is drawn.
             options: What the environment's ``reset`` was given.
             when: When agents are settled.
-            script: The tape of another episode, which is to be replayed.
+            script: The tape of another episode, which is to be replayed; None: it is an episode of its own.
 
         Raises:
             NoDecisionError: The simulation ended without one.
@@ -177,11 +177,11 @@ class Session:
             self._starting = False
 
     def _plan_of_simulation(self) -> Plan:
-        """The plan, with the simulation given to those mappings that ask for it."""
+        """The plan, with the simulation given to those mappings and policies that ask for it."""
         if not self.plan.asks:
             return self.plan
         if self._bound is None or self._bound[0] is not self.plan or self._bound[1] is not self.simulation:
-            self._bound = self.plan, self.simulation, self.plan.with_simulation(self.simulation)
+            self._bound = self.plan, self.simulation, self.plan.with_simulation(self.simulation, self)
         return self._bound[2]
 
     def _begin(
@@ -189,7 +189,7 @@ class Session:
         seed: int | None,
         options: dict[str, Any] | None,
         when: When,
-        script: Iterable[Any],
+        script: Iterable[Any] | None,
     ) -> Episode:
         self._hold_patches()
         self.options = options
@@ -241,7 +241,7 @@ class Session:
             BaseException: What the model raises.
         """
         episode = other.episode
-        if episode is None or episode.pending is None:
+        if episode is None or (episode.pending or episode.consulted) is None:
             raise other.refusal()
         if episode.tape is LOST:
             raise BranchError(
@@ -254,6 +254,7 @@ class Session:
         answer = again.play if again.when is When.RETURN else again.step
         while again.script:
             answer(again.script.popleft())
+        again.script = None
         if not _stand_alike(again, episode):
             again.close()
             raise BranchError(
@@ -275,6 +276,11 @@ class Session:
             for number in sockets_of(loop):
                 found.pop(number, None)
         return list(found.values()), loops
+
+    def step_out(self) -> None:
+        """In a branch that was forked from within: have its user's global generators in place."""
+        if self._rng is not None:
+            self._rng.step_out()
 
     def check_reseed(self) -> None:
         """Make sure that the chance that lies ahead can be drawn anew.
@@ -413,7 +419,7 @@ class Session:
 
 def _stand_alike(one: Episode, other: Episode) -> bool:
     """Whether the pending decisions of two episodes look just the same."""
-    mine, theirs = one.pending, other.pending
+    mine, theirs = one.pending, other.pending or other.consulted
     return (
         mine is not None
         and theirs is not None

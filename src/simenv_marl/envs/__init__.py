@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 from ..core.plan import Plan
 from ..errors import OptionValueError, shown
+from . import asked  # noqa: F401 - the environments that policies are given
 from .aec import SimulationAECEnv
 from .base import View
 from .joint import SimulationJointEnv

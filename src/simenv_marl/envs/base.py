@@ -274,6 +274,22 @@ class View:
         made._resume_from_replay()
         return made
 
+    @property
+    def episode(self) -> Episode:
+        """The episode that goes on, or has just ended: for planners.
+
+        Raises:
+            ResetNeededError: There is none.
+        """
+        return self._running()
+
+    def stop_showing(self) -> None:
+        """In a branch: show nothing of what is not to happen."""
+        self._shows = False
+
+    def begin_branch(self) -> None:
+        """Make ready for what is done in a branch, of which this is the environment."""
+
     def _resume_from_replay(self) -> None:
         """Take over the session's episode in the midst of it."""
 

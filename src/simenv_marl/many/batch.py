@@ -14,11 +14,15 @@ from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import Any, Final, Protocol
 
+import numpy as np
+
+from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.bound import BoundPoint, DeferredPolicy
 from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.roster import two_arguments
 from ..core.session import Session
+from ..core.spaces import duplicate
 from ..core.stacking import rows, stacker
 from ..core.together import step_all
 from ..decision import DecisionPoint
@@ -37,6 +41,7 @@ class BatchPolicy:
         policy: The policy, to be called with observations and infos.
         informed: Whether it takes the infos.
         identifying: Whether it takes what identifies each decision besides.
+        asking: Whether it asks for the environment, and so answers one decision at a time.
         groups: Of its decisions.
     """
 
@@ -45,6 +50,7 @@ class BatchPolicy:
         self.policy: Callable[..., Any] = two_arguments(policy)
         self.informed = self.policy is policy
         self.identifying = self.informed and _takes_three(policy)
+        self.asking = isinstance(self.policy, AskingPolicy)
         self.groups: list[Group] = []
 
     def __repr__(self) -> str:
@@ -94,17 +100,46 @@ class PolicyKey(DeferredPolicy):
         """Policies are callable; this one is never called, because episodes wait for it."""
         raise NotImplementedError
 
+    def alone(self, episode: Any, agent: Any) -> Any:
+        """Answer a decision at once, of an episode that is a branch and waits for one agent alone."""
+        group = self.group(agent.point)
+        episode.pending = agent
+        try:
+            actions, _ = group.ask(group.stack([agent.observation]), [episode])
+        finally:
+            episode.pending = None
+        return actions[0]
 
-def policy_keys(policies: Mapping[Any, Any]) -> dict[Any, Any]:
-    """What stands for policies in a plan; what is no policy, as it is."""
+
+class AskingKey(AskingPolicy, PolicyKey):
+    """The same of a policy that asks for the environment, and so answers one decision at a time."""
+
+    def __init__(self, place: int, asked: BatchPolicy, policy: Callable[..., Any]) -> None:
+        AskingPolicy.__init__(self, policy)
+        PolicyKey.__init__(self, place, asked)
+
+    def alone(self, episode: Any, agent: Any) -> Any:
+        """Answer a decision at once, of an episode that is a branch and waits for one agent alone."""
+        return self(agent.observation, agent.info)
+
+
+def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[Any, Any]:
+    """What stands for policies in a plan; what is no policy, as it is.
+
+    Args:
+        policies: The policies.
+        rewarded: Whether those that ask for the environment are waited for as well. Else they are asked where they
+            decide, as they answer one decision at a time.
+    """
     known: dict[int, BatchPolicy] = {}
     found: dict[Any, Any] = {}
     for place, (key, policy) in enumerate(policies.items()):
         found[key] = policy
-        if policy is not RULE and callable(policy):
+        asks = asks_for_environment(policy)
+        if policy is not RULE and callable(policy) and (rewarded or not asks):
             asked = known.setdefault(id(policy), BatchPolicy(policy))
             asked.keys.append(key)
-            found[key] = PolicyKey(place, asked)
+            found[key] = AskingKey(place, asked, policy) if asks else PolicyKey(place, asked)
     return found
 
 
@@ -165,7 +200,7 @@ class Group:
                 agent.info = {}  # what a policy does to its own is not to be seen at the next decision
         try:
             identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
-            answers = asked.answers(observations, infos, identities)
+            answers = _each(waiting) if asked.asking else asked.answers(observations, infos, identities)
             extras: Mapping[str, Any] = {}
             if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
                 answers, extras = answers
@@ -186,6 +221,19 @@ class Group:
             )
             raise
         return actions, extras
+
+
+def _each(waiting: Sequence[Episode]) -> Any:
+    """What a policy answers that asks for the environment, one decision after the other."""
+    answers = []
+    for episode in waiting:
+        agent: Any = episode.pending
+        answers.append(agent.policy(duplicate(agent.observation), agent.info))
+        agent.info = {}
+    if not all(type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping) for answer in answers):
+        return answers
+    extras = {name: np.stack([np.asarray(extra[name]) for _, extra in answers]) for name in answers[0][1]}
+    return [action for action, _ in answers], extras
 
 
 # -- all of them ----------------------------------------------------------------------------------

@@ -184,7 +184,8 @@ def learners_plan(
     simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
 ) -> tuple[Plan, dict[Any, int]]:
     """The plan of the episodes, and the places of the policies by their keys."""
-    found = policy_keys({key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()})
+    given = {key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()}
+    found = policy_keys(given, rewarded=True)
     keys = {key: entry.place for key, entry in found.items() if isinstance(entry, PolicyKey)}
     return Plan.draw_up(simulation, points, {**options, "policies": found}, unanswered=True, rewarded=True), keys
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.spaces import same as alike
 from ..core.stacking import stacker
 from ..errors import OptionValueError, shown
@@ -90,7 +91,7 @@ def compare_with_rule(
     by_rule = dict.fromkeys(policies, RULE)
     checked = {name: value for name, value in options.items() if name not in PLAYING}
     check_knowable(simulation, {**by_rule, **(others or {})}, by_rule, points, checked)
-    asked = {id(policy): _Onlooker(policy) for policy in policies.values()}
+    asked = {id(policy): _onlooker(policy) for policy in policies.values()}
     onlookers = {key: asked[id(policy)] for key, policy in policies.items()}
     collected = collect_episodes(simulation, {**onlookers, **(others or {})}, seeds=seeds, points=points, **options)
     return {key: _compared(collected[key], float(tolerance)) for key in policies}
@@ -109,6 +110,22 @@ class _Onlooker:
         for place, action in enumerate(actions_of(returned, len(identities), self.policy)):
             noted[place] = action
         return RULE, {"noted": noted}
+
+
+class _AskingOnlooker:
+    """The same for a policy that asks for the environment."""
+
+    def __init__(self, policy: Any) -> None:
+        self.asked = AskingPolicy(policy)
+
+    def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
+        noted = np.empty((), object)
+        noted[()] = self.asked.answer(observation, info, _environment)
+        return RULE, {"noted": noted}
+
+
+def _onlooker(policy: Any) -> Any:
+    return _AskingOnlooker(policy) if asks_for_environment(policy) else _Onlooker(policy)
 
 
 def _compared(found: Trajectories, tolerance: float) -> Comparison:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.asking import asks_for_environment
 from ..core.stacking import rows, taken
 from ..errors import InvalidActionError, OptionValueError, shown
 from ..simulation import RULE
@@ -44,6 +45,8 @@ class Mixture:
         for policy, weight in pairs:
             if policy is not RULE and not callable(policy):
                 raise OptionValueError(f"a mixture is one of policies, callables or RULE, not of {shown(policy)}")
+            if asks_for_environment(policy):
+                raise OptionValueError(f"{shown(policy)} asks for the environment, which a mixture has none of")
             if (
                 isinstance(weight, bool)
                 or not isinstance(weight, (int, float))

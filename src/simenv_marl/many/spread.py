@@ -12,8 +12,8 @@ from ..core.processes import pack, pack_error, unpack, unpack_error
 from ..errors import MissingExtraError
 
 
-def progress_bar(total: int) -> Any:
-    """A bar that shows how many simulations have ended.
+def progress_bar(total: int, unit: str = "simulation") -> Any:
+    """A bar that shows how many simulations have ended, or whatever else is counted.
 
     Raises:
         MissingExtraError: tqdm is not installed.
@@ -22,7 +22,7 @@ def progress_bar(total: int) -> Any:
         from tqdm.auto import tqdm  # type: ignore[import-untyped]
     except ImportError:
         raise _missing("progress=True", "tqdm") from None
-    return tqdm(total=total, unit="simulation")
+    return tqdm(total=total, unit=unit)
 
 
 def _missing(what: str, package: str) -> MissingExtraError:

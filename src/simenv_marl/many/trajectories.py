@@ -269,7 +269,7 @@ class Ledger:
         if page.restricted:
             page.masks.append(stack_masks([agent.mask for agent in agents]))
         if waiting[0].clock is not None:
-            page.times.extend([agent.info["time"] for agent in agents])
+            page.times.extend([agent.now for agent in agents])  # the policy may have been given the info
 
     def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
         """They have been: see ``Watcher``."""

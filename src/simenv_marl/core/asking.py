@@ -1,0 +1,80 @@
+"""Policies that ask for the environment in which they decide: those with a keyword-only parameter ``_environment``.
+
+Such a policy is wrapped when a plan binds it, so that nothing is paid for it where no policy asks. What it is given is
+made by the views, of which this room knows nothing: they say how, in ``AskingPolicy.make``.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any, Final
+from weakref import ref
+
+from ..errors import OptionValueError, shown
+from ..simulation import positional
+from .bound import asks_for
+
+ENVIRONMENT: Final = "_environment"
+"""The parameter of policies that ask for the environment."""
+
+
+def takes_info(policy: Callable[..., Any]) -> bool:
+    """Whether a policy is to be called with the observation and the info, and not with the observation alone."""
+    parameters = positional(policy)
+    return len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info")
+
+
+def asks_for_environment(policy: Any) -> bool:
+    """Whether a policy has a keyword-only parameter ``_environment``."""
+    return asks_for(policy, ENVIRONMENT)
+
+
+class AskingPolicy:
+    """A policy that is given the environment, with its decision pending.
+
+    Attributes:
+        policy: The policy.
+    """
+
+    make: Callable[[Any], Any]
+    """Makes the environment of a session, in which such a policy decides; set by the views."""
+
+    def __init__(self, policy: Callable[..., Any]) -> None:
+        self.policy = policy
+        self._informed = takes_info(policy)
+        self._session: Callable[[], Any] = _nothing
+
+    def given(self, session: Any) -> AskingPolicy:
+        """The same, for the episodes of a session, which is held weakly."""
+        made = copy.copy(self)
+        made._session = ref(session)
+        return made
+
+    def __call__(self, observation: Any, info: Any) -> Any:
+        """Ask the policy.
+
+        Raises:
+            OptionValueError: It is asked where there is no one episode.
+            BaseException: What the policy raises.
+        """
+        session = self._session()
+        if session is None:
+            raise OptionValueError(
+                f"the policy {shown(self.policy)} asks for {ENVIRONMENT}, which there is not here: name it in policies="
+            )
+        return self.answer(observation, info, AskingPolicy.make(session))
+
+    def answer(self, observation: Any, info: Any, environment: Any) -> Any:
+        """What the policy answers in an environment."""
+        given = (observation, info) if self._informed else (observation,)
+        return self.policy(*given, **{ENVIRONMENT: environment})
+
+
+def _nothing() -> None:
+    """Stands for a session that is not known."""
+
+
+def given_session(policy: Any, session: Any) -> Any:
+    """A policy of a plan, with the session given to it if it asks for the environment."""
+    return policy.given(session) if isinstance(policy, AskingPolicy) else policy

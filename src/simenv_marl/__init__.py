@@ -3,6 +3,7 @@
 The rooms of the package; each imports only from those below it::
 
     __main__                            the command line
+    planning                            what actions are worth, and policies that decide by that
     testing, registration, branching    checks of a simulation; registries; exact continuations of an episode
     envs                                views: an episode read as a PettingZoo or Gymnasium environment
     many                                policies back in the model, in one simulation or in many at once; pictures
@@ -52,6 +53,9 @@ from .many.demonstrations import record_dataset, save_dataset
 from .many.mixture import Mixture
 from .many.plots import plot_returns, plot_timeline
 from .many.simulate import simulate
+from .planning.policy import RolloutPolicy
+from .planning.tree import TreeSearchPolicy
+from .planning.values import ActionValues, action_values
 from .registration import register_simulation
 from .simulation import RULE, TRUNCATED, SimulationInterface
 
@@ -60,12 +64,14 @@ __version__ = "0.1.0"
 __all__ = [
     "RULE",
     "TRUNCATED",
+    "ActionValues",
     "Call",
     "ChangedArgs",
     "ChangedResult",
     "Comparison",
     "Definition",
     "Mixture",
+    "RolloutPolicy",
     "SimulationAECEnv",
     "SimulationEnv",
     "SimulationInterface",
@@ -73,7 +79,9 @@ __all__ = [
     "SimulationParallelEnv",
     "SimulationVectorEnv",
     "Trajectories",
+    "TreeSearchPolicy",
     "Variant",
+    "action_values",
     "aec_env",
     "attach_handler",
     "attached_handlers",

@@ -1,0 +1,122 @@
+"""Candidates for one decision, tried out on common futures in branches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..branching import branch
+from ..errors import BranchError, warn_user
+from ..many.spread import progress_bar
+from .lookahead import Lookahead
+from .players import player_of
+
+_KEY: Final = 0x706C616E
+"""Keeps the seeds of futures apart from others that are made of the episode's seed."""
+
+
+class Futures:
+    """The futures of a pending decision. The same number stands for the same future, whatever the candidate.
+
+    Attributes:
+        actions: The candidates.
+        endless: Whether there are as many futures as one likes; else there is the one that lies ahead.
+        returns: By candidate, what its tries have come to.
+    """
+
+    def __init__(self, env: Any, actions: Any, look: Lookahead, seed: int | None, *, legal: bool = False) -> None:
+        """Make ready.
+
+        Args:
+            env: The environment.
+            actions: The candidates, as ``Player.candidates`` takes them.
+            look: How they are tried out.
+            seed: Tells these futures of the decision from others; None: it has its own.
+            legal: Whether candidates that are masked now are left out.
+
+        Raises:
+            SimEnvError: Something in this cannot work; the leaf says what.
+        """
+        self._env, self._look = env, look
+        player = player_of(env, look.base)
+        look.check(player)
+        self.actions = player.candidates(actions, legal=legal)
+        self.returns: list[list[float]] = [[] for _ in self.actions]
+        self._entropy = [*player.entropy, _KEY, *(() if seed is None else (seed,))]
+        try:
+            player.view.check_reseed()
+            self.endless = True
+        except BranchError:
+            self.endless = False
+            warn_user(
+                f"{type(player.view.simulation).__name__} cannot draw anew what it leaves to chance: candidates are"
+                " tried out on the one future that lies ahead of it, and the planner foresees that. Give it a method"
+                " reseed(seed), which does nothing where nothing is left to chance, or make the environment with"
+                " global_rng=True if it draws from Python's or NumPy's global generators"
+            )
+
+    def run(self, candidates: Iterable[int], more: int, *, progress: bool = False) -> None:
+        """Try out candidates in their next futures.
+
+        Args:
+            candidates: Which ones.
+            more: In how many futures each; in one at most where there are no others.
+            progress: Whether to show a bar.
+
+        Raises:
+            BranchError: A branch has died, or has taken too long.
+            BaseException: What the model, a mapping or the base raises in a branch.
+        """
+        pairs = [
+            (candidate, future)
+            for candidate in candidates
+            for future in range(len(self.returns[candidate]), len(self.returns[candidate]) + more)
+            if self.endless or future == 0
+        ]
+        size = len(self.actions) if progress else max(1, len(pairs))
+        with progress_bar(len(pairs), "branch") if progress else nullcontext() as bar:
+            for start in range(0, len(pairs), size):
+                part = pairs[start : start + size]
+                self.play([((candidate,), future) for candidate, future in part])
+                if bar is not None:
+                    bar.update(len(part))
+
+    def play(self, tries: Sequence[tuple[tuple[int, ...], int]]) -> list[list[float]]:
+        """Try out candidates, and what is done after them.
+
+        Args:
+            tries: Of each the actions, by their places, and the future.
+
+        Returns:
+            Of each what ``Lookahead.play`` tells.
+        """
+        look, actions, seeds = self._look, self.actions, None
+        if self.endless:
+            numbers = self.seeds(1 + max((future for _, future in tries), default=0))
+            seeds = [numbers[future] for _, future in tries]
+        brought: list[list[float]] = branch(
+            self._env,
+            lambda twin, number: look.play(twin, [actions[place] for place in tries[number][0]]),
+            len(tries),
+            method=look.method,
+            seeds=seeds,
+            time_limit=look.time_limit,
+        )
+        for (places, _), rewards in zip(tries, brought, strict=True):
+            self.returns[places[0]].append(sum(rewards))
+        return brought
+
+    def seeds(self, number: int) -> list[int]:
+        """The seeds of the first futures."""
+        return [int(word) for word in np.random.SeedSequence(self._entropy).generate_state(number)]
+
+    def table(self) -> NDArray[np.float64]:
+        """The returns, in a row for each candidate; nan where it was not tried."""
+        table = np.full((len(self.returns), max(map(len, self.returns))), np.nan)
+        for row, values in enumerate(self.returns):
+            table[row, : len(values)] = values
+        return table

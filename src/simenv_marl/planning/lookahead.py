@@ -1,0 +1,134 @@
+"""How far and by what a future is valued, and what a candidate is worth in one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from math import isfinite
+from numbers import Real
+from typing import Any, Final
+
+from ..core.rng import process_kept
+from ..errors import OptionValueError, shown
+from ..simulation import RULE
+from .players import Player, player_of
+
+UNITS: Final = ("decision", "time")
+"""By what horizons and discounts count."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lookahead:
+    """How candidates are tried out: see ``action_values``, which has the same parameters."""
+
+    base: Any = RULE
+    futures: int = 16
+    horizon: float | None = None
+    horizon_by: str = "decision"
+    terminal_value: Callable[[Any], float] | None = None
+    discount: float = 1.0
+    discount_by: str = "decision"
+    method: str | None = None
+    time_limit: float = 600.0
+
+    def __post_init__(self) -> None:
+        for name in ("horizon_by", "discount_by"):
+            if getattr(self, name) not in UNITS:
+                raise OptionValueError(f'{name} must be "decision" or "time", not {shown(getattr(self, name))}')
+        if not is_count(self.futures):
+            raise OptionValueError(f"futures must be a positive integer, not {shown(self.futures)}")
+        horizon, timed = self.horizon, self.horizon_by == "time"
+        if horizon is not None and not (is_number(horizon) and horizon > 0 if timed else is_count(horizon)):
+            kind = "a time that is positive" if timed else "a number of decisions, 1 or more,"
+            raise OptionValueError(f"horizon must be {kind} or None, not {shown(horizon)}")
+        if not (is_number(self.discount) and 0 <= self.discount <= 1):
+            raise OptionValueError(f"discount must be a number from 0 to 1, not {shown(self.discount)}")
+        if self.terminal_value is not None and not callable(self.terminal_value):
+            raise OptionValueError(
+                f"terminal_value must be a callable of the environment, not {shown(self.terminal_value)}"
+            )
+
+    def check(self, player: Player) -> None:
+        """Make sure that a player can go by this.
+
+        Raises:
+            OptionValueError: It cannot.
+            UnknownAgentError: The base is one of an agent that there is not.
+        """
+        player.check_base()
+        if self._timed and player.episode.clock is None:
+            raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
+
+    @property
+    def _timed(self) -> bool:
+        """Whether the simulation's time is asked for."""
+        return "time" in (self.discount_by, self.horizon_by)
+
+    def play(self, env: Any, actions: Sequence[Any]) -> list[float]:
+        """In a branch: take actions, one after the other, and go on by the base.
+
+        Args:
+            env: The branch.
+            actions: The candidate, and what is tried out at the agent's decisions after it. Where one of these is
+                illegal by then, the base decides.
+
+        Returns:
+            What each decision of the agent has brought, discounted; what comes after the horizon is the last one's.
+        """
+        with _planning(), process_kept():
+            return self._play(player_of(env, self.base), actions)
+
+    def _play(self, player: Player, actions: Sequence[Any]) -> list[float]:
+        player.begin()
+        timed, action = self._timed, actions[0]
+        brought: list[float] = []
+        weight, began = 1.0, player.now() if timed else 0.0
+        now = began
+        while True:
+            reward, acted = player.step(action)
+            if acted:
+                weight = self.discount ** (now - began if self.discount_by == "time" else len(brought))
+                brought.append(0.0)
+            brought[-1] += weight * reward
+            if player.over:
+                return brought
+            decided, now = len(brought), player.now() if timed else 0.0
+            if self.horizon is not None and (now - began if self.horizon_by == "time" else decided) >= self.horizon:
+                break
+            planned = decided < len(actions) and player.allows(actions[decided])
+            action = actions[decided] if planned else player.decide()
+        if self.terminal_value is not None:
+            rest = self.terminal_value(player.env)
+            if not is_number(rest):
+                raise OptionValueError(f"terminal_value must return a finite number, not {shown(rest)}")
+            brought[-1] += float(rest) * self.discount ** (now - began if self.discount_by == "time" else decided)
+        return brought
+
+
+def is_count(value: Any) -> bool:
+    """Whether something is a positive integer."""
+    return hasattr(value, "__index__") and not isinstance(value, bool) and value >= 1
+
+
+def is_number(value: Any) -> bool:
+    """Whether something is one finite number."""
+    return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
+
+
+_deep: ContextVar[bool] = ContextVar("simenv_marl.planning", default=False)
+
+
+def within_a_branch() -> bool:
+    """Whether this runs in a branch in which a candidate is tried out: planners are their own bases there."""
+    return _deep.get()
+
+
+@contextmanager
+def _planning() -> Iterator[None]:
+    token = _deep.set(True)
+    try:
+        yield
+    finally:
+        _deep.reset(token)

@@ -1,0 +1,373 @@
+"""How the agent that decides goes through a branch, in each view: its candidate first, and then its base.
+
+An environment may be in wrappers. Actions of the agent go through them, and observations and rewards are theirs.
+``RULE``, which is an action of the bare environment alone, is put in the place of what the wrappers have let through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+from zlib import crc32
+
+from gymnasium import spaces
+
+from ..core.actions import ILLEGAL, action_check, mask_allows
+from ..core.agent import Agent
+from ..core.asking import AskingPolicy
+from ..core.roster import two_arguments
+from ..core.spaces import duplicate
+from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv, View
+from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, ViewError, shown
+from ..simulation import RULE
+
+
+class Player:
+    """The agent whose decision is pending.
+
+    Attributes:
+        env: The environment, in wrappers or not.
+        view: The environment without them.
+        episode: Its episode.
+        agent: The name of the agent.
+        own: What the episode knows of it.
+        over: Whether the agent's episode has ended.
+    """
+
+    def __init__(self, env: Any, base: Any) -> None:
+        """Take the agent's place in an environment whose decision is pending.
+
+        Args:
+            env: The environment.
+            base: Who decides after the candidate: ``RULE``, a policy of the agent, or policies by agent.
+        """
+        self.env, self.view, self.base = env, env.unwrapped, base
+        self.episode = self.view.episode
+        self.own: Agent = self.episode.pending or self.episode.consulted
+        self.agent = self.own.name
+        self.over = False
+        self._policies: dict[str, Callable[..., Any]] = {}
+        self._seen: Any = None  # the observation and the info that the latest step has brought
+
+    # -- before anything moves --------------------------------------------------------------------
+
+    @property
+    def space(self) -> spaces.Space[Any]:
+        """The action space, as the wrappers have it."""
+        space: spaces.Space[Any] = self.env.action_space
+        return space
+
+    def candidates(self, actions: Any, *, legal: bool = False) -> list[Any]:
+        """The candidates for the pending decision.
+
+        Args:
+            actions: The candidates; None: all legal actions of a ``Discrete``.
+            legal: Whether those that are masked now are left out, and no error.
+
+        Raises:
+            OptionValueError: They are none.
+            InvalidActionError: One of them is not legal.
+        """
+        if actions is None:
+            space = self.space
+            if not isinstance(space, spaces.Discrete):
+                raise OptionValueError(f"actions=None means all legal ones of a Discrete; of {shown(space)}, list some")
+            actions, legal = range(int(space.start), int(space.start + space.n)), True
+        try:
+            listed = [] if isinstance(actions, (str, Mapping)) else list(actions)
+        except TypeError:
+            listed = []
+        if not listed:
+            raise OptionValueError(f"actions must be a list of candidates, not {shown(actions)}")
+        found = [action for action in listed if not (legal and self._is_masked(action))]
+        if not found:
+            raise InvalidActionError(f"all candidates of {self.agent!r} are masked; its mask is {shown(self.own.mask)}")
+        for action in found:
+            if action is not RULE:
+                self._check(action)
+        return found
+
+    def _check(self, action: Any) -> None:
+        if self.env is self.view:
+            self.own.point.checked(action, self.agent, self.own.mask)
+        elif action_check(self.space)(action) is ILLEGAL:
+            raise InvalidActionError(f"the action {shown(action)} of {self.agent!r} is not in {shown(self.space)}")
+        elif self._is_masked(action):
+            raise InvalidActionError(f"the action {shown(action)} is masked; the mask is {shown(self.own.mask)}")
+
+    def _is_masked(self, action: Any) -> bool:
+        """Whether a mask, which wrappers may have made that of another space, forbids an action."""
+        space, mask = self.own.point.definition.action_space, self.own.mask
+        if mask is None or action is RULE or self.space != space:
+            return False
+        known = action_check(space)(action)
+        return known is not ILLEGAL and not mask_allows(space, mask, known)
+
+    def check_base(self) -> None:
+        """Make sure that the base can be asked.
+
+        Raises:
+            OptionValueError: It is no policy.
+            UnknownAgentError: It is one of an agent that there is not.
+        """
+        base = self.base
+        for policy in base.values() if isinstance(base, Mapping) else [base]:
+            if policy is not RULE and not callable(policy):
+                raise OptionValueError(f"base must be RULE, a policy, or policies by agent, not {shown(base)}")
+        for name in base if isinstance(base, Mapping) else ():
+            if not self._may_be(name):
+                known = [*self.episode.agents, *self.episode.answered]
+                raise UnknownAgentError(f"base names {shown(name)}, which is no agent here; these are: {known}")
+
+    def _may_be(self, name: Any) -> bool:
+        """Whether there is an agent of that name, or may be one."""
+        found: bool = self.episode.may_be(name)
+        return found
+
+    @property
+    def entropy(self) -> list[int]:
+        """What tells this decision from all others, however the episode is played."""
+        episode = self.episode
+        number = self.own.consultations - 1 if episode.consulted is self.own else episode.turns
+        return [episode.seed, number, crc32(self.agent.encode(errors="surrogatepass"))]
+
+    # -- in a branch ------------------------------------------------------------------------------
+
+    def now(self) -> float:
+        """The simulation's time."""
+        return float(self.episode.clock())
+
+    def begin(self) -> None:
+        """Make ready for what is done in a branch."""
+        self.view.stop_showing()
+
+    def step(self, action: Any) -> tuple[float, bool]:
+        """Take an action, and go on to where the agent is to say what it does next.
+
+        Returns:
+            The reward that this has brought, and whether the agent has decided by that action.
+        """
+        observation, reward, terminated, truncated, info = self._through(action)
+        self._seen, self.over = (observation, info), terminated or truncated
+        return float(reward), True
+
+    def allows(self, action: Any) -> bool:
+        """Whether an action that was legal at another decision is so now."""
+        return not self._is_masked(action)
+
+    def decide(self) -> Any:
+        """What the base says the agent is to do."""
+        return self._ask(self.agent, *(self._seen or self._observed(self.own)))
+
+    def _observed(self, agent: Agent) -> tuple[Any, dict[str, Any]]:
+        """What an agent has observed last."""
+        seen = agent.point.blank() if agent.observation is None else duplicate(agent.observation)
+        return seen, dict(agent.info)
+
+    def _ask(self, name: str, observation: Any, info: Any) -> Any:
+        """What an agent's base answers."""
+        base = self.base
+        if isinstance(base, Mapping):
+            base = base.get(name, RULE)
+        elif name != self.agent:
+            return RULE
+        if base is RULE:
+            return RULE
+        policy = self._policies.get(name)
+        if policy is None:
+            policy = self._policies[name] = two_arguments(base)
+        if isinstance(policy, AskingPolicy):
+            return policy.answer(observation, info, self.env)
+        return policy(observation, info)
+
+    def _through(self, action: Any, *, replaced: bool | None = None) -> Any:
+        """Step through the wrappers.
+
+        Args:
+            action: The action.
+            replaced: Whether it is to reach the bare environment as it is; None: if it is ``RULE``.
+        """
+        if self.env is self.view or not (action is RULE if replaced is None else replaced):
+            return self.env.step(action)
+        return self._replacing(lambda given: action, self.space.sample())
+
+    def _replacing(self, replace: Callable[[Any], Any], placeholder: Any) -> Any:
+        """Step through the wrappers with a placeholder, whose place something else takes behind them."""
+        view, step = self.view, type(self.view).step
+        vars(view)["step"] = lambda given: step(view, replace(given))
+        try:
+            return self.env.step(placeholder)
+        finally:
+            del vars(view)["step"]
+
+
+class SinglePlayer(Player):
+    """The agent of a single view. All others are led in the simulation."""
+
+    def begin(self) -> None:
+        """Make ready for what is done in a branch."""
+        super().begin()
+        if isinstance(self.base, Mapping):
+            self.episode.leave_to(self.base)
+
+
+class JointPlayer(Player):
+    """The one agent of a joint view, of which the agents of the roster are parts."""
+
+    def __init__(self, env: Any, base: Any) -> None:
+        super().__init__(env, base)
+        self.agent = "all agents"
+
+    def _check(self, action: Any) -> None:
+        if self.env is self.view:
+            self.episode.check(self.view.joint.actions(self.episode, action))
+        else:
+            super()._check(action)
+
+    def _is_masked(self, action: Any) -> bool:
+        return False
+
+    def allows(self, action: Any) -> bool:
+        """Whether an action that was legal at another decision is so now."""
+        try:
+            self._check(action)
+        except InvalidActionError:
+            return False
+        return True
+
+    def check_base(self) -> None:
+        """Make sure that the base can be asked.
+
+        Raises:
+            OptionValueError, UnknownAgentError: It cannot.
+        """
+        super().check_base()
+        if isinstance(self.base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
+            raise OptionValueError("a base by agent needs a joint view without flatten=True; give one policy of all")
+
+    def _may_be(self, name: Any) -> bool:
+        return name in self.view.joint.roster
+
+    def decide(self) -> Any:
+        """What the base says all agents are to do."""
+        if not isinstance(self.base, Mapping):
+            seen: Any = self._seen or (self.view.joint.observe(self.episode), {})
+            return self._ask(self.agent, *seen)
+        agents = self.episode.agents
+        return {
+            name: self._ask(name, *self._observed(agents[name])) if name in agents else RULE
+            for name in self.view.joint.roster
+        }
+
+    def step(self, action: Any) -> tuple[float, bool]:
+        """Play a round."""
+        parts = action.values() if isinstance(action, Mapping) else [action]
+        observation, reward, terminated, truncated, info = self._through(
+            action, replaced=any(part is RULE for part in parts)
+        )
+        self._seen, self.over = (observation, info), terminated or truncated
+        return float(reward), True
+
+
+class AECPlayer(Player):
+    """An agent of an AEC view."""
+
+    def __init__(self, env: Any, base: Any) -> None:
+        super().__init__(env, base)
+        if self.view.agent_selection != self.agent:
+            raise EpisodeOverError(
+                f"{self.view.agent_selection!r} is selected, whose episode has ended: take its step(None) before the"
+                f" decision of {self.agent!r} is planned"
+            )
+
+    @property
+    def space(self) -> spaces.Space[Any]:
+        """The action space, as the wrappers have it."""
+        space: spaces.Space[Any] = self.env.action_space(self.env.agent_selection)
+        return space
+
+    def step(self, action: Any) -> tuple[float, bool]:
+        """Take an action, and have all others decide, until the agent is selected once more."""
+        env = self.env
+        self._through(action)
+        while env.agents:
+            name = env.agent_selection
+            if name == self.agent:
+                _, reward, terminated, truncated, _ = env.last(observe=False)
+                self._seen, self.over = None, terminated or truncated
+                return float(reward), True
+            ended = env.terminations[name] or env.truncations[name]
+            self._through(None if ended else self._decision_of(name))
+        self.over = True
+        return 0.0, True
+
+    def decide(self) -> Any:
+        """What the base says the agent is to do."""
+        return self._decision_of(self.agent)
+
+    def _decision_of(self, name: str) -> Any:
+        """What the base of the selected agent answers."""
+        if self.base is RULE or (name != self.agent and not isinstance(self.base, Mapping)):
+            return RULE
+        observation, _, _, _, info = self.env.last()
+        return self._ask(name, observation, info)
+
+
+class ParallelPlayer(Player):
+    """An agent of a parallel view, whose decisions are parts of rounds."""
+
+    def __init__(self, env: Any, base: Any) -> None:
+        super().__init__(env, base)
+        self._seen = {}
+
+    @property
+    def space(self) -> spaces.Space[Any]:
+        """The action space, as the wrappers have it."""
+        space: spaces.Space[Any] = self.env.action_space(self.agent)
+        return space
+
+    def step(self, action: Any) -> tuple[float, bool]:
+        """Play a round."""
+        agents = self.episode.agents
+        answers = {name: action if name == self.agent else self._decision_of(name) for name in agents}
+        ruled = {name: answer for name, answer in answers.items() if answer is RULE}
+        if ruled and self.env is not self.view:
+            placeholders = answers | {name: self.env.action_space(name).sample() for name in ruled}
+            results = self._replacing(lambda given: {**given, **ruled}, placeholders)
+        else:
+            results = self.env.step(answers)
+        observations, rewards, terminations, truncations, infos = results
+        self._seen = {name: (observations[name], infos.get(name, {})) for name in observations}
+        over = terminations.get(self.agent, True) or truncations.get(self.agent, True)
+        self.over = bool(over or self.own.ended)  # padded, those who have ended stay
+        return float(rewards.get(self.agent, 0.0)), self.own.acted
+
+    def decide(self) -> Any:
+        """What the base says the agent is to do."""
+        return self._decision_of(self.agent)
+
+    def _decision_of(self, name: str) -> Any:
+        return self._ask(name, *(self._seen.get(name) or self._observed(self.episode.agents[name])))
+
+
+PLAYERS: dict[type, type[Player]] = {
+    SimulationAECEnv: AECPlayer,
+    SimulationParallelEnv: ParallelPlayer,
+    SimulationJointEnv: JointPlayer,
+    SimulationEnv: SinglePlayer,
+}
+"""By the class of a view."""
+
+
+def player_of(env: Any, base: Any) -> Player:
+    """The agent whose decision is pending.
+
+    Raises:
+        ViewError: It is no environment of one simulation.
+        ResetNeededError, ReentrancyError: No decision is pending.
+    """
+    view = getattr(env, "unwrapped", env)
+    if not isinstance(view, View):
+        raise ViewError(f"only in environments of one simulation actions can be tried out; {shown(env)} is none")
+    view.check_pending()
+    return next(made for kind, made in PLAYERS.items() if isinstance(view, kind))(env, base)

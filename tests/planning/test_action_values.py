@@ -1,0 +1,584 @@
+"""What candidate actions are worth: the same as by a reference that goes through the model by itself."""
+
+import random
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit, TransformAction, TransformReward
+from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, BaseParallelWrapper, OrderEnforcingWrapper
+
+from simenv_marl import (
+    RULE,
+    BranchError,
+    EpisodeOverError,
+    InvalidActionError,
+    NotResetError,
+    OptionValueError,
+    SimulationInterface,
+    UnknownAgentError,
+    ViewError,
+    action_values,
+    aec_env,
+    difference,
+    joint_env,
+    parallel_env,
+    single_env,
+    vector_env,
+)
+from simenv_marl.planning.futures import Futures
+from simenv_marl.planning.lookahead import Lookahead
+from tests.conftest import DRIVERS
+from tests.worlds.duels import LEFT, SPACE, Duel, Unseeded, points, worth
+from tests.worlds.models import define
+
+METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
+VIEWS = ("aec", "parallel", "single", "agent")
+
+
+def made(view, model=Duel, **options):
+    """An environment whose pending decision is that of the one on the left, reset."""
+    if view == "single":
+        env = single_env(model, {LEFT: points()[LEFT]}, **options)
+    elif view == "agent":
+        env = single_env(model, points(), agent="left", **options)
+    else:
+        env = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env}[view](model, points(), **options)
+    env.reset(seed=5)
+    return env
+
+
+def futures_of(env, number, seed=None):
+    """The seeds of an environment's futures."""
+    return Futures(env, [RULE], Lookahead(), seed).seeds(number)
+
+
+def expected(env, agent, actions=(0, 1, 2), number=3, **given):
+    """Of each action what it is worth in each future."""
+    return np.array(
+        [[worth(agent, action, future, **given) for future in futures_of(env, number)] for action in actions]
+    )
+
+
+def greedy(observation):
+    """A base: it depends on what it sees."""
+    return int(observation[1]) % 3
+
+
+@METHODS
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("view", VIEWS)
+def test_every_view_and_driver(view, driver, method):
+    if driver == "thread" and method == "fork":
+        method = None  # which is then a replay
+    env = made(view, driver=driver)
+    told = action_values(env, futures=3, method=method)
+    table = expected(env, "left")
+    assert told.actions == (0, 1, 2)
+    assert told.returns == pytest.approx(table)
+    assert told.means == pytest.approx(table.mean(axis=1))
+    assert told.standard_errors == pytest.approx(table.std(axis=1, ddof=1) / np.sqrt(3))
+    assert told.counts.tolist() == [3, 3, 3]
+    assert told.best == 2
+    env.close()
+
+
+@METHODS
+def test_joint_views_sum_up(method):
+    env = made("joint")
+    actions = [{"left": 2, "right": RULE}, RULE, {"left": 0, "right": 1}]
+    told = action_values(env, actions, futures=3, method=method)
+    assert told.returns == pytest.approx(expected(env, "left", (2, 1, 0), both=True))
+    assert told.best is actions[2]
+
+
+@pytest.mark.parametrize("view", ["aec", "parallel"])
+def test_a_decision_in_mid_episode(view):
+    env = made(view)
+    for agent in ("left", "right", "left"):
+        env.step(1 if view == "aec" else {agent: 1})
+    told = action_values(env, futures=3, horizon=2)
+    assert told.returns == pytest.approx(expected(env, "right", at=3, horizon=2))
+    assert told.best == 2
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_the_environment_does_not_move(view):
+    env, other = made(view), made(view)
+    action_values(env, futures=2)
+    action_values(env, futures=2, method="replay")
+
+    def go_on(env):
+        if view == "parallel":
+            return [repr(env.step(dict.fromkeys(env.agents, 2))) for _ in range(3)], env.simulation.value
+        return [repr(env.step(2)) for _ in range(3)], env.simulation.value
+
+    assert go_on(env) == go_on(other)
+
+
+@pytest.mark.parametrize("view", [*VIEWS, "joint"])
+def test_the_horizon_counts_decisions_of_the_agent(view):
+    env, agent = made(view), "left"
+    actions = [0, 2] if view != "joint" else [{"left": 0, "right": 1}, {"left": 2, "right": 1}]
+    for horizon in (1, 2, 4, 6, 7):
+        table = expected(env, agent, (0, 2), horizon=horizon, both=view == "joint")
+        assert action_values(env, actions, futures=3, horizon=horizon).returns == pytest.approx(table)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_horizon_of_one_is_the_reward_of_the_action(view):
+    env = made(view)
+    values = action_values(env, horizon=1, futures=4)
+    step = env.step({"left": 2, "right": RULE} if view == "parallel" else 2)
+    assert step is None or values.means[2] != pytest.approx(step[1]["left"] if view == "parallel" else step[1])
+    env = made(view, Unseeded)
+    with pytest.warns(UserWarning, match="foresees"):
+        values = action_values(env, horizon=1)
+    if view == "aec":
+        env.step(2)
+        env.step(RULE)
+        assert values.means[2] == env.last()[1]
+    else:
+        rewards = env.step({"left": 2, "right": RULE} if view == "parallel" else 2)[1]
+        assert values.means[2] == (rewards["left"] if view == "parallel" else rewards)
+
+
+@METHODS
+@pytest.mark.parametrize("view", ["aec", "single"])
+def test_a_value_at_the_horizon(view, method):
+    env = made(view)
+    told = action_values(
+        env, futures=3, horizon=2, discount=0.5, method=method,
+        terminal_value=lambda env: 10 + env.unwrapped.simulation.value,
+    )  # fmt: skip
+    table = expected(env, "left", horizon=2, discount=0.5, terminal=lambda value: 10 + value)
+    assert told.returns == pytest.approx(table)
+
+
+def test_no_value_at_a_horizon_that_is_the_end():
+    env = made("single")
+    told = action_values(env, futures=2, horizon=6, terminal_value=lambda env: 1e6)
+    assert told.means.max() < 1e3
+    told = action_values(env, futures=2, horizon=5, terminal_value=lambda env: 1e6)
+    assert told.means.min() > 1e5
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("timed", [False, True])
+def test_discounts(view, timed):
+    env = made(view)
+    told = action_values(env, futures=3, discount=0.8, discount_by="time" if timed else "decision")
+    assert told.returns == pytest.approx(expected(env, "left", discount=0.8, timed=timed))
+    told = action_values(env, futures=3, discount=0)
+    assert told.returns == pytest.approx(expected(env, "left", horizon=1))
+
+
+def test_a_horizon_of_time():
+    env = made("single")
+    for horizon in (0.1, 0.5, 2.0, 5, 1e9):
+        told = action_values(env, futures=3, horizon=horizon, horizon_by="time", terminal_value=lambda env: 7.0)
+        table = expected(env, "left", horizon=horizon, timed_horizon=True, terminal=lambda value: 7.0)
+        assert told.returns == pytest.approx(table)
+
+
+@METHODS
+@pytest.mark.parametrize("view", VIEWS)
+def test_the_base_is_a_policy_of_the_agent(view, method):
+    env = made(view)
+    told = action_values(env, futures=3, base=greedy, method=method)
+    assert told.returns == pytest.approx(expected(env, "left", bases={"left": greedy}))
+    told = action_values(env, futures=3, base=lambda observation, info: info["time"] > 2, method=method)
+    assert not np.allclose(told.returns, expected(env, "left"))
+
+
+@METHODS
+@pytest.mark.parametrize("view", ["aec", "parallel"])
+def test_the_base_is_policies_by_agent(view, method):
+    env = made(view)
+    bases = {"left": greedy, "right": lambda observation: 2 - int(observation[0]) % 3}
+    told = action_values(env, futures=3, base=bases, method=method)
+    assert told.returns == pytest.approx(expected(env, "left", bases=bases))
+    told = action_values(env, futures=3, base=bases | {"left": RULE}, method=method)
+    assert told.returns == pytest.approx(expected(env, "left", bases={"right": bases["right"]}))
+
+
+def test_bases_of_the_joint_view():
+    env = made("joint")
+    bases = {"left": greedy, "right": lambda observation: 2 - int(observation[0]) % 3}
+    first = {"left": 2, "right": 1}
+    told = action_values(env, [first], futures=3, base={"left": greedy})
+    assert told.returns == pytest.approx(expected(env, "left", (2,), both=True, bases={"left": greedy}))
+    # A round: the one on the right decides by what was seen before the other one has moved.
+    whole = action_values(env, [first], futures=3, base=lambda seen: {n: bases[n](seen[n]) for n in bases})
+    parts = action_values(env, [first], futures=3, base=bases)
+    assert whole.returns == pytest.approx(parts.returns)
+    with pytest.raises(OptionValueError, match="without flatten"):
+        action_values(made("joint", flatten=True), [[1, 1]], base=bases)
+
+
+def test_policies_of_the_environment_stay():
+    stays = {"right": lambda observation: 2}
+    env = made("aec", policies=stays)
+    for base in (RULE, {"left": RULE, "right": lambda observation: 0}):
+        told = action_values(env, futures=3, base=base)
+        assert told.returns == pytest.approx(expected(env, "left", bases=stays))
+
+
+class Herd:
+    """Two beings that count up together, each in its turn."""
+
+    def reset(self, seed=None):
+        self.sum, self.moves = 0, 0
+
+    def reseed(self, seed):
+        pass
+
+    def run(self):
+        for self.moves in range(6):
+            self.sum += self.graze("one" if self.moves % 2 == 0 else "other")
+
+    def graze(self, name):
+        return 1
+
+
+GRAZING = {
+    f"{__name__}.Herd.graze": define(
+        agent=lambda herd, name: name,
+        observation_space_mapping=lambda herd, name: [herd.moves, herd.sum],
+        reward_mapping=difference(lambda herd, name: float(herd.sum)),
+    )
+}
+
+
+@METHODS
+def test_others_of_a_single_view_follow_the_base_by_agent(method):
+    env = single_env(Herd, GRAZING, agent="one")
+    env.reset(seed=1)
+    assert action_values(env, [0, 3], futures=1, method=method).means.tolist() == [5.0, 8.0]
+    told = action_values(env, [0, 3], futures=1, method=method, base={"other": lambda seen: int(seen[0])})
+    assert told.means.tolist() == [2 + 1 + 3 + 5, 2 + 4 + 3 + 5]
+    with pytest.raises(UnknownAgentError, match="'right'"):  # at a point that is not the environment's
+        action_values(made("agent"), base={"right": RULE})
+    declared = single_env(Herd, GRAZING, agent="one", possible_agents=["one", "other"])
+    declared.reset(seed=1)
+    with pytest.raises(UnknownAgentError, match="'third'"):
+        action_values(declared, base={"third": RULE})
+
+
+class Mortal(Duel):
+    ceiling = 3.0
+
+
+@METHODS
+@pytest.mark.parametrize("view", ["aec", "parallel", "single"])
+def test_agents_that_die_on_the_way(view, method):
+    env = made(view, Mortal)
+    told = action_values(env, futures=8, base=lambda observation: 2, terminal_value=lambda env: 1e6, method=method)
+    table = expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2})
+    assert told.returns == pytest.approx(table)
+    endless = expected(env, "left", number=8, bases={"left": lambda seen: 2})
+    assert not np.allclose(table, endless)  # the last reward counts, and none after it
+    told = action_values(env, futures=8, horizon=5, base=lambda observation: 2, terminal_value=lambda env: 1e6)
+    assert told.means.max() < 1e3
+
+
+@pytest.mark.parametrize("view", ["aec", "parallel"])
+def test_agents_that_die_and_stay_for_the_learner(view):
+    env = made(view, Mortal, padded=True)
+    told = action_values(env, futures=8, base=lambda observation: 2)
+    assert told.returns == pytest.approx(expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2}))
+
+
+# -- common futures -------------------------------------------------------------------------------
+
+
+@METHODS
+def test_a_candidate_that_changes_nothing_has_the_same_values(method):
+    env = made("single")
+    told = action_values(env, [1, RULE, 1, 2], futures=4, method=method)
+    assert told.returns[0].tolist() == told.returns[1].tolist() == told.returns[2].tolist()
+    assert len(set(told.returns[0])) == 4
+    assert told.actions == (1, RULE, 1, 2)
+
+
+def test_futures_are_those_of_the_decision():
+    env, other = made("single"), made("aec")
+    first = action_values(env, futures=4)
+    assert action_values(env, futures=4).returns.tolist() == first.returns.tolist()
+    assert action_values(env, futures=6).returns[:, :4].tolist() == first.returns.tolist()
+    assert action_values(env, futures=4, seed=1).returns.tolist() != first.returns.tolist()
+    assert (
+        action_values(env, futures=4, seed=1).returns.tolist() == action_values(env, seed=1, futures=4).returns.tolist()
+    )
+    assert action_values(other, futures=4).returns == pytest.approx(first.returns)
+    seeds = futures_of(env, 4)
+    env.step(1)
+    assert not set(seeds) & set(futures_of(env, 4))
+    env.reset(seed=6)
+    assert not set(seeds) & set(futures_of(env, 4))
+
+
+class Global(Duel):
+    """Its chance is that of Python's global generator."""
+
+    reseed = None
+
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.random = random
+
+
+@METHODS
+def test_global_generators_are_common_too(method):
+    env = made("single", Global, global_rng=True)
+    state = random.getstate()
+    told = action_values(env, [1, RULE, 2], futures=3, method=method)
+    assert told.returns[0].tolist() == told.returns[1].tolist()
+    assert len(set(told.returns[0])) == 3
+    assert random.getstate() == state
+
+
+@METHODS
+def test_a_base_that_draws_has_the_same_noise_for_all_candidates(method):
+    def draws(observation):
+        return random.randrange(3) if observation[0] % 2 else int(np.random.randint(3))
+
+    env = made("single")
+    random.seed(1)
+    state = random.getstate(), np.random.get_state()[1].tolist()
+    told = action_values(env, [1, RULE, 2], futures=4, base=draws, method=method)
+    assert told.returns[0].tolist() == told.returns[1].tolist()
+    assert (random.getstate(), np.random.get_state()[1].tolist()) == state
+    random.seed(2)
+    np.random.seed(2)
+    assert (
+        action_values(env, [1, RULE, 2], futures=4, base=draws, method=method).returns.tolist() == told.returns.tolist()
+    )
+    assert not np.allclose(told.returns, action_values(env, [1, RULE, 2], futures=4, method=method).returns)
+
+
+@METHODS
+def test_in_the_one_exact_future_too_a_base_has_the_same_noise(method):
+    env = made("single", Unseeded)
+    state = random.getstate()
+    with pytest.warns(UserWarning, match="foresees"):
+        told = action_values(env, [1, RULE], base=lambda observation: random.randrange(3), method=method)
+    assert told.means[0] == told.means[1]
+    assert random.getstate() == state
+
+
+@METHODS
+@pytest.mark.parametrize("view", VIEWS)
+def test_one_exact_future_and_a_warning(view, method):
+    env = made(view, Unseeded)
+    with pytest.warns(UserWarning, match="Unseeded cannot draw anew .* foresees") as caught:
+        told = action_values(env, futures=9, method=method)
+    assert caught[0].filename == __file__
+    assert told.counts.tolist() == [1, 1, 1]
+    assert np.isnan(told.standard_errors).all()
+    assert told.returns == pytest.approx(np.array([[worth("left", action, None)] for action in range(3)]))
+
+
+# -- wrappers -------------------------------------------------------------------------------------
+
+
+class Doubled(BaseParallelWrapper):
+    def step(self, actions):
+        observations, rewards, *rest = self.env.step(dict(actions))
+        return observations, {agent: 2 * reward for agent, reward in rewards.items()}, *rest
+
+
+def test_wrappers_of_single_views():
+    env = made("single")
+    table = expected(env, "left", horizon=3)
+    limited = TimeLimit(env, 3)
+    limited.reset(seed=5)
+    told = action_values(limited, futures=3, terminal_value=lambda env: 1e6)
+    assert told.returns == pytest.approx(table)
+    wrapped = TransformReward(TransformAction(env, lambda action: 2 - action, spaces.Discrete(3)), lambda r: 10 * r)
+    wrapped.reset(seed=5)
+    told = action_values(wrapped, futures=3, horizon=3)  # with RULE as base, which no wrapper is to meet
+    assert told.returns == pytest.approx(10 * table[::-1])
+    assert told.best == 0
+    told = action_values(wrapped, futures=3, horizon=3, base=lambda observation: 2)
+    assert told.returns == pytest.approx(10 * expected(env, "left", horizon=3, bases={"left": lambda seen: 0})[::-1])
+
+
+@METHODS
+def test_wrappers_of_pettingzoo(method):
+    env = OrderEnforcingWrapper(AssertOutOfBoundsWrapper(made("aec")))
+    env.reset(seed=5)
+    told = action_values(env, futures=3, method=method)
+    assert told.returns == pytest.approx(expected(env, "left"))
+    env = Doubled(made("parallel"))
+    env.reset(seed=5)
+    told = action_values(env, [RULE, 2], futures=3, method=method)
+    assert told.returns == pytest.approx(2 * expected(env, "left", (1, 2)))
+
+
+def test_wrappers_of_the_joint_view():
+    env = TransformReward(made("joint"), lambda reward: -reward)
+    env.reset(seed=5)
+    actions = [{"left": 2, "right": 1}, {"left": RULE, "right": 1}]
+    with pytest.raises(InvalidActionError, match="not in"):
+        action_values(env, actions)
+    told = action_values(env, [actions[0], RULE], futures=3)
+    assert told.returns == pytest.approx(-expected(env, "left", (2, 1), both=True))
+
+
+# -- what cannot be -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "match"),
+    [
+        ({"actions": [0, 3]}, InvalidActionError, "3 of 'left' is not in its action space"),
+        ({"actions": []}, OptionValueError, "list of candidates"),
+        ({"actions": "12"}, OptionValueError, "list of candidates"),
+        ({"actions": 1}, OptionValueError, "list of candidates"),
+        ({"futures": 0}, OptionValueError, "futures"),
+        ({"futures": 2.5}, OptionValueError, "futures"),
+        ({"futures": True}, OptionValueError, "futures"),
+        ({"horizon": 0}, OptionValueError, "horizon"),
+        ({"horizon": 1.5}, OptionValueError, "horizon"),
+        ({"horizon": 0.0, "horizon_by": "time"}, OptionValueError, "horizon"),
+        ({"horizon_by": "days"}, OptionValueError, "horizon_by"),
+        ({"discount_by": "step"}, OptionValueError, "discount_by"),
+        ({"discount": 1.1}, OptionValueError, "discount"),
+        ({"discount": float("nan")}, OptionValueError, "discount"),
+        ({"terminal_value": 3.0}, OptionValueError, "terminal_value"),
+        ({"terminal_value": lambda env: None, "horizon": 1}, OptionValueError, "finite number"),
+        ({"base": 1}, OptionValueError, "base must be"),
+        ({"base": {"left": 1}}, OptionValueError, "base must be"),
+        ({"base": {"middle": RULE}}, UnknownAgentError, "'middle'"),
+        ({"base": lambda observation: 7}, InvalidActionError, "7"),
+        ({"seed": -1}, OptionValueError, "seed"),
+        ({"method": "spoon"}, OptionValueError, "method"),
+    ],
+)
+@pytest.mark.parametrize("view", ["aec", "parallel", "single"])
+def test_what_cannot_be(view, given, error, match):
+    env = made(view)
+    with pytest.raises(error, match=match):
+        action_values(env, **{"futures": 1} | given)
+    assert action_values(env, futures=1).best == 2  # nothing has come of it
+
+
+def test_no_decision_is_pending():
+    env = single_env(Duel, {LEFT: points()[LEFT]})
+    with pytest.raises(NotResetError):
+        action_values(env)
+    env.reset(seed=1)
+    while not env.step(1)[2]:
+        pass
+    with pytest.raises(EpisodeOverError):
+        action_values(env)
+    env = made("aec", Mortal)
+    while env.agent_selection == "right" or not env.terminations["left"]:
+        env.step(2)
+    with pytest.raises(EpisodeOverError, match=r"step\(None\)"):
+        action_values(env)
+    env.step(None)
+    assert action_values(env, futures=2).best == 2
+    for other in (vector_env(Duel, {LEFT: points()[LEFT]}, num_envs=2), Duel()):
+        with pytest.raises(ViewError, match="one simulation"):
+            action_values(other)
+
+
+def test_candidates_must_be_listed_unless_they_are_discrete():
+    point = define(action_space=spaces.Box(0, 2, (1,), np.float64), action_space_mapping=np.sum, agent="left",
+                   observation_space=SPACE, observation_space_mapping=lambda duel: [duel.turn, duel.value],
+                   reward_mapping=lambda duel: duel.value)  # fmt: skip
+    env = single_env(Duel, {LEFT: point})
+    env.reset(seed=5)
+    with pytest.raises(OptionValueError, match="Discrete"):
+        action_values(env)
+    assert action_values(env, np.array([[0.0], [2.0], [1.0]]), futures=2).best.tolist() == [2.0]
+    with pytest.raises(OptionValueError, match="Discrete"):
+        action_values(made("joint"))
+
+
+def masked(**options):
+    given = points(action_mask_mapping=lambda duel: [1, 1, duel.turn % 2])
+    env = single_env(Duel, {LEFT: given[LEFT]}, **options)
+    env.reset(seed=5)
+    return env
+
+
+def test_masked_candidates():
+    env = masked()
+    assert action_values(env, futures=2).actions == (0, 1)
+    with pytest.raises(InvalidActionError, match="masked"):
+        action_values(env, [1, 2])
+    wrapped = TransformReward(env, float)
+    wrapped.reset(seed=5)
+    assert action_values(wrapped, futures=2).actions == (0, 1)
+    with pytest.raises(InvalidActionError, match="masked"):
+        action_values(wrapped, [1, 2])
+
+
+class Timeless(SimulationInterface):
+    def reset(self, seed=None):
+        self.left = 3
+
+    def reseed(self, seed):
+        pass
+
+    def run(self):
+        while self.left:
+            self.left -= self.choose()
+
+    @define(action_space=spaces.Discrete(3, start=1), reward_mapping=lambda model: -1.0)
+    def choose(self):
+        return 1
+
+
+def test_time_needs_a_clock():
+    env = single_env(Timeless, Timeless.choose)
+    env.reset(seed=1)
+    assert action_values(env, futures=2).actions == (1, 2, 3)
+    assert action_values(env, futures=2).means.tolist() == [-3.0, -2.0, -1.0]
+    for given in ({"discount_by": "time"}, {"horizon_by": "time", "horizon": 1}):
+        with pytest.raises(OptionValueError, match=r"time\(\)"):
+            action_values(env, **given)
+
+
+def test_time_limit_and_errors_in_a_branch():
+    env = made("single")
+
+    def hangs(observation):
+        while True:
+            pass
+
+    with pytest.raises(BranchError, match="longer than"):
+        action_values(env, futures=1, base=hangs, time_limit=0.2)
+
+    def fails(observation):
+        raise LookupError("no idea")
+
+    with pytest.raises(LookupError, match="no idea") as caught:
+        action_values(env, futures=1, base=fails)
+    assert "in branch" in "".join(caught.value.__notes__)
+
+
+def test_progress_on_request(capsys):
+    assert action_values(made("single"), futures=3, progress=True).counts.tolist() == [3, 3, 3]
+    assert "9/9" in capsys.readouterr().err
+
+
+def test_branches_are_not_shown():
+    class Shown(Duel):
+        render_modes = ("human",)
+        pictures = 0
+
+        def render(self, mode):
+            self.pictures += 1
+
+    env = single_env(Shown, {LEFT: points()[LEFT]}, render_mode="human")
+    env.reset(seed=5)
+
+    def pictures(env):
+        return float(env.unwrapped.simulation.pictures)
+
+    told = action_values(env, [1], futures=1, horizon=3, terminal_value=pictures)
+    assert told.means[0] == pytest.approx(worth("left", 1, futures_of(env, 1)[0], horizon=3) + 1)

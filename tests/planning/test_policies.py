@@ -1,0 +1,579 @@
+"""Policies that plan: how they spend their branches, and all places where they serve."""
+
+import copy
+import pickle
+import random
+import sys
+import threading
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    BranchError,
+    CopyError,
+    InvalidActionError,
+    Mixture,
+    OptionValueError,
+    ReentrancyError,
+    RolloutPolicy,
+    action_values,
+    aec_env,
+    branch,
+    collect_episodes,
+    compare_with_rule,
+    joint_env,
+    parallel_env,
+    record_dataset,
+    simulate,
+    simulate_many,
+    single_env,
+    vector_env,
+)
+from tests.conftest import DRIVERS
+from tests.planning.test_action_values import GRAZING, Herd, Mortal, greedy, made
+from tests.worlds.duels import LEFT, RIGHT, Duel, Unseeded, points, worth
+from tests.worlds.models import define
+
+METHODS = pytest.mark.parametrize("method", ["fork", "replay"])
+
+
+class Noted:
+    """A policy that notes what another one answers."""
+
+    def __init__(self, policy):
+        self.policy, self.answers = policy, []
+
+    def __call__(self, observation, info, *, _environment):
+        self.answers.append(self.policy(observation, info, _environment=_environment))
+        return self.answers[-1]
+
+
+def planner(**given):
+    return RolloutPolicy(**{"base": greedy, "futures": 2, "horizon": 2, "discount": 0.1} | given)
+
+
+def tame(**changes):
+    """Points at which the one on the left is to come near to three, so that it matters what it does."""
+    return points(reward_mapping=lambda duel: -abs(duel.value - 3), **changes)
+
+
+def by_hand(seed=5, policy=None, model=Duel, **options):
+    """What a planner does in a single view whose user asks it: its actions, and what the model has come to."""
+    env = single_env(model, tame(), agent="left", **options)
+    env.reset(seed=seed)
+    policy, actions, over = policy or planner(), [], False
+    while not over:
+        actions.append(policy.choose(env).best)
+        over = any(env.step(actions[-1])[2:4])
+    env.close()
+    return actions, env.simulation.value
+
+
+# -- sequential halving ---------------------------------------------------------------------------
+
+
+def test_the_budget_is_divided_among_rounds():
+    env = single_env(Wide, Wide.choose)
+    env.reset(seed=1)
+    told = RolloutPolicy(budget=96).choose(env)
+    assert sorted(told.counts.tolist()) == [4, 4, 4, 4, 12, 12, 28, 28]
+    assert told.best == 7
+    assert told.counts[7] == 28
+    assert told.returns.shape == (8, 28)
+    assert np.isnan(told.returns[0, 4:]).all()
+    assert told.means[0] == pytest.approx(np.nanmean(told.returns[0]))
+
+
+@pytest.mark.parametrize("budget", [8, 9, 17, 24, 50, 100])
+def test_the_budget_is_spent_and_not_overspent(budget):
+    env = single_env(Wide, Wide.choose)
+    env.reset(seed=1)
+    counts = RolloutPolicy(budget=budget).choose(env).counts
+    assert budget - 1 <= counts.sum() <= budget
+    assert counts.min() >= 1
+
+
+def test_by_default_the_budget_is_that_of_all_candidates():
+    env = single_env(Wide, Wide.choose)
+    env.reset(seed=1)
+    assert RolloutPolicy(futures=6).choose(env).counts.sum() == 48
+    assert RolloutPolicy([1, 4, 2], futures=6).choose(env).counts.sum() in (17, 18)
+
+
+def test_candidates_of_a_round_meet_the_same_futures():
+    env = single_env(Wide, Wide.choose)
+    env.reset(seed=1)
+    told = RolloutPolicy([2, 2, 2, 2], budget=32).choose(env)
+    assert told.counts.tolist() == [12, 12, 4, 4]
+    assert told.returns[0].tolist() == told.returns[1].tolist()
+    assert told.returns[2, :4].tolist() == told.returns[0, :4].tolist()
+    assert told.returns[0, :4].tolist() == action_values(env, [2], futures=4).returns[0].tolist()
+
+
+def test_one_candidate_is_not_tried():
+    env = single_env(Wide, Wide.choose)
+    env.reset(seed=1)
+    told = RolloutPolicy([3]).choose(env)
+    assert (told.best, told.counts.tolist()) == (3, [0])
+    assert np.isnan(told.means).all()
+
+
+def test_one_future_is_tried_once():
+    env = made("single", Unseeded)
+    with pytest.warns(UserWarning, match="foresees"):
+        told = RolloutPolicy(futures=5).choose(env)
+    assert told.counts.tolist() == [1, 1, 1]
+    assert told.best == 2
+
+
+def test_masked_candidates_are_left_out():
+    given = points(action_mask_mapping=lambda duel: [duel.turn % 2, 1, 1])
+    env = single_env(Duel, {LEFT: given[LEFT]})
+    env.reset(seed=5)
+    told = RolloutPolicy([0, 1], futures=2).choose(env)
+    assert told.actions == (1,)
+    with pytest.raises(InvalidActionError, match="all candidates"):
+        RolloutPolicy([0]).choose(env)
+    with pytest.raises(InvalidActionError, match="not in"):
+        RolloutPolicy([0, 5]).choose(env)
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        ({"budget": 0}, "budget"),
+        ({"budget": 1.5}, "budget"),
+        ({"futures": 0}, "futures"),
+        ({"horizon": 0}, "horizon"),
+        ({"seed": -1}, "seed"),
+        ({"discount_by": "day"}, "discount_by"),
+    ],
+)
+def test_what_cannot_be(given, match):
+    with pytest.raises(OptionValueError, match=match):
+        RolloutPolicy(**given)
+
+
+def test_a_budget_that_does_not_suffice():
+    with pytest.raises(OptionValueError, match="3 candidates once"):
+        RolloutPolicy(budget=2).choose(made("single"))
+
+
+class Wide:
+    """Eight candidates, of which the last is the best."""
+
+    def reset(self, seed=None):
+        self.random, self.paid = random.Random(seed), 0.0
+
+    def reseed(self, seed):
+        self.random.seed(seed)
+
+    def run(self):
+        for _ in range(2):
+            self.paid = self.choose() + self.random.gauss(0, 1)
+
+    @define(action_space=spaces.Discrete(8), reward_mapping=lambda wide: wide.paid)
+    def choose(self):
+        return 0
+
+
+# -- all places where it serves -------------------------------------------------------------------
+
+
+@METHODS
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_simulate(driver, method):
+    if driver == "thread" and method == "fork":
+        method = None
+    noted = Noted(planner(method=method))
+    simulation = simulate(Duel, {"left": noted}, points=tame(), seed=5, driver=driver)
+    assert (noted.answers, simulation.value) == by_hand()
+    assert len(set(noted.answers)) > 1
+
+
+def test_a_point_names_it_as_well_as_an_agent():
+    noted = Noted(planner())
+    assert simulate(Duel, {LEFT: noted}, points=tame(), seed=5).value == by_hand()[1]
+
+
+@pytest.mark.parametrize("method", ["fork", "replay"])
+@pytest.mark.parametrize("view", ["aec", "parallel", "joint", "single"])
+def test_policies_of_environments(view, method):
+    noted = Noted(planner(method=method))
+    make = {"aec": aec_env, "parallel": parallel_env, "joint": joint_env, "single": single_env}[view]
+    env = make(Duel, tame(), policies={"left": noted})
+    env.reset(seed=5)
+    over = False
+    while not over:
+        if view == "aec":
+            env.step(1)
+            over = env.terminations["right"]
+        elif view == "parallel":
+            over = env.step({"right": 1})[2]["right"]
+        else:
+            over = env.step({"right": 1} if view == "joint" else 1)[2]
+    assert noted.answers == by_hand()[0]
+
+
+def test_simulate_many_asks_row_by_row():
+    seeds = [5, 6]
+    found = simulate_many(
+        Duel, {"left": planner(), "right": lambda observations: np.ones(len(observations), int)},
+        points=tame(), seeds=seeds, collect=lambda duel: duel.value,
+    )  # fmt: skip
+    assert found == [by_hand(seed)[1] for seed in seeds]
+    assert found == simulate_many(
+        Duel, {"left": planner()}, points=tame(), seeds=seeds, collect=lambda duel: duel.value
+    )
+
+
+@pytest.mark.parametrize("batch_size", [1, 8])
+def test_collect_episodes(batch_size):
+    seeds = [5, 6]
+    found = collect_episodes(Duel, {"left": planner()}, points=tame(), seeds=seeds, batch_size=batch_size)["left"]
+    for place, seed in enumerate(seeds):
+        assert found.actions[found.episodes == place].tolist() == by_hand(seed)[0]
+    others = collect_episodes(
+        Duel, {"left": planner(), "right": lambda observations: np.ones(len(observations), int)},
+        points=tame(), seeds=seeds, batch_size=batch_size,
+    )  # fmt: skip
+    assert len(others["right"]) == 12
+
+
+@METHODS
+def test_batch_policies_of_others_go_on_in_branches(method):
+    def downwards(observations, infos, identities):
+        return np.full(len(observations), 2)
+
+    def alone(observation):
+        return 2
+
+    policies = {"left": planner(method=method), "right": downwards}
+    told = simulate_many(Duel, policies, points=tame(), seeds=[5, 5], collect=lambda duel: duel.value)
+    assert told[0] == told[1] == simulate(Duel, {"left": planner(), "right": alone}, points=tame(), seed=5).value
+    values = []
+
+    def left(observation, info, *, _environment):
+        values.append(action_values(_environment, base=greedy, futures=2, method=method))
+        return values[-1].best
+
+    collect_episodes(Duel, {"left": left, "right": downwards}, points=points(), seeds=[5])
+    other = []
+
+    def single(observation, info, *, _environment):
+        other.append(action_values(_environment, base=greedy, futures=2, method=method))
+        return other[-1].best
+
+    simulate(Duel, {"left": single, "right": alone}, points=points(), seed=5)
+    assert other[0].returns == pytest.approx(values[0].returns)
+
+
+def test_record_dataset(tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    dataset = record_dataset("duel/left-v0", Duel, {"left": planner()}, points=tame(), seeds=[5, 6])
+    assert [episode.actions.tolist() for episode in dataset] == [by_hand(5)[0], by_hand(6)[0]]
+
+
+def test_compare_with_rule():
+    given = tame(rule_action_mapping=lambda decision: decision)
+    plain = compare_with_rule(Duel, {"left": lambda seen: np.ones(len(seen), int)}, points=given, seeds=[5])["left"]
+    assert plain.agreement == 1
+    told = compare_with_rule(Duel, {"left": planner()}, points=given, seeds=[5, 6])["left"]
+    env = single_env(Duel, given, agent="left")
+    wanted = []
+    for seed in (5, 6):
+        env.reset(seed=seed)
+        for _ in range(6):
+            wanted.append(planner().choose(env).best)
+            env.step(RULE)
+    assert told.policy_actions.tolist() == wanted
+    assert told.trajectories.actions.tolist() == [1] * 12
+
+
+def test_a_vector_environment():
+    envs = vector_env(Duel, tame(), num_envs=2, policies={"right": planner()})
+    envs.reset(seed=5)
+    for _ in range(3):
+        envs.step(np.array([1, 1]))
+    assert [env.unwrapped.simulation.turn for env in envs.envs] == [3, 3]
+    envs.close()
+
+
+def test_a_mixture_cannot_ask_it():
+    with pytest.raises(OptionValueError, match="asks for the environment"):
+        Mixture({RULE: 1, planner(): 1})
+
+
+# -- what a policy gets ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", ["simulate", "aec", "parallel", "collect"])
+def test_the_environment_of_a_policy(view):
+    seen = []
+
+    def left(observation, info, *, _environment):
+        assert _environment.unwrapped is _environment
+        assert _environment.action_space == spaces.Discrete(3)
+        assert _environment.observation_space.shape == (2,)
+        assert [_environment.simulation.turn, _environment.simulation.value] == observation.tolist()
+        for use in (lambda: _environment.step(1), _environment.reset):
+            with pytest.raises(ReentrancyError):
+                use()
+        with pytest.raises((ReentrancyError, EnvironmentError)):
+            _environment.close()
+        for copied in (copy.deepcopy, pickle.dumps):
+            with pytest.raises(CopyError):
+                copied(_environment)
+        for method in ("fork", "replay"):
+            told = branch(_environment, lambda twin, i: (twin.step(i)[:4], twin.simulation.turn), 3, method=method)
+            seen.append(told)
+        return 1
+
+    if view == "simulate":
+        simulate(Duel, {"left": left}, points=points(), seed=5)
+    elif view == "collect":
+        collect_episodes(Duel, {"left": left}, points=points(), seeds=[5])
+    else:
+        env = (aec_env if view == "aec" else parallel_env)(Duel, points(), policies={"left": left})
+        env.reset(seed=5)
+        while env.agents and not (view == "aec" and env.terminations["right"]):
+            env.step(1 if view == "aec" else {"right": 1})
+    assert len(seen) == 12
+    for forked, replayed in zip(seen[::2], seen[1::2], strict=True):
+        assert repr(forked) == repr(replayed)
+    for turn, told in enumerate(seen[::2]):
+        for action, ((_, reward, terminated, truncated), came_to) in enumerate(told):
+            # The reward is that of the action alone, since the agent's decision that was pending.
+            assert reward == pytest.approx(worth("left", action, None, at=2 * turn, horizon=1))
+            assert (terminated, truncated) == (turn == 5, False)
+            assert came_to == min(turn + 1, 5)
+
+
+def test_a_policy_of_the_observation_alone_may_ask_too():
+    def left(observation, *, _environment):
+        return action_values(_environment, futures=2, horizon=1).best
+
+    assert simulate(Duel, {"left": left}, points=points(), seed=5).value != simulate(Duel, seed=5).value
+
+
+def test_agents_that_die_while_their_policy_plans():
+    def left(observation, info, *, _environment):
+        told = action_values(_environment, base=lambda observation: 2, futures=4, terminal_value=lambda env: 1e6)
+        values.append(told)
+        return 1
+
+    for method in ("fork", "replay"):
+        values = []
+        env = made("single", Mortal)
+        first = action_values(env, base=lambda observation: 2, futures=4, method=method)
+        simulate(Mortal, {"left": left}, points=points(), seed=5)
+        assert values[0].returns == pytest.approx(first.returns)
+
+
+def test_entities_plan_each_for_itself():
+    """Who is called on has a policy by its point; the others of the point plan as well, and not in branches."""
+    point = f"{Herd.__module__}.Herd.graze"
+    told = simulate(Herd, {point: RolloutPolicy(futures=1)}, points=GRAZING, seed=1)
+    assert told.sum == 6 * 9
+    base = {"one": lambda observation: 2, "other": lambda observation: 5}
+    values = []
+
+    def one(observation, info, *, _environment):
+        values.append(action_values(_environment, [0], base=base, futures=1))
+        return 0
+
+    simulate(Herd, {"one": one}, points=GRAZING, seed=1)
+    assert values[0].means.tolist() == [5 + 2 + 5 + 2 + 5]
+    simulate(Herd, {"one": one, "other": lambda observation: 1}, points=GRAZING, seed=1)
+    assert values[3].means.tolist() == [1 + 2 + 1 + 2 + 1]
+
+
+@METHODS
+def test_two_planners_at_once(method):
+    """In the branches of the one the other follows its base."""
+    values = []
+
+    def noting(observation, info, *, _environment):
+        told = action_values(_environment, base=greedy, futures=3, method=method)
+        if told.counts[0]:  # else it was asked in a branch
+            values.append(told)
+        return 1
+
+    def down(observation):
+        return 2
+
+    simulate(Duel, {"left": noting, "right": RolloutPolicy(base=down, method=method)}, points=points(), seed=5)
+    simulate(Duel, {"left": noting, "right": down}, points=points(), seed=5)
+    assert values[0].returns.tolist() == values[6].returns.tolist()
+
+
+def test_a_planner_of_the_users_own_does_not_plan_within_plans():
+    calls = []
+
+    def plans(observation, info, *, _environment):
+        calls.append(action_values(_environment, base=lambda observation: 2, futures=2, method="replay"))
+        return calls[-1].best
+
+    simulate(Duel, {"left": plans, "right": plans}, points=points(), seed=5)
+    within = [told for told in calls if not told.counts[0]]
+    assert len(calls) - len(within) == 12
+    assert {told.best for told in within} == {2}
+    assert within[0].actions == (2,)
+
+
+def test_the_users_own_branches_are_exact():
+    """There a planner plans as it would."""
+    env = aec_env(Duel, tame(), policies={"left": planner()})
+    env.reset(seed=5)
+    env.step(1)
+
+    def ahead(twin, number):
+        for _ in range(3):
+            twin.step(1)
+        return twin.simulation.value
+
+    forked, replayed = branch(env, ahead)[0], branch(env, ahead, method="replay")[0]
+    assert forked == replayed == ahead(env, 0)
+
+
+def test_a_planner_as_a_base_is_its_own_base():
+    env = made("single")
+    told = action_values(env, futures=3, base=RolloutPolicy(base=greedy))
+    assert told.returns.tolist() == action_values(env, futures=3, base=greedy).returns.tolist()
+
+
+def test_errors_surface_from_where_the_policy_is_asked():
+    def fails(observation):
+        raise LookupError("no idea")
+
+    with pytest.raises(LookupError, match="no idea"):
+        simulate(Duel, {"left": RolloutPolicy(base=fails, futures=1)}, points=points(), seed=5)
+    env = aec_env(Duel, points(), policies={"left": RolloutPolicy(base=fails, futures=1)})
+    with pytest.raises(LookupError, match="no idea"):
+        env.reset(seed=5)
+
+
+def test_a_replay_of_a_branch_of_a_policy_is_refused():
+    def left(observation, info, *, _environment):
+        branch(_environment, lambda twin, i: branch(twin, lambda again, j: again.step(1), method="replay"))
+
+    with pytest.raises(BranchError, match="fork"):
+        simulate(Duel, {"left": left}, points=points(), seed=5)
+
+
+def test_nothing_is_kept_where_no_policy_asks():
+    tapes = []
+
+    class Peeping(Duel):
+        def left(self):
+            return 1
+
+    def left(observation):
+        tapes.append(len(session().episode.tape))
+        return 1
+
+    def session():
+        frame = sys._getframe()
+        while "self" not in frame.f_locals or type(frame.f_locals["self"]).__name__ != "Session":
+            frame = frame.f_back
+        return frame.f_locals["self"]
+
+    simulate(Duel, {"left": left}, points=points(), seed=5)
+    assert tapes == [0] * 6
+
+
+class GlobalDuel(Duel):
+    reseed = None
+
+    def reset(self, seed=None):
+        super().reset(seed)
+        self.random = random
+
+
+def test_global_generators_of_their_own():
+    noted = {}
+    for method in ("fork", "replay"):
+        noted[method] = Noted(RolloutPolicy(base=lambda seen: random.randrange(3), futures=3, method=method))
+        simulate(GlobalDuel, {"left": noted[method]}, points=tame(), seed=5, global_rng=True)
+    assert noted["fork"].answers == noted["replay"].answers
+
+
+def test_in_a_thread_of_its_own():
+    found = []
+
+    def work():
+        found.append(simulate(Duel, {"left": planner()}, points=tame(), seed=5).value)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join(60)
+    assert found == [by_hand()[1]]
+
+
+def test_seeds_tell_planners_apart():
+    env = made("single")
+    one, other = (RolloutPolicy(futures=3).choose(env) for _ in range(2))
+    assert one.means.tolist() == other.means.tolist()
+    assert one.means[2] != RolloutPolicy(futures=3, seed=1).choose(env).means[2]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"skip_forced": True},
+        {"max_steps": 4},
+        {"padded": True},
+        {"global_rng": True},
+        {"plugins": [(lambda duel: None, LEFT, "before"), (lambda duel: None, RIGHT, "after")]},
+    ],
+    ids=lambda options: next(iter(options)),
+)
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_options_of_the_environment(make, options):
+    """By either method a planner finds the same, and what it does is what comes of it."""
+    given, found = points(action_mask_mapping=lambda duel: [1, duel.turn % 2, duel.turn % 2]), []
+    for method in ("fork", "replay"):
+        noted = Noted(RolloutPolicy(futures=2, horizon=2, method=method))
+        env = make(Duel, given, policies={"left": noted}, **options)
+        env.reset(seed=5)
+        for _ in range(3):
+            env.step(1 if make is aec_env else {"right": 1})
+        found.append((noted.answers, env.unwrapped.simulation.value))
+        env.close()
+    assert found[0] == found[1]
+    assert set(found[0][0]) == ({2} if "skip_forced" in options else {0, 2})
+
+
+def test_max_steps_end_the_futures_of_the_one_agent_that_is_asked():
+    """There they count its own decisions; in those of a policy beside a user's agents they count nothing."""
+    told = []
+
+    def left(observation, info, *, _environment):
+        told.append(action_values(_environment, [1], futures=1).means[0])
+        return 1
+
+    collect_episodes(Duel, {"left": left}, points=points(), seeds=[5], max_steps=2)
+    env = made("single", max_steps=2)
+    assert told[0] == pytest.approx(action_values(env, [1], futures=1).means[0])
+    env = aec_env(Duel, points(), policies={"left": left}, max_steps=2)
+    env.reset(seed=5)
+    assert told[-1] == pytest.approx(action_values(made("single"), [1], futures=1).means[0])
+
+
+def test_environments_of_the_registry(request):
+    import gymnasium
+
+    from simenv_marl import register_simulation
+
+    request.addfinalizer(lambda: [gymnasium.registry.pop(key) for key in [*gymnasium.registry] if "duelling" in key])
+    register_simulation(Duel, {LEFT: points()[LEFT]}, name="duelling")
+    env = gymnasium.make(next(key for key in gymnasium.registry if "duelling" in key), max_episode_steps=3)
+    env.reset(seed=5)
+    bare = single_env(Duel, {LEFT: points()[LEFT]})
+    bare.reset(seed=5)
+    told = action_values(env, futures=2)
+    assert told.returns == pytest.approx(action_values(bare, futures=2, horizon=3).returns)

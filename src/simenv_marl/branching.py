@@ -10,13 +10,14 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextvars import ContextVar
 from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 
-from .core.forking import Standing
+from .core.forking import Standing, end_with
 from .core.processes import pack_error, pack_plainly, unpack, unpack_error
 from .core.rng import is_seed, process_kept, seed_process
 from .envs import View
@@ -25,6 +26,12 @@ from .errors import BranchError, OptionValueError, ViewError, WorkerError, annot
 Result = TypeVar("Result")
 
 METHODS: Final = ("fork", "replay")
+
+DEEPEST: Final = 4
+"""How deep branches can be nested. In each of them there may be as many as there are cores, and so on."""
+
+_depth: ContextVar[int] = ContextVar("simenv_marl.branching", default=0)
+"""How deep a branch this is."""
 
 
 def branch(
@@ -83,7 +90,14 @@ def branch(
             'method="fork" needs a platform that can fork, and driver="greenlet": a forked process has none of the'
             ' other threads; use "replay"'
         )
+    if not time_limit > 0:
+        raise OptionValueError(f"time_limit must be a number of seconds, not {shown(time_limit)}")
     view.check_pending()
+    if _depth.get() == DEEPEST:
+        raise BranchError(
+            f"branches are nested {DEEPEST} deep: a policy that branches its environment is asked again in its"
+            " branches, and so on without end; action_values and RolloutPolicy leave what is decided there to a base"
+        )
     if seeds is not None:
         view.check_reseed()
         function = _in_other_futures(function, _checked_seeds(seeds, n))
@@ -94,9 +108,17 @@ def branch(
             ' method="replay"'
         )
     if obstacles or not forks or method == "replay":
-        around = nullcontext if seeds is None else process_kept
-        return [_replayed(env, view, function, number, around) for number in range(n)]
+        return [_replayed(env, view, function, number) for number in range(n)]
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
+
+
+@contextmanager
+def _one_deeper() -> Iterator[None]:
+    token = _depth.set(_depth.get() + 1)
+    try:
+        yield
+    finally:
+        _depth.reset(token)
 
 
 # -- other futures --------------------------------------------------------------------------------
@@ -128,19 +150,17 @@ def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) 
 # -- by replaying ---------------------------------------------------------------------------------
 
 
-def _replayed(
-    env: Any,
-    view: View,
-    function: Callable[[Any, int], Result],
-    number: int,
-    around: Callable[[], AbstractContextManager[None]],
-) -> Result:
+def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
+    with process_kept(), _one_deeper():  # the model may draw from the process's generators, now as then
+        return _run_replayed(env, view, function, number)
+
+
+def _run_replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
     twin = view.replayed()
     try:
         twin.begin_branch()
         # Of the wrappers around it each is copied, with all that it remembers.
-        with around():
-            result = function(copy.deepcopy(env, {id(view): twin}), number)
+        result = function(copy.deepcopy(env, {id(view): twin}), number)
     except BaseException as error:
         annotate(error, f"simenv_marl: in branch {number}")
         close_after(error, twin.close, "the branch")
@@ -177,7 +197,8 @@ def _standing_alike(function: Callable[[Any, int], Result], standing: Standing) 
     def resume_and_call(env: Any, number: int) -> Result:
         standing.resume()
         getattr(env, "unwrapped", env).begin_branch()
-        return function(env, number)
+        with _one_deeper():
+            return function(env, number)
 
     return resume_and_call
 
@@ -217,10 +238,12 @@ def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: lis
     for stream in (sys.stdout, sys.stderr):
         with suppress(Exception):  # what is in it would be written by both processes
             stream.flush()
+    parent = os.getpid()
     reading, writing = os.pipe()
     with _unwarned():
         process = os.fork()
     if process == 0:
+        end_with(parent)
         _be_child(env, function, number, [reading, *pipes], writing)
     os.close(writing)
     return _Child(number, process, reading, time_limit)

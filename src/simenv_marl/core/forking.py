@@ -7,11 +7,13 @@ puts that right in the forked process.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import random
 import shutil
 import signal
 import stat
+import sys
 import tempfile
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import suppress
@@ -61,6 +63,21 @@ def _path(number: int) -> str:
         held = fcntl.fcntl(number, fcntl.F_GETPATH, bytes(1024))
         return os.fsdecode(held.partition(b"\0")[0])
     return f"{DESCRIPTORS}/{number}"
+
+
+# -- the end of the parent ------------------------------------------------------------------------
+
+_PR_SET_PDEATHSIG: Final = 1
+
+_prctl: Final[Any] = getattr(ctypes.CDLL(None), "prctl", None) if sys.platform == "linux" else None
+
+
+def end_with(parent: int) -> None:
+    """Have this forked process end when its parent does, however that ends; Linux alone knows how."""
+    if _prctl is not None:
+        _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        if os.getppid() != parent:  # it has ended already
+            os._exit(1)
 
 
 # -- event loops ----------------------------------------------------------------------------------

@@ -228,6 +228,7 @@ def _each(waiting: Sequence[Episode]) -> Any:
     answers = []
     for episode in waiting:
         agent: Any = episode.pending
+        agent.consultations += 1
         answers.append(agent.policy(duplicate(agent.observation), agent.info))
         agent.info = {}
     if not all(type(answer) is tuple and len(answer) == 2 and isinstance(answer[1], Mapping) for answer in answers):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..branching import branch
-from ..errors import BranchError, warn_user
+from ..errors import BranchError, annotate, shown, warn_user
 from ..many.spread import progress_bar
 from .lookahead import Lookahead
 from .players import player_of
@@ -94,13 +94,13 @@ class Futures:
         Returns:
             Of each what ``Lookahead.play`` tells.
         """
-        look, actions, seeds = self._look, self.actions, None
+        look, seeds = self._look, None
         if self.endless:
             numbers = self.seeds(1 + max((future for _, future in tries), default=0))
             seeds = [numbers[future] for _, future in tries]
         brought: list[list[float]] = branch(
             self._env,
-            lambda twin, number: look.play(twin, [actions[place] for place in tries[number][0]]),
+            lambda twin, number: self._tried(twin, *tries[number]),
             len(tries),
             method=look.method,
             seeds=seeds,
@@ -109,6 +109,15 @@ class Futures:
         for (places, _), rewards in zip(tries, brought, strict=True):
             self.returns[places[0]].append(sum(rewards))
         return brought
+
+    def _tried(self, twin: Any, places: tuple[int, ...], future: int) -> list[float]:
+        """In a branch: try out actions, by their places."""
+        actions = [self.actions[place] for place in places]
+        try:
+            return self._look.play(twin, actions)
+        except BaseException as error:
+            annotate(error, f"simenv_marl: while {', '.join(map(shown, actions))} was tried out in future {future}")
+            raise
 
     def seeds(self, number: int) -> list[int]:
         """The seeds of the first futures."""

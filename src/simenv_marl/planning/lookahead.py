@@ -10,6 +10,8 @@ from math import isfinite
 from numbers import Real
 from typing import Any, Final
 
+import numpy as np
+
 from ..core.rng import process_kept
 from ..errors import OptionValueError, shown
 from ..simulation import RULE
@@ -84,14 +86,10 @@ class Lookahead:
         player.begin()
         timed, action = self._timed, actions[0]
         brought: list[float] = []
-        weight, began = 1.0, player.now() if timed else 0.0
-        now = began
+        began = now = player.now() if timed else 0.0
         while True:
-            reward, acted = player.step(action)
-            if acted:
-                weight = self.discount ** (now - began if self.discount_by == "time" else len(brought))
-                brought.append(0.0)
-            brought[-1] += weight * reward
+            weight = self.discount ** (now - began if self.discount_by == "time" else len(brought))
+            brought.append(weight * player.step(action))
             if player.over:
                 return brought
             decided, now = len(brought), player.now() if timed else 0.0
@@ -100,7 +98,9 @@ class Lookahead:
             planned = decided < len(actions) and player.allows(actions[decided])
             action = actions[decided] if planned else player.decide()
         if self.terminal_value is not None:
-            rest = self.terminal_value(player.env)
+            rest: Any = self.terminal_value(player.env)
+            if isinstance(rest, np.ndarray) and rest.size == 1:
+                rest = rest.item()
             if not is_number(rest):
                 raise OptionValueError(f"terminal_value must return a finite number, not {shown(rest)}")
             brought[-1] += float(rest) * self.discount ** (now - began if self.discount_by == "time" else decided)

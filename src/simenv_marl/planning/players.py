@@ -22,6 +22,16 @@ from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, Unk
 from ..simulation import RULE
 
 
+class Planner:
+    """A policy that plans. In a branch in which a candidate is tried out, it is its own base.
+
+    Attributes:
+        base: Who decides after a candidate.
+    """
+
+    base: Any
+
+
 class Player:
     """The agent whose decision is pending.
 
@@ -90,7 +100,9 @@ class Player:
     def _check(self, action: Any) -> None:
         if self.env is self.view:
             self.own.point.checked(action, self.agent, self.own.mask)
-        elif action_check(self.space)(action) is ILLEGAL:
+        elif (
+            self.own.point.check if self.space == self.own.point.definition.action_space else action_check(self.space)
+        )(action) is ILLEGAL:
             raise InvalidActionError(f"the action {shown(action)} of {self.agent!r} is not in {shown(self.space)}")
         elif self._is_masked(action):
             raise InvalidActionError(f"the action {shown(action)} is masked; the mask is {shown(self.own.mask)}")
@@ -128,7 +140,7 @@ class Player:
     def entropy(self) -> list[int]:
         """What tells this decision from all others, however the episode is played."""
         episode = self.episode
-        number = self.own.consultations - 1 if episode.consulted is self.own else episode.turns
+        number = self.own.consultations - 1 if self.own.consultations else episode.turns
         return [episode.seed, number, crc32(self.agent.encode(errors="surrogatepass"))]
 
     # -- in a branch ------------------------------------------------------------------------------
@@ -141,15 +153,11 @@ class Player:
         """Make ready for what is done in a branch."""
         self.view.stop_showing()
 
-    def step(self, action: Any) -> tuple[float, bool]:
-        """Take an action, and go on to where the agent is to say what it does next.
-
-        Returns:
-            The reward that this has brought, and whether the agent has decided by that action.
-        """
+    def step(self, action: Any) -> float:
+        """Take an action, and go on to the agent's next decision, or to its end; return the reward of that."""
         observation, reward, terminated, truncated, info = self._through(action)
         self._seen, self.over = (observation, info), terminated or truncated
-        return float(reward), True
+        return float(reward)
 
     def allows(self, action: Any) -> bool:
         """Whether an action that was legal at another decision is so now."""
@@ -166,11 +174,9 @@ class Player:
 
     def _ask(self, name: str, observation: Any, info: Any) -> Any:
         """What an agent's base answers."""
-        base = self.base
-        if isinstance(base, Mapping):
-            base = base.get(name, RULE)
-        elif name != self.agent:
-            return RULE
+        base: Any = self.base if name == self.agent or isinstance(self.base, Mapping) else RULE
+        while isinstance(base, (Mapping, Planner)):
+            base = base.base if isinstance(base, Planner) else base.get(name, RULE)
         if base is RULE:
             return RULE
         policy = self._policies.get(name)
@@ -180,16 +186,17 @@ class Player:
             return policy.answer(observation, info, self.env)
         return policy(observation, info)
 
-    def _through(self, action: Any, *, replaced: bool | None = None) -> Any:
-        """Step through the wrappers.
-
-        Args:
-            action: The action.
-            replaced: Whether it is to reach the bare environment as it is; None: if it is ``RULE``.
-        """
-        if self.env is self.view or not (action is RULE if replaced is None else replaced):
+    def _through(self, action: Any) -> Any:
+        """Step through the wrappers; ``RULE`` reaches the bare environment as it is."""
+        if self.env is self.view or action is not RULE:
             return self.env.step(action)
-        return self._replacing(lambda given: action, self.space.sample())
+        return self._replacing(lambda given: action, self._placeholder(self.space, self.episode.pending))
+
+    @staticmethod
+    def _placeholder(space: spaces.Space[Any], agent: Agent) -> Any:
+        """A legal action for wrappers to look at, where something else is done."""
+        mask = agent.mask if space == agent.point.definition.action_space else None
+        return space.sample() if mask is None else space.sample(mask)
 
     def _replacing(self, replace: Callable[[Any], Any], placeholder: Any) -> Any:
         """Step through the wrappers with a placeholder, whose place something else takes behind them."""
@@ -222,7 +229,14 @@ class JointPlayer(Player):
         if self.env is self.view:
             self.episode.check(self.view.joint.actions(self.episode, action))
         else:
-            super()._check(action)
+            super()._check(self._without_rules(action))
+
+    def _without_rules(self, action: Any) -> Any:
+        """A joint action in which other actions stand for the parts that are ``RULE``."""
+        if not isinstance(action, Mapping):
+            return action
+        space: Any = self.space
+        return {name: space[name].sample() if part is RULE else part for name, part in action.items()}
 
     def _is_masked(self, action: Any) -> bool:
         return False
@@ -259,14 +273,16 @@ class JointPlayer(Player):
             for name in self.view.joint.roster
         }
 
-    def step(self, action: Any) -> tuple[float, bool]:
+    def step(self, action: Any) -> float:
         """Play a round."""
-        parts = action.values() if isinstance(action, Mapping) else [action]
-        observation, reward, terminated, truncated, info = self._through(
-            action, replaced=any(part is RULE for part in parts)
-        )
+        ruled = {name: RULE for name, part in action.items() if part is RULE} if isinstance(action, Mapping) else {}
+        if ruled and self.env is not self.view:
+            results = self._replacing(lambda given: {**given, **ruled}, self._without_rules(action))
+        else:
+            results = self._through(action)
+        observation, reward, terminated, truncated, info = results
         self._seen, self.over = (observation, info), terminated or truncated
-        return float(reward), True
+        return float(reward)
 
 
 class AECPlayer(Player):
@@ -286,7 +302,7 @@ class AECPlayer(Player):
         space: spaces.Space[Any] = self.env.action_space(self.env.agent_selection)
         return space
 
-    def step(self, action: Any) -> tuple[float, bool]:
+    def step(self, action: Any) -> float:
         """Take an action, and have all others decide, until the agent is selected once more."""
         env = self.env
         self._through(action)
@@ -295,11 +311,11 @@ class AECPlayer(Player):
             if name == self.agent:
                 _, reward, terminated, truncated, _ = env.last(observe=False)
                 self._seen, self.over = None, terminated or truncated
-                return float(reward), True
+                return float(reward)
             ended = env.terminations[name] or env.truncations[name]
             self._through(None if ended else self._decision_of(name))
         self.over = True
-        return 0.0, True
+        return 0.0
 
     def decide(self) -> Any:
         """What the base says the agent is to do."""
@@ -326,13 +342,21 @@ class ParallelPlayer(Player):
         space: spaces.Space[Any] = self.env.action_space(self.agent)
         return space
 
-    def step(self, action: Any) -> tuple[float, bool]:
-        """Play a round."""
+    def step(self, action: Any) -> float:
+        """Play a round, and others without an action of the agent's until its decision is pending again."""
+        reward = self._round({self.agent: action})
+        while not self.over and self.episode.pending is not self.own:
+            reward += self._round({})
+        return reward
+
+    def _round(self, own: dict[str, Any]) -> float:
         agents = self.episode.agents
-        answers = {name: action if name == self.agent else self._decision_of(name) for name in agents}
+        answers = own | {name: self._decision_of(name) for name in agents if name != self.agent}
         ruled = {name: answer for name, answer in answers.items() if answer is RULE}
         if ruled and self.env is not self.view:
-            placeholders = answers | {name: self.env.action_space(name).sample() for name in ruled}
+            placeholders = answers | {
+                name: self._placeholder(self.env.action_space(name), agents[name]) for name in ruled
+            }
             results = self._replacing(lambda given: {**given, **ruled}, placeholders)
         else:
             results = self.env.step(answers)
@@ -340,7 +364,7 @@ class ParallelPlayer(Player):
         self._seen = {name: (observations[name], infos.get(name, {})) for name in observations}
         over = terminations.get(self.agent, True) or truncations.get(self.agent, True)
         self.over = bool(over or self.own.ended)  # padded, those who have ended stay
-        return float(rewards.get(self.agent, 0.0)), self.own.acted
+        return float(rewards.get(self.agent, 0.0))
 
     def decide(self) -> Any:
         """What the base says the agent is to do."""

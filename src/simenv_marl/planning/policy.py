@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from math import ceil, log2
 from typing import Any
 
@@ -13,10 +13,11 @@ from ..errors import OptionValueError, shown
 from ..simulation import RULE
 from .futures import Futures
 from .lookahead import Lookahead, is_count, within_a_branch
+from .players import Planner
 from .values import ActionValues, base_value, valued
 
 
-class RolloutPolicy:
+class RolloutPolicy(Planner):
     """A policy that looks one decision ahead of a base, and spends its branches on the candidates that are in the race.
 
     By sequential halving (Karnin, Koren and Somekh, 2013): the budget is divided among rounds, in each of which all
@@ -73,7 +74,10 @@ class RolloutPolicy:
             discount=discount, discount_by=discount_by, method=method, time_limit=time_limit,
         )  # fmt: skip
         self.base, self.budget = base, budget
-        self._actions, self._seed = actions, checked_seed(seed)
+        self._actions: Any = actions
+        if isinstance(actions, Iterable) and not isinstance(actions, (str, Mapping)):
+            self._actions = list(actions)  # which are asked for at each decision
+        self._seed = checked_seed(seed)
 
     def choose(self, env: Any) -> ActionValues:
         """Find out which candidate for the pending decision of an environment is best.

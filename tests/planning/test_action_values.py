@@ -419,11 +419,10 @@ def test_wrappers_of_pettingzoo(method):
 def test_wrappers_of_the_joint_view():
     env = TransformReward(made("joint"), lambda reward: -reward)
     env.reset(seed=5)
-    actions = [{"left": 2, "right": 1}, {"left": RULE, "right": 1}]
     with pytest.raises(InvalidActionError, match="not in"):
-        action_values(env, actions)
-    told = action_values(env, [actions[0], RULE], futures=3)
-    assert told.returns == pytest.approx(-expected(env, "left", (2, 1), both=True))
+        action_values(env, [{"left": 3, "right": RULE}])
+    told = action_values(env, [{"left": 2, "right": 1}, {"left": 1, "right": RULE}, RULE], futures=3)
+    assert told.returns == pytest.approx(-expected(env, "left", (2, 1, 1), both=True))
 
 
 # -- what cannot be -------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ class Noted:
     """A policy that notes what another one answers."""
 
     def __init__(self, policy):
-        self.policy, self.answers = policy, []
+        self.policy, self.answers, self.base = policy, [], policy.base
 
     def __call__(self, observation, info, *, _environment):
         self.answers.append(self.policy(observation, info, _environment=_environment))
@@ -411,18 +411,43 @@ def test_two_planners_at_once(method):
     assert values[0].returns.tolist() == values[6].returns.tolist()
 
 
-def test_a_planner_of_the_users_own_does_not_plan_within_plans():
+@METHODS
+def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
+    """In a branch of the one the other is left to its base, or to its rule; else there were a branch of each branch."""
+    calls, seen = [], []
+
+    def branches(observation, info, *, _environment):
+        calls.append(int(observation[0]))
+        seen.append(branch(_environment, lambda twin, i: (twin.step(i)[1], calls[:]), 2, method=method))
+        return 1
+
+    simulate(Duel, {"left": branches, "right": branches}, points=points(), seed=5)
+    assert len(calls) == 12
+    for number, (first, second) in enumerate(seen):
+        assert len(first[1]) == len(second[1]) == number + 1  # nobody was asked there
+    assert seen[0][1][0] == pytest.approx(worth("left", 1, None, horizon=1))
+    branches.base = lambda observation: 2
+    del seen[:], calls[:]
+    simulate(Duel, {"left": branches, "right": branches}, points=points(), seed=5)
+    bases = {"right": branches.base}
+    assert seen[0][1][0] == pytest.approx(worth("left", 1, None, horizon=1, bases=bases))
+
+
+@METHODS
+def test_policies_that_plan_by_themselves_are_left_to_their_base_in_plans(method):
     calls = []
 
     def plans(observation, info, *, _environment):
-        calls.append(action_values(_environment, base=lambda observation: 2, futures=2, method="replay"))
+        calls.append(action_values(_environment, base=greedy, futures=2, method=method))
         return calls[-1].best
 
     simulate(Duel, {"left": plans, "right": plans}, points=points(), seed=5)
-    within = [told for told in calls if not told.counts[0]]
-    assert len(calls) - len(within) == 12
-    assert {told.best for told in within} == {2}
-    assert within[0].actions == (2,)
+    assert [told.counts.tolist() for told in calls] == [[2, 2, 2]] * 12
+    env = aec_env(Duel, points(), policies={"right": plans})
+    env.reset(seed=5)
+    told = action_values(env, futures=3, method=method)
+    assert told.returns == pytest.approx(action_values(made("aec"), futures=3, method=method).returns)
+    assert len(calls) == 12
 
 
 def test_the_users_own_branches_are_exact():

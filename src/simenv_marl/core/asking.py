@@ -2,18 +2,25 @@
 
 Such a policy is wrapped when a plan binds it, so that nothing is paid for it where no policy asks. What it is given is
 made by the views, of which this room knows nothing: they say how, in ``AskingPolicy.make``.
+
+In a branch of such an environment, and in one in which a planner tries out a candidate, no policy is given another one:
+two that branch would ask each other for ever. Its ``base`` answers there, if it has that attribute, else the rule.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
 from typing import Any, Final
 from weakref import ref
 
 from ..errors import OptionValueError, shown
-from ..simulation import positional
+from ..simulation import RULE, positional
 from .bound import asks_for
+
+PLANNING: Final[ContextVar[bool]] = ContextVar("simenv_marl.planning", default=False)
+"""Whether this runs in a branch in which a planner tries out a candidate."""
 
 ENVIRONMENT: Final = "_environment"
 """The parameter of policies that ask for the environment."""
@@ -63,7 +70,21 @@ class AskingPolicy:
             raise OptionValueError(
                 f"the policy {shown(self.policy)} asks for {ENVIRONMENT}, which there is not here: name it in policies="
             )
+        episode = session.episode
+        if episode.alone or PLANNING.get():
+            return self._by_base(observation, info, (episode.consulted or episode.pending).name)
         return self.answer(observation, info, AskingPolicy.make(session))
+
+    def _by_base(self, observation: Any, info: Any, agent: str) -> Any:
+        """What the policy's base answers for an agent."""
+        base = getattr(self.policy, "base", RULE)
+        if isinstance(base, Mapping):
+            base = base.get(agent, RULE)
+        if base is RULE or not callable(base):
+            return RULE
+        if asks_for_environment(base):
+            return AskingPolicy(base)._by_base(observation, info, agent)
+        return base(observation, info) if takes_info(base) else base(observation)
 
     def answer(self, observation: Any, info: Any, environment: Any) -> Any:
         """What the policy answers in an environment."""

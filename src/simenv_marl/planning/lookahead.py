@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
 from math import isfinite
 from numbers import Real
@@ -12,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..core.asking import PLANNING
 from ..core.rng import process_kept
 from ..errors import OptionValueError, shown
 from ..simulation import RULE
@@ -117,18 +117,15 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
 
 
-_deep: ContextVar[bool] = ContextVar("simenv_marl.planning", default=False)
-
-
 def within_a_branch() -> bool:
     """Whether this runs in a branch in which a candidate is tried out: planners are their own bases there."""
-    return _deep.get()
+    return PLANNING.get()
 
 
 @contextmanager
 def _planning() -> Iterator[None]:
-    token = _deep.set(True)
+    token = PLANNING.set(True)
     try:
         yield
     finally:
-        _deep.reset(token)
+        PLANNING.reset(token)

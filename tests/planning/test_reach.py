@@ -1,0 +1,290 @@
+"""Where planning meets what else there is: births in rounds, masks and clipping in wrappers, planners as bases."""
+
+import os
+import random
+import time
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import TransformAction, TransformObservation, TransformReward
+from pettingzoo.utils.wrappers import TerminateIllegalWrapper
+
+from simenv_marl import (
+    BranchError,
+    OptionValueError,
+    RolloutPolicy,
+    SimulationInterface,
+    action_values,
+    aec_env,
+    branch,
+    collect_episodes,
+    difference,
+    joint_env,
+    make_step,
+    parallel_env,
+    reseed_generators,
+    simulate,
+    simulate_many,
+    single_env,
+)
+
+SPACE = spaces.Box(-99, 99, (2,), np.float32)
+DEFINITION = {"observation_space": SPACE, "action_space": spaces.Discrete(3), "action_space_mapping": int}
+
+
+class Pair(SimulationInterface):
+    """Two who decide in turn; at the end of a round one has earned both actions, the other ten times its own."""
+
+    noise = 0.0
+
+    def reset(self, seed=None):
+        self.turn, self.both, self.own, self.log = 0, 0.0, 0.0, []
+        self.random = random.Random(seed)
+
+    def reseed(self, seed):
+        reseed_generators(self, seed)
+
+    def run(self):
+        while self.turn < 4:
+            self.log.append((self.first(), self.second()))
+            self.both += sum(self.log[-1]) + self.noise * self.log[-1][0] * self.random.gauss(0, 1)
+            self.own += 10 * self.log[-1][1] + self.noise * self.log[-1][1] * self.random.gauss(0, 1)
+            self.turn += 1
+
+    @make_step(
+        **DEFINITION,
+        observation_space_mapping=lambda pair: [pair.turn, 1],
+        reward_mapping=difference(lambda pair: pair.both),
+        agent="first",
+    )
+    def first(self):
+        return 1
+
+    @make_step(
+        **DEFINITION,
+        observation_space_mapping=lambda pair: [pair.turn, 2],
+        reward_mapping=difference(lambda pair: pair.own),
+        agent="second",
+    )
+    def second(self):
+        return 1
+
+
+class Noisy(Pair):
+    noise = 3.0
+
+
+POINTS = [Pair.first, Pair.second]
+
+
+class Births(SimulationInterface):
+    """One decides; a second one is born in the first round and decides at once; both are paid at its end."""
+
+    def reset(self, seed=None):
+        self.earned, self.turn = {0: 0.0}, 0
+
+    def reseed(self, seed):
+        pass
+
+    def run(self):
+        while self.turn < 4:
+            actions = {number: self.act(number) for number in list(self.earned)}
+            if self.turn == 0:
+                self.earned[1] = 0.0
+                actions[1] = self.act(1)
+            for number, action in actions.items():
+                self.earned[number] += action
+            self.turn += 1
+
+    @make_step(
+        **DEFINITION,
+        observation_space_mapping=lambda births, number: [births.turn, number],
+        reward_mapping=difference(lambda births, number: births.earned[number]),
+        agent=lambda births, number: f"born_{number}",
+    )
+    def act(self, number):
+        return 1
+
+
+def begun(env):
+    env.reset(seed=1)
+    return env
+
+
+@pytest.mark.parametrize("view", [aec_env, parallel_env])
+def test_what_an_action_is_worth_reaches_to_the_next_decision(view):
+    env = begun(view(Births, [Births.act]))
+    for horizon, means in ((1, [0, 1, 2]), (2, [1, 2, 3]), (None, [3, 4, 5])):
+        assert action_values(env, futures=1, horizon=horizon).means.tolist() == means
+    assert action_values(env, futures=1, discount=0.5).means.tolist() == [0.875, 1.875, 2.875]
+    turn = action_values(env, futures=1, horizon=1, terminal_value=lambda env: 100 * env.unwrapped.simulation.turn)
+    assert turn.means.tolist() == [100, 101, 102]
+
+
+@pytest.mark.parametrize("options", [{}, {"padded": True, "possible_agents": ["first", "second"]}])
+def test_the_first_of_padded_rounds(options):
+    env = begun(parallel_env(Pair, POINTS, **options))
+    assert action_values(env, futures=1, horizon=1).means.tolist() == [1, 2, 3]
+    assert RolloutPolicy(futures=1, horizon=1).choose(env).best == 2
+
+
+def test_wrappers_that_look_at_masks_see_legal_actions():
+    masked = {
+        "observation_space": spaces.Dict(observation=SPACE, action_mask=spaces.Box(0, 1, (6,), np.int8)),
+        "observation_space_mapping": lambda pair: {"observation": [pair.turn, 1]},
+        "action_space": spaces.Discrete(6),
+        "action_space_mapping": int,
+        "action_mask_mapping": lambda pair: [0, 1, 0, 1, 0, 0],
+        "reward_mapping": difference(lambda pair: pair.both),
+    }
+    points = {f"{__name__}.Pair.{name}": make_step(**masked, agent=name) for name in ("first", "second")}
+    env = begun(aec_env(Pair, points))
+    wrapped = begun(TerminateIllegalWrapper(aec_env(Pair, points), -1))
+    assert action_values(wrapped, futures=2).returns.tolist() == action_values(env, futures=2).returns.tolist()
+
+
+@pytest.mark.parametrize(
+    ("view", "candidate"), [(aec_env, 1), (parallel_env, 1), (joint_env, {"first": 1, "second": 1})]
+)
+def test_a_planner_as_the_base_of_another_agent_is_its_base(view, candidate):
+    def own(observation):
+        return 2 if observation[1] == 2 else 0
+
+    means = [
+        action_values(begun(view(Pair, POINTS)), [candidate], base={"second": base}, futures=1).means.tolist()
+        for base in (own, RolloutPolicy(base=own))
+    ]
+    assert means[0] == means[1]
+
+
+def test_the_base_of_a_planner_sees_what_wrappers_let_through():
+    def shifted(observation):
+        return 2 if observation[0] > 500 else 0
+
+    env = TransformObservation(single_env(Pair, POINTS, agent="first"), lambda observation: observation + 1000, None)
+    begun(env)
+    plain, planned = (action_values(env, base=base, futures=1).means for base in (shifted, RolloutPolicy(base=shifted)))
+    assert plain.tolist() == planned.tolist()
+
+
+def test_parts_of_joint_actions_that_are_left_to_the_rule_go_around_wrappers_alone():
+    space = joint_env(Pair, POINTS).action_space
+
+    def turned(action):
+        return {name: 2 - part for name, part in action.items()}
+
+    env = begun(TransformAction(joint_env(Pair, POINTS), turned, space))
+    bases = ({"first": lambda observation: 0, "second": lambda observation: 1}, {"first": lambda observation: 0})
+    both, one = (action_values(env, [{"first": 1, "second": 1}], base=base, futures=1).means[0] for base in bases)
+    assert both == one
+
+
+def test_candidates_that_are_clipped():
+    class Amounts(SimulationInterface):
+        def reset(self, seed=None):
+            self.total = 0.0
+
+        def reseed(self, seed):
+            pass
+
+        def run(self):
+            for _ in range(3):
+                self.total += float(self.amount()[0])
+
+        @make_step(
+            observation_space=spaces.Box(-99, 99, (1,), np.float32),
+            observation_space_mapping=lambda amounts: [amounts.total],
+            action_space=spaces.Box(0, 1, (1,), np.float32),
+            action_space_mapping=lambda action: action,
+            reward_mapping=difference(lambda amounts: amounts.total),
+            agent="a",
+        )
+        def amount(self):
+            return [0.5]
+
+    env = single_env(Amounts, Amounts.amount, clip_actions=True)
+    for made in (env, TransformReward(env, lambda reward: reward)):
+        assert action_values(begun(made), [[5.0]], futures=1).means.tolist() == [2.0]
+
+
+def test_a_planner_decides_alike_wherever_it_serves():
+    points = [Noisy.first, Noisy.second]
+    for seed in range(2):
+        planners = {name: RolloutPolicy(futures=2, horizon=1) for name in ("first", "second")}
+        one = simulate(Noisy, planners, points=points, seed=seed).log
+        many = simulate_many(Noisy, planners, points=points, seeds=[seed], collect=lambda pair: pair.log)
+        collected = collect_episodes(Noisy, planners, points=points, seeds=[seed])
+        assert many == [one]
+        assert list(zip(*(collected[name].actions.tolist() for name in planners), strict=True)) == one
+
+
+@pytest.mark.filterwarnings("ignore:.*draws from the global generator", "ignore:.*cannot draw anew")
+def test_replays_leave_the_generators_of_the_process_alone():
+    class Lucky(Pair):
+        reseed = None
+
+        def run(self):
+            while self.turn < 4:
+                self.both += self.first() * random.random()
+                self.turn += 1
+
+    random.seed(5)
+    env = begun(single_env(Lucky, [Pair.first]))
+    env.step(1)
+    before = random.getstate()
+    found = action_values(env, [1, 1, 1], futures=1, method="replay").returns.ravel().tolist()
+    assert found == found[:1] * 3
+    assert random.getstate() == before
+
+
+def test_branches_are_not_nested_for_ever():
+    env = begun(single_env(Pair, [Pair.first]))
+
+    def deeper(twin, number):
+        return branch(twin, deeper, 1)
+
+    with pytest.raises(BranchError, match="nested 4 deep"):
+        branch(env, deeper, 1)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="what ends with its parent is Linux's to say")
+def test_a_branch_that_is_ended_takes_its_own_branches_along(tmp_path):
+    mark = tmp_path / "mark"
+
+    def slow(twin, number):
+        until = time.monotonic() + 20
+        while time.monotonic() < until:
+            with mark.open("a") as file:
+                file.write(".")
+            time.sleep(0.02)
+
+    env = begun(single_env(Pair, [Pair.first]))
+    with pytest.raises(BranchError, match="longer than"):
+        branch(env, lambda twin, number: branch(twin, slow, 1, method="fork"), 1, method="fork", time_limit=1.0)
+    time.sleep(0.3)
+    size = mark.stat().st_size
+    time.sleep(0.3)
+    assert mark.stat().st_size == size
+
+
+def test_an_error_says_which_candidate_was_tried_in_which_future():
+    class Fragile(Pair):
+        def run(self):
+            assert self.first() != 2
+
+    env = begun(single_env(Fragile, [Pair.first]))
+    with pytest.raises(AssertionError) as raised:
+        action_values(env, futures=2)
+    assert any("while 2 was tried out in future" in note for note in raised.value.__notes__)
+
+
+def test_time_limits_candidates_and_terminal_values():
+    env = begun(single_env(Pair, [Pair.first]))
+    for limit in (0, -1.0, float("nan")):
+        with pytest.raises(OptionValueError, match="time_limit"):
+            branch(env, lambda twin, number: None, time_limit=limit)
+    planner = RolloutPolicy((number for number in range(3)), futures=1, horizon=1)
+    assert [planner.choose(env).best for _ in range(2)] == [2, 2]
+    told = action_values(env, futures=1, horizon=1, terminal_value=lambda env: np.array([7.0]))
+    assert told.means.tolist() == [8, 9, 10]

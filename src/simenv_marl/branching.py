@@ -10,8 +10,8 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from contextvars import ContextVar
 from typing import Any, Final, NoReturn, TypeVar
 
@@ -112,15 +112,6 @@ def branch(
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
 
 
-@contextmanager
-def _one_deeper() -> Iterator[None]:
-    token = _depth.set(_depth.get() + 1)
-    try:
-        yield
-    finally:
-        _depth.reset(token)
-
-
 # -- other futures --------------------------------------------------------------------------------
 
 
@@ -151,8 +142,12 @@ def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) 
 
 
 def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
-    with process_kept(), _one_deeper():  # the model may draw from the process's generators, now as then
-        return _run_replayed(env, view, function, number)
+    deeper = _depth.set(_depth.get() + 1)
+    try:
+        with process_kept():  # the model may draw from the process's generators, now as then
+            return _run_replayed(env, view, function, number)
+    finally:
+        _depth.reset(deeper)
 
 
 def _run_replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
@@ -197,8 +192,8 @@ def _standing_alike(function: Callable[[Any, int], Result], standing: Standing) 
     def resume_and_call(env: Any, number: int) -> Result:
         standing.resume()
         getattr(env, "unwrapped", env).begin_branch()
-        with _one_deeper():
-            return function(env, number)
+        _depth.set(_depth.get() + 1)
+        return function(env, number)
 
     return resume_and_call
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import random
 from _random import Random as Twister
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from ctypes import c_char, memmove, string_at
 from sys import modules
 from threading import get_ident
@@ -298,18 +297,21 @@ def seed_process(seed: int) -> None:
         torchs.manual_seed(_integer(another))
 
 
-@contextmanager
-def process_kept() -> Iterator[None]:
-    """Put the global generators of the process back to where they were."""
-    before, torchs = PortableState(), _generator_of_torch()
-    before.save()
-    drawn = None if torchs is None else torchs.get_state()
-    try:
-        yield
-    finally:
-        before.load()
-        if torchs is not None:
-            torchs.set_state(drawn)
+class process_kept:  # noqa: N801 - it is used like a function
+    """Put the global generators of the process back to where they were.
+
+    It is a class, as ``outside_simulation`` is, since some errors cannot pass a context manager made of a generator.
+    """
+
+    def __enter__(self) -> None:
+        self._before, torchs = PortableState(), _generator_of_torch()
+        self._before.save()
+        self._drawn = None if torchs is None else torchs.get_state()
+
+    def __exit__(self, *error: object) -> None:
+        self._before.load()
+        if self._drawn is not None:
+            _generator_of_torch().set_state(self._drawn)
 
 
 def _generator_of_torch() -> Any:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
+from greenlet import getcurrent
+
 from ..errors import (
     ClosedError,
     EpisodeOverError,
@@ -18,6 +20,7 @@ from ..errors import (
     shown,
     warn_user,
 )
+from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
@@ -69,6 +72,8 @@ class Ending(Participants):
         unwinding: Whether it is being ended.
         failed_in_model: Whether the error that has ended the episode came from the simulation.
         terminated, truncated: How it ended; both False until then, and where an error has ended it.
+        unheard: Whether the episode has ended before its user was asked, since all decisions were forced: the first
+            step tells of it.
         untold: Agents that forced moves have ended during the reset, whose reward and end the first round tells.
         turns: How many actions the environment's user has given.
         seed: What the simulation was reset with.
@@ -78,7 +83,7 @@ class Ending(Participants):
 
     __slots__ = (
         "_around", "begun", "driver", "failed_in_model", "over", "pending", "plugins", "running", "seed", "terminated",
-        "truncated", "turns", "untold", "unwinding",
+        "truncated", "turns", "unheard", "untold", "unwinding",
     )  # fmt: skip
 
     def __init__(
@@ -96,7 +101,9 @@ class Ending(Participants):
         super().__init__(plan, simulation, clock)
         self.driver, self.seed, self.plugins, self._around = driver, seed, plan.plugins, around
         self.pending: Agent | None = None
-        self.over = self.terminated = self.truncated = self.failed_in_model = self.begun = self.unwinding = False
+        self.over = self.terminated = self.truncated = self.failed_in_model = self.begun = self.unwinding = (
+            self.unheard
+        ) = False
         self.running = True
         self.turns = 0
         self.untold: list[Agent] = []
@@ -104,6 +111,26 @@ class Ending(Participants):
     def at_work(self) -> at_work:
         """What is to be around all that runs for the environment."""
         return at_work(self.plugins, *self._around, self.driver)
+
+    def _hear(self) -> None:
+        """Where no decision is pending: let the user learn of an end before the first one, or refuse."""
+        if not self.unheard:
+            raise self.refusal()
+        self.unheard = False
+
+    def _enter(self, move: Callable[[Any, Any, bool], None], given: Any) -> None:
+        """Make a move at work."""
+        here = getcurrent()
+        if here is not self.driver.caller or EVALUATING:
+            with self.at_work():
+                move(self, given, True)
+            return
+        assert self.plugins is not None
+        EVALUATING[here] = self.plugins  # as ``at_work`` does it, where nothing else is to be seen to
+        try:
+            move(self, given, True)
+        finally:
+            del EVALUATING[here]
 
     def finish(self, *, truncated: bool) -> None:
         """End the episode of all agents that are left."""

@@ -83,12 +83,10 @@ class Episode(Ending):
         last_time: The time at the latest step of a joint view.
         skips: Whether decisions with one legal action are answered with it.
         stalled: How many rounds have had no action for the pending agent since the simulation last moved.
-        unheard: Whether the episode has ended before its user was asked, since all decisions were forced: the first
-            step tells of it.
     """
 
     __slots__ = (
-        "_left", "decide", "last_time", "limit", "most_steps", "skips", "stalled", "tape", "unheard", "when",
+        "_left", "decide", "last_time", "limit", "most_steps", "skips", "stalled", "tape", "when",
     )  # fmt: skip
 
     def __init__(
@@ -116,7 +114,7 @@ class Episode(Ending):
         self.when = when
         self.most_steps = plan.options.max_steps or inf
         self.limit = min(self.most_steps, LONGEST_TAPE + 1)
-        self.skips, self.unheard, self.stalled = plan.options.skip_forced, False, 0
+        self.skips, self.stalled = plan.options.skip_forced, 0
         self.decide: Callable[..., Any] | None = None
         if when is When.RETURN:
             self.decide = Episode._decide_in_round
@@ -187,26 +185,6 @@ class Episode(Ending):
             else:  # nothing has moved
                 self.annotate(error)
             raise
-
-    def _hear(self) -> None:
-        """Where no decision is pending: let the user learn of an end before the first one, or refuse."""
-        if not self.unheard:
-            raise self.refusal()
-        self.unheard = False
-
-    def _enter(self, move: Callable[[Episode, Any, bool], None], given: Any) -> None:
-        """Make a move at work."""
-        here = getcurrent()
-        if here is not self.driver.caller or EVALUATING:
-            with self.at_work():
-                move(self, given, True)
-            return
-        assert self.plugins is not None
-        EVALUATING[here] = self.plugins  # as ``at_work`` does it, where nothing else is to be seen to
-        try:
-            move(self, given, True)
-        finally:
-            del EVALUATING[here]
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
         """Turn an agent's action into the reply that the simulation gets, and let go of what only the decision needed.

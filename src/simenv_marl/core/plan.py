@@ -83,6 +83,7 @@ class Plan:
         *,
         unanswered: bool = False,
         rewarded: bool = False,
+        others: Any = None,
         render_fps: float = RENDER_FPS,
         ends_agents: bool = False,
         spare: list[Spare] | None = None,
@@ -98,6 +99,7 @@ class Plan:
                 f" {render_modes or 'it has none'}"
             )
         self.unanswered, self.rewarded, self._ends_agents = unanswered, rewarded, ends_agents
+        self._others = others
         agents = name_agents(named)
         if options.agent is not None and options.agent not in agents and None not in agents:
             raise AgentError(
@@ -121,7 +123,7 @@ class Plan:
         self.points: list[Any] = []
         self.active: list[BoundPoint] = []
         for point, agent in zip(self._everything, agents, strict=True):
-            policy = self._by_point.get(point.point)
+            policy = self._by_point.get(point.point, self._others)
             if options.agent is not None and agent != (options.agent if options.agent in known else None):
                 policy = policy or RULE
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
@@ -163,6 +165,17 @@ class Plan:
         made.policies = {key: given_session(policy, session) for key, policy in self.policies.items()}
         made._bind_points(first=False)
         return made
+
+    def with_source(self, source: Any, variant: Variant | None, spare: Spare) -> Plan:
+        """The same plan, of simulations that are made of something else, and of which there is one already."""
+        made = self._copied()
+        made.source, made.variant, made._spare = source, variant, [spare]
+        return made
+
+    @property
+    def looked_at(self) -> Any:
+        """The simulation that was made to be looked at, unless an environment has taken it."""
+        return self._spare[-1].simulation if self._spare else None
 
     def for_one(self, agent: str) -> Plan:
         """The same plan, for a branch that waits for one agent alone: who has no policy is left to its rule."""
@@ -285,6 +298,7 @@ class Plan:
         *,
         unanswered: bool = False,
         rewarded: bool = False,
+        others: Any = None,
     ) -> Plan:
         """Make a plan of what users say.
 
@@ -294,6 +308,7 @@ class Plan:
             options: The options, by name.
             unanswered: Whether there is no environment's user.
             rewarded: Whether agents that deferred policies answer are agents of the environment all the same.
+            others: The policy of all for whom none is given; all decision points are meant where none is named.
 
         Raises:
             SimEnvError: Something in them cannot work; the leaf says what.
@@ -313,9 +328,10 @@ class Plan:
             spare.append(made)
             model = made.simulation
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
-        named = find_points(points, model, required=not unanswered or names_agents(checked.policies))
+        required = not unanswered or others is not None or names_agents(checked.policies)
+        named = find_points(points, model, required=required)
         return cls(
-            source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded,
+            source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded, others=others,
             render_fps=getattr(model, "render_fps", RENDER_FPS), spare=spare, variant=variant,
             ends_agents=issubclass(model if isinstance(model, type) else type(model), SimulationInterface),
         )  # fmt: skip

@@ -53,7 +53,7 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     """Say what an environment of a plan is made of: the result of ``provenance``."""
     name = _dotted_name(plan.maker)
     options = {
-        option.name: _written(getattr(plan.options, option.name))
+        option.name: written_plainly(getattr(plan.options, option.name))
         for option in fields(Options)
         if option.name not in ("plugins", "policies") and getattr(plan.options, option.name) != option.default
     }
@@ -64,13 +64,13 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
         "simulation": name,
         "packages": {package: _version(package) for package in packages},
         "variant": None if plan.variant is None else plan.variant.name,
-        "parameters": {} if plan.variant is None else _written(plan.variant.parameters),
+        "parameters": {} if plan.variant is None else written_plainly(plan.variant.parameters),
         "points": points,
         "plugins": [
-            {"handler": _written(handler), "target": target, "position": position}
+            {"handler": written_plainly(handler), "target": target, "position": position}
             for handler, target, position in ([] if plan.plugins is None else plan.plugins.entries)
         ],
-        "policies": {_key(key): _written(policy) for key, policy in policies.items()},
+        "policies": {_key(key): written_plainly(policy) for key, policy in policies.items()},
         "options": options,
         "seed": seed,
         "python": platform.python_version(),
@@ -86,22 +86,26 @@ def _key(key: Any) -> str:
     return key if isinstance(key, str) else _dotted_name(key)
 
 
-def _written(value: Any) -> Any:
+def written_plainly(value: Any) -> Any:
     """A value in what JSON knows."""
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Mapping):
-        return {_key(key): _written(part) for key, part in value.items()}
+        return {_key(key): written_plainly(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_written(part) for part in value]
+        return [written_plainly(part) for part in value]
     if isinstance(value, (set, frozenset)):
         return sorted(map(repr, value))
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, partial):
-        return {"partial": _written(value.func), "args": _written(value.args), "keywords": _written(value.keywords)}
+        return {
+            "partial": written_plainly(value.func),
+            "args": written_plainly(value.args),
+            "keywords": written_plainly(value.keywords),
+        }
     return _dotted_name(value) if hasattr(value, "__qualname__") else repr(value)
 
 
@@ -118,6 +122,7 @@ def _distributions() -> Mapping[str, list[str]]:
     return importlib.metadata.packages_distributions()
 
 
+@cache
 def _version_of_distribution(name: str) -> str | None:
     try:
         return importlib.metadata.version(name)

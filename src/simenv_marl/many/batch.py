@@ -97,8 +97,8 @@ class PolicyKey(DeferredPolicy):
         return group
 
     def __call__(self, observation: Any, info: Any) -> Any:
-        """Policies are callable; this one is never called, because episodes wait for it."""
-        raise NotImplementedError
+        """Answer one decision, where the policy is one of one decision at a time."""
+        return self.asked.policy(observation, info)
 
     def alone(self, episode: Any, agent: Any) -> Any:
         """Answer a decision at once, of an episode that is a branch and waits for one agent alone."""

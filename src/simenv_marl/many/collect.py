@@ -13,7 +13,7 @@ from ..core.plan import Plan
 from ..core.session import checked_seed
 from ..errors import OptionValueError, shown
 from ..simulation import RULE
-from .batch import PolicyKey, Watcher, policy_keys, run
+from .batch import BatchPolicy, PolicyKey, Watcher, policy_keys, run
 from .spread import progress_bar, spread
 from .trajectories import Ledger, Trajectories, merged
 
@@ -73,8 +73,8 @@ def simulate_many(
         BaseException: Whatever a model, a mapping, a policy or ``collect`` raises, with a note that says of which
             seed. All other simulations are unwound before.
     """
-    checked = _checked_seeds(seeds)
-    _check_numbers(batch_size, workers)
+    checked = checked_seeds(seeds)
+    check_numbers(batch_size, workers)
     _check_collect(collect)
     arguments = (simulation, _checked_policies(policies), points, collect, int(batch_size), options)
     # Made here also where the work is done elsewhere, so that what cannot work is found out before.
@@ -161,8 +161,8 @@ def collect_episodes(
         BaseException: Whatever a model, a mapping or a policy raises, with a note that says of which seed. All other
             simulations are unwound before.
     """
-    checked = _checked_seeds(seeds)
-    _check_numbers(batch_size, workers)
+    checked = checked_seeds(seeds)
+    check_numbers(batch_size, workers)
     _check_collect(collect)
     given = _checked_policies(policies)
     plan, keys = learners_plan(simulation, given, points, options)
@@ -181,13 +181,28 @@ def collect_episodes(
 
 
 def learners_plan(
-    simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]
+    simulation: Any,
+    policies: Mapping[Any, Any],
+    points: Any,
+    options: Mapping[str, Any],
+    *,
+    all_points: bool = False,
 ) -> tuple[Plan, dict[Any, int]]:
-    """The plan of the episodes, and the places of the policies by their keys."""
-    given = {key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()}
-    found = policy_keys(given, rewarded=True)
+    """The plan of the episodes, and the places of the policies by their keys.
+
+    Args:
+        simulation: As ``collect_episodes`` takes it.
+        policies: As well.
+        points: As well.
+        options: As well.
+        all_points: Whether those for whom no policy answers are agents as well, whose decisions are left to the rule.
+    """
+    asked = {key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()}
+    found = policy_keys(asked, rewarded=True)
     keys = {key: entry.place for key, entry in found.items() if isinstance(entry, PolicyKey)}
-    return Plan.draw_up(simulation, points, {**options, "policies": found}, unanswered=True, rewarded=True), keys
+    others = PolicyKey(len(found), BatchPolicy(_left_to_the_rule)) if all_points else None
+    given = {**options, "policies": found}
+    return Plan.draw_up(simulation, points, given, unanswered=True, rewarded=True, others=others), keys
 
 
 def _left_to_the_rule(observations: Any) -> Any:
@@ -233,7 +248,12 @@ def _collect(
     return {place: replace(own, collected=tuple(collected)) for place, own in found.items()}
 
 
-def _checked_seeds(seeds: Any) -> list[int]:
+def checked_seeds(seeds: Any) -> list[int]:
+    """Seeds as a list of python integers.
+
+    Raises:
+        OptionValueError: They are none.
+    """
     if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
         raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {shown(seeds)}")
     checked = []
@@ -255,7 +275,12 @@ def _check_collect(collect: Any) -> None:
         raise OptionValueError(f"collect must be a callable of a simulation, or None, not {shown(collect)}")
 
 
-def _check_numbers(batch_size: Any, workers: Any) -> None:
+def check_numbers(batch_size: Any, workers: Any) -> None:
+    """Make sure that there may be so many simulations, and so many processes.
+
+    Raises:
+        OptionValueError: There may not.
+    """
     for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as there are"

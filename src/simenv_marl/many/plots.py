@@ -59,8 +59,12 @@ STYLE: Final[dict[Any, Any]] = {
 
 
 @contextmanager
-def _style(what: str) -> Iterator[Any]:
-    """Draw in the style of these pictures; yields what makes a new figure of some inches."""
+def style(what: str) -> Iterator[Any]:
+    """Draw in the style of these pictures; yields what makes a new figure of some inches.
+
+    Raises:
+        MissingExtraError: Matplotlib is missing.
+    """
     try:
         from matplotlib import rc_context
         from matplotlib.figure import Figure
@@ -130,7 +134,7 @@ def plot_timeline(
     panels = panels_of(parts, number, agents, action_names)
     rows = [row for panel in panels for row in panel.rows]
     begin, end = min(row.at[0] for row in rows), max(row.end for row in rows)
-    with _style("plot_timeline") as new_figure:
+    with style("plot_timeline") as new_figure:
         if len(rows) <= CHARTED:
             size = 9.5, 0.9 + sum(0.75 + 0.95 * len(panel.leaves[:DRAWN]) for panel in panels for _ in panel.rows)
             figure = new_figure(*size) if figure is None else figure
@@ -212,10 +216,10 @@ def _chart_rewards(axes: Axes, row: Row) -> None:
     axes.vlines(row.at, 0.0, rewards, color=INK, linewidth=1.4 if len(rewards) <= 150 else 0.7)
     axes.axhline(0.0, color=PALE, linewidth=0.8, zorder=1)
     axes.set_ylabel("reward")
-    _beside(axes, f"sum {rewards.sum():.4g}", 0.5, axes.transAxes)
+    beside(axes, f"sum {rewards.sum():.4g}", 0.5, axes.transAxes)
 
 
-def _beside(axes: Axes, text: str, height: float, at: Any) -> None:
+def beside(axes: Axes, text: str, height: float, at: Any) -> None:
     """Write something to the right of axes."""
     axes.annotate(text, (1.0, height), (6, 0), at, "offset points", va="center", fontsize=8.5, annotation_clip=False)
 
@@ -371,7 +375,7 @@ def plot_returns(
     if number > LISTED:
         raise OptionValueError(f"per={per!r} would draw {number} rows, more than {LISTED}; per='policy' draws fewer")
     titles = list(dict.fromkeys(title for rows in groups.values() for title in rows))
-    with _style("plot_returns") as new_figure:
+    with style("plot_returns") as new_figure:
         if ax is None:
             ax = new_figure(8.0, 0.8 + 0.34 * number + 0.3 * len(groups)).subplots()
         height, ticks = 0.0, {}
@@ -414,4 +418,4 @@ def _draw_returns(axes: Axes, height: float, returns: NDArray[np.float64], colou
         below, above = np.quantile(draws, (0.025, 0.975))
         text, interval = f"{mean:.4g}  [{below:.4g}, {above:.4g}]", [[mean - below], [above - mean]]
     axes.errorbar([mean], [height], xerr=interval, fmt="o", color=INK, markersize=4, elinewidth=1.6, zorder=5)
-    _beside(axes, text, height, axes.get_yaxis_transform())
+    beside(axes, text, height, axes.get_yaxis_transform())

@@ -12,8 +12,13 @@ from ..core.processes import pack, pack_error, unpack, unpack_error
 from ..errors import MissingExtraError
 
 
-def progress_bar(total: int, unit: str = "simulation") -> Any:
+def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
     """A bar that shows how many simulations have ended, or whatever else is counted.
+
+    Args:
+        total: How many there are.
+        unit: What is counted.
+        done: How many of them had ended before.
 
     Raises:
         MissingExtraError: tqdm is not installed.
@@ -22,7 +27,7 @@ def progress_bar(total: int, unit: str = "simulation") -> Any:
         from tqdm.auto import tqdm  # type: ignore[import-untyped]
     except ImportError:
         raise _missing("progress=True", "tqdm") from None
-    return tqdm(total=total, unit=unit)
+    return tqdm(total=total, unit=unit, initial=done)
 
 
 def _missing(what: str, package: str) -> MissingExtraError:
@@ -30,16 +35,22 @@ def _missing(what: str, package: str) -> MissingExtraError:
 
 
 def spread(
-    work: Callable[..., Any], arguments: tuple[Any, ...], seeds: Sequence[int], workers: int, least: int
+    work: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    seeds: Sequence[Any],
+    workers: int,
+    least: int,
+    share: int = 4,
 ) -> Iterator[tuple[int, Any]]:
     """Have worker processes do some work, each of a part of the seeds.
 
     Args:
         work: Called with the arguments and a list of seeds; a function of this package.
         arguments: What it is called with.
-        seeds: All seeds.
+        seeds: All seeds, or whatever else is to be parted.
         workers: How many processes; -1: as many as joblib's backend has.
         least: How many seeds are not to be parted, if every worker is to have some.
+        share: How many parts there are for each process.
 
     Yields:
         How many seeds a part has, and what came of it; in the order of the seeds.
@@ -54,7 +65,7 @@ def spread(
     except ImportError:
         raise _missing(f"workers={workers}", "joblib") from None
     processes = max(1, joblib.effective_n_jobs(workers))
-    size = max(1, ceil(len(seeds) / (4 * processes)), min(least, ceil(len(seeds) / processes)))
+    size = max(1, ceil(len(seeds) / (share * processes)), min(least, ceil(len(seeds) / processes)))
     parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]
     parcel = pack((work, arguments))
     try:
@@ -84,7 +95,7 @@ def _closing(results: Any) -> Iterator[None]:
                 close()
 
 
-def _work(parcel: bytes, seeds: list[int]) -> tuple[bool, bytes]:
+def _work(parcel: bytes, seeds: list[Any]) -> tuple[bool, bytes]:
     """In a worker: do the work.
 
     Returns:

@@ -5,6 +5,7 @@ The rooms of the package; each imports only from those below it::
     __main__                            the command line
     planning                            what actions are worth, and policies that decide by that
     testing, registration, branching    checks of a simulation; registries; exact continuations of an episode
+    experiments                         contenders on the same seeds; designs; sweeps that resume; what factors do
     envs                                views: an episode read as a PettingZoo or Gymnasium environment
     many                                policies back in the model, in one simulation or in many at once; pictures
     core                                what happens when: plans, stacks, sessions, episodes, agents
@@ -37,6 +38,10 @@ from .envs import (
     vector_env,
 )
 from .errors import *  # noqa: F403 - the whole tree is public
+from .experiments.designs import design
+from .experiments.effects import Effects, effects, sobol_indices
+from .experiments.evaluation import Evaluation, evaluate
+from .experiments.runs import run_experiment
 from .hooks.attached import Call, ChangedArgs, ChangedResult
 from .hooks.plugins import (
     attach_handler,
@@ -70,6 +75,8 @@ __all__ = [
     "ChangedResult",
     "Comparison",
     "Definition",
+    "Effects",
+    "Evaluation",
     "Mixture",
     "RolloutPolicy",
     "SimulationAECEnv",
@@ -89,8 +96,11 @@ __all__ = [
     "collect_episodes",
     "compare_with_rule",
     "decision_points",
+    "design",
     "difference",
+    "effects",
     "errors",
+    "evaluate",
     "expose_to_plugins",
     "exposed_functions",
     "generate_env",
@@ -105,10 +115,12 @@ __all__ = [
     "register_simulation",
     "remove_handler",
     "reseed_generators",
+    "run_experiment",
     "save_dataset",
     "simulate",
     "simulate_many",
     "single_env",
+    "sobol_indices",
     "trace",
     "vector_env",
 ]

@@ -28,6 +28,7 @@
     |-- ReentrancyError      (RuntimeError)  an environment used while it is moving
     |-- WrongThreadError     (RuntimeError)  a thread or process that cannot go on from here
     |-- MissingExtraError    (ImportError)   a package that only an extra installs
+    |-- StoreError           (OSError)       a store of an experiment that cannot be read or written
     |-- WorkerError          (RuntimeError)  a process with simulations that died, or has raised what cannot be told
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
 
@@ -64,6 +65,7 @@ __all__ = [
     "RewardError",
     "SimEnvError",
     "SimulationError",
+    "StoreError",
     "UnknownAgentError",
     "UnknownOptionError",
     "UnknownPointError",
@@ -252,6 +254,10 @@ class WrongThreadError(SimEnvError, RuntimeError):
 
 class WorkerError(SimEnvError, RuntimeError):
     """A process with simulations in it died, or something was raised there that cannot be told here as it was."""
+
+
+class StoreError(SimEnvError, OSError):
+    """The store of an experiment cannot be read or written. What was stored before stays as it is."""
 
 
 class MissingExtraError(SimEnvError, ImportError):

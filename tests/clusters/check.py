@@ -6,13 +6,15 @@ Everything listens on the loopback address alone.
 
 import argparse
 import os
+import tempfile
 from contextlib import contextmanager
+from pathlib import Path
 
 import joblib
 import numpy as np
 from gymnasium import spaces
 
-from simenv_marl import collect_episodes, make_step, simulate_many
+from simenv_marl import collect_episodes, make_step, run_experiment, simulate_many
 
 
 class Model:
@@ -28,8 +30,11 @@ class Model:
     def decide(self):
         return 0
 
+    def __init__(self, bonus=0):
+        self.bonus = bonus
+
     def reset(self, seed):
-        self.generator, self.level, self.log = np.random.default_rng(seed), seed, []
+        self.generator, self.level, self.log = np.random.default_rng(seed), seed + self.bonus, []
 
     def run(self):
         for _ in range(int(self.generator.integers(1, 20))):
@@ -96,10 +101,27 @@ def check():
     assert simulate_many(Model, policies, seeds=seeds, workers=2, collect=lambda model: model.log) == alone
 
 
+def check_experiment():
+    """The table of an experiment is the same, and the workers have written it."""
+    policies = {"batched": {Model.decide: policy}}
+    with tempfile.TemporaryDirectory() as folder:
+        tables = [
+            run_experiment(
+                Model, {"bonus": [0, 3, 5]}, policies=policies, seeds=range(9), points=[Model.decide], batched=True,
+                metric=lambda model: model.level, store=Path(folder) / str(workers), workers=workers,
+            )
+            for workers in (0, 2)
+        ]  # fmt: skip
+        assert tables[0].equals(tables[1])
+        assert len(tables[0]) == 3 * 2 * 9 * 2
+        assert list((Path(folder) / "2").glob("*.jsonl"))
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cluster", choices=["dask", "ray"])
     name = parser.parse_args().cluster
     with {"dask": dask_cluster, "ray": ray_cluster}[name]():
         check()
+        check_experiment()
     print(f"{name}: all is as in one process")

@@ -1,0 +1,1 @@
+"""Experiments: contenders on the same seeds, designs, sweeps that resume, and what factors do."""

@@ -1,0 +1,345 @@
+"""Designs: which combinations of factors are worth a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil, floor, isfinite
+from string import ascii_lowercase
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.rng import is_seed
+from ..errors import OptionValueError, shown
+from .extras import needed
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+__all__ = ["design"]
+
+MOST_ROWS: Final = 10_000_000
+"""A design of more rows is taken for a mistake."""
+
+
+@dataclass(frozen=True)
+class Factor:
+    """What is varied.
+
+    Attributes:
+        name: What it is called.
+        levels: The values that it can have; None where it is a range.
+        low, high: The bounds of a range, which belong to it.
+        whole: Whether a range is one of integers.
+    """
+
+    name: str
+    levels: tuple[Any, ...] | None = None
+    low: Any = None
+    high: Any = None
+    whole: bool = False
+
+    def spread(self, unit: NDArray[np.float64]) -> list[Any]:
+        """Values for numbers in [0, 1), so that what is spread evenly there is spread evenly here."""
+        if self.levels is not None:
+            return [self.levels[min(floor(u * len(self.levels)), len(self.levels) - 1)] for u in unit.tolist()]
+        if self.whole:
+            number = self.high - self.low + 1
+            return [self.low + min(floor(u * number), number - 1) for u in unit.tolist()]
+        return [self._between(u) for u in unit.tolist()]
+
+    def _between(self, u: float) -> float:
+        value = self.low * (1 - u) + self.high * u  # which cannot overflow
+        return float(min(max(value, self.low), self.high))
+
+    def placed(self, unit: NDArray[np.float64]) -> list[Any]:
+        """Values for places in [0, 1], both ends of which belong to it; of a range."""
+        return [round(self._between(u)) if self.whole else self._between(u) for u in unit.tolist()]
+
+    def steps(self, number: int) -> list[Any]:
+        """So many values of a range, from one bound to the other; all levels of a list."""
+        if self.levels is not None:
+            return list(self.levels)
+        return list(dict.fromkeys(self.placed(np.linspace(0.0, 1.0, number))))
+
+    def ends(self) -> list[Any]:
+        """The two values of a design of two levels.
+
+        Raises:
+            OptionValueError: There are not two.
+        """
+        if self.levels is not None and len(self.levels) != 2:
+            raise OptionValueError(
+                f"this method has two levels of each factor, and {self.name!r} has {len(self.levels)}; give it two, or"
+                " a range (low, high)"
+            )
+        return [self.low, self.high] if self.levels is None else list(self.levels)
+
+
+def design(
+    factors: Mapping[str, Any], method: str = "full_factorial", n: int | None = None, *, seed: int | None = None
+) -> DataFrame:
+    """Say which combinations of factors are to be run.
+
+    Args:
+        factors: By name: a range, the tuple ``(low, high)``, of integers where both are; or a list of levels, which
+            may be anything.
+        method: How combinations are chosen:
+
+            - ``"full_factorial"``: all combinations; of a range ``n`` values (2) from bound to bound;
+            - ``"fractional_factorial"``: of two levels each, a fraction in ``n`` runs, a power of two (as many as main
+              effects need), with as little mixed as can be;
+            - ``"plackett_burman"``: of two levels each, main effects in a multiple of four runs;
+            - ``"central_composite"``: ranges, for a quadratic surface: corners, a star and the middle, all within;
+            - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space;
+            - ``"one_at_a_time"``: the middle of ranges and the first of levels, and then each factor by itself at its
+              other values, of a range ``n`` (2) from bound to bound;
+            - ``"saltelli"``: ``n`` samples (a power of two) for ``sobol_indices``, in ``n * (2 * factors + 2)`` rows.
+        n: How many, where the method asks for that.
+        seed: Of what is drawn at random. None: always the same, so that a script that is run again goes on with its
+            experiment.
+
+    Returns:
+        A row for each run, a column for each factor, in values of the factor's own type.
+
+    Raises:
+        OptionValueError: A factor has no levels, the method does not exist, or cannot be with these factors and ``n``.
+        MissingExtraError: pandas, pyDOE or SALib is missing.
+    """
+    pandas = needed("pandas", "design")
+    found = _checked(factors)
+    if method not in METHODS:
+        raise OptionValueError(f"method must be one of {', '.join(METHODS)}, not {shown(method)}")
+    if n is not None and (isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1):
+        raise OptionValueError(f"n must be a positive integer, not {shown(n)}")
+    if seed is not None and not is_seed(seed):
+        raise OptionValueError(f"seed must be a non-negative integer or None, not {shown(seed)}")
+    columns = METHODS[method](found, None if n is None else int(n), int(seed or 0))
+    series = {
+        factor.name: pandas.Series(values, dtype=_dtype(factor)) for factor, values in zip(found, columns, strict=True)
+    }
+    table: DataFrame = pandas.DataFrame(series)
+    return table
+
+
+def _checked(factors: Any) -> list[Factor]:
+    if not isinstance(factors, Mapping) or not factors:
+        raise OptionValueError(f"factors must be a dict from names to ranges or lists of levels, not {shown(factors)}")
+    return [_factor(name, given) for name, given in factors.items()]
+
+
+def _factor(name: Any, given: Any) -> Factor:
+    if not isinstance(name, str) or not name:
+        raise OptionValueError(f"the name of a factor must be a string, not {shown(name)}")
+    if isinstance(given, tuple):
+        numbers = [value.item() if isinstance(value, np.generic) else value for value in given]
+        if len(numbers) != 2 or not all(type(value) in (int, float) and isfinite(value) for value in numbers):
+            raise OptionValueError(
+                f"the factor {name!r} is {shown(given)}: a tuple is a range (low, high) of two finite numbers; levels"
+                " come as a list"
+            )
+        low, high = numbers
+        if not low < high:
+            raise OptionValueError(f"the range of {name!r} is empty: {shown(given)} goes from low to high")
+        whole = type(low) is type(high) is int
+        return Factor(name, low=low if whole else float(low), high=high if whole else float(high), whole=whole)
+    if isinstance(given, (str, bytes, Mapping)) or not isinstance(given, Iterable):
+        raise OptionValueError(
+            f"the factor {name!r} must be a range (low, high) or a list of levels, not {shown(given)}"
+        )
+    levels = tuple(value.item() if isinstance(value, np.generic) else value for value in given)
+    if not levels:
+        raise OptionValueError(f"the factor {name!r} has no levels")
+    for place, level in enumerate(levels):
+        if any(level is other or (type(level) is type(other) and _same(level, other)) for other in levels[:place]):
+            raise OptionValueError(f"the factor {name!r} has the level {shown(level)} twice")
+    return Factor(name, levels)
+
+
+def _same(one: Any, other: Any) -> bool:
+    try:
+        return bool(one == other)
+    except Exception:  # such as of arrays
+        return False
+
+
+def _dtype(factor: Factor) -> Any:
+    """In which type a column keeps the values of a factor."""
+    kinds = {int if factor.whole else float} if factor.levels is None else set(map(type, factor.levels))
+    if kinds == {str}:
+        return "str"
+    if kinds == {int}:
+        bounds = factor.levels or (factor.low, factor.high)
+        return np.int64 if all(-(2**63) <= value < 2**63 for value in bounds) else object
+    return np.float64 if kinds == {float} else np.bool_ if kinds == {bool} else object
+
+
+# -- methods: the columns of a design -------------------------------------------------------------
+
+Columns = list[list[Any]]
+
+
+def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    if n == 1:
+        raise OptionValueError("a full factorial design has n values of each range, at least 2")
+    steps = [factor.steps(n or 2) for factor in factors]
+    rows = 1
+    for own in steps:
+        rows *= len(own)
+    if rows > MOST_ROWS:
+        raise OptionValueError(
+            f"all combinations are {rows:,} rows, more than {MOST_ROWS:,}; another method needs fewer"
+        )
+    places = needed("pydoe", "design").fullfact([len(own) for own in reversed(steps)])[:, ::-1].astype(int)
+    return [[own[place] for place in column] for own, column in zip(steps, places.T.tolist(), strict=True)]
+
+
+def _of_two_levels(factors: Sequence[Factor], matrix: Any) -> Columns:
+    """A design of -1 and 1."""
+    return [
+        [factor.ends()[int(sign > 0)] for sign in column]
+        for factor, column in zip(factors, np.asarray(matrix).T, strict=True)
+    ]
+
+
+def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    pydoe, number = needed("pydoe", "design"), len(factors)
+    for factor in factors:
+        factor.ends()
+    least = 2 ** ceil(np.log2(number + 1))
+    if n is None:
+        n = least
+    if n & (n - 1) or not least <= n <= min(2**number, MOST_ROWS):
+        raise OptionValueError(
+            f"a fractional design of {number} factors in {n} runs cannot be: n is a power of two, from {least}"
+            f" to {2**number}"
+        )
+    if n == 2**number:
+        return _of_two_levels(factors, pydoe.ff2n(number))
+    return _of_two_levels(factors, pydoe.fracfact(_generators(n.bit_length() - 1, number)))
+
+
+def _generators(basic: int, number: int) -> str:
+    """What the columns of a fractional design are products of, so that effects of low order are mixed least.
+
+    Args:
+        basic: How many factors have all their combinations.
+        number: How many factors there are. Columns are bits: the product of two is their exclusive or.
+    """
+    columns: list[int] = []
+    for resolution in range(min(basic + 1, 8), 2, -1):
+        columns = [1 << place for place in range(basic)]
+        sums: list[set[int]] = [{0}, *(set() for _ in range(resolution - 2))]  # of so many columns
+        for column in columns:
+            _extend(sums, column)
+        for word in range(3, 2**basic):  # taken in their order, what is left is large: a lexicographic code
+            if len(columns) == number:
+                break
+            if not any(word in own for own in sums):
+                columns.append(word)
+                _extend(sums, word)
+        if len(columns) == number:
+            break
+    letters = ascii_lowercase
+    return " ".join("".join(letters[place] for place in range(basic) if column >> place & 1) for column in columns)
+
+
+def _extend(sums: list[set[int]], column: int) -> None:
+    for fewer, own in zip(sums[-2::-1], sums[:0:-1], strict=True):
+        own |= {other ^ column for other in fewer}
+
+
+def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    pydoe, number = needed("pydoe", "design"), len(factors)
+    for factor in factors:
+        factor.ends()
+    matrix = None
+    for columns in range(number, number + 8):  # of some sizes none is known to it, but of the next one
+        try:
+            matrix = pydoe.pbdesign(columns)[:, :number]
+        except ValueError:
+            continue
+        break
+    if matrix is None:
+        raise OptionValueError(f"no Plackett-Burman design of {number} factors is known")
+    if n is not None and n != len(matrix):
+        raise OptionValueError(f"a Plackett-Burman design of {number} factors has {len(matrix)} runs, not {n}")
+    return _of_two_levels(factors, matrix)
+
+
+def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    pydoe = needed("pydoe", "design")
+    for factor in factors:
+        if factor.levels is not None:
+            raise OptionValueError(
+                f"a central composite design is one of ranges (low, high); {factor.name!r} has levels"
+            )
+    if len(factors) < 2:
+        raise OptionValueError("a central composite design is one of two factors at least")
+    # The middle is there once: a simulation with the same seed would bring the same.
+    matrix = pydoe.ccdesign(len(factors), center=(0, 1), alpha="rotatable", face="inscribed")
+    if n is not None and n != len(matrix):
+        raise OptionValueError(f"a central composite design of {len(factors)} factors has {len(matrix)} runs, not {n}")
+    return [factor.placed((column + 1) / 2) for factor, column in zip(factors, matrix.T, strict=True)]
+
+
+def _latin_hypercube(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    return _spread(factors, needed("pydoe", "design").lhs(len(factors), samples=_rows(n), seed=seed))
+
+
+def _sobol(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    pydoe = needed("pydoe", "design")
+    points = pydoe.sobol_sequence(_rows(n), len(factors), scramble=True, seed=seed, use_pow_of_2=False)
+    return _spread(factors, points)
+
+
+def _halton(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    pydoe = needed("pydoe", "design")
+    return _spread(factors, pydoe.cranley_patterson_shift(pydoe.halton_sequence(_rows(n), len(factors)), seed=seed))
+
+
+def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    rows, names = _rows(n), [factor.name for factor in factors]
+    if rows & (rows - 1):
+        raise OptionValueError(f"a Saltelli design has a power of two of samples, not {rows}")
+    problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
+    return _spread(factors, needed("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
+
+
+def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
+    if n == 1:
+        raise OptionValueError("a design of one factor at a time has n values of each range, at least 2")
+    middle = [f.levels[0] if f.levels is not None else f.placed(np.array([0.5]))[0] for f in factors]
+    rows = [middle]
+    for place, factor in enumerate(factors):
+        for value in factor.steps(n or 2):
+            if value is not middle[place] and not (type(value) is type(middle[place]) and _same(value, middle[place])):
+                rows.append([*middle[:place], value, *middle[place + 1 :]])
+    return [list(column) for column in zip(*rows, strict=True)]
+
+
+def _rows(n: int | None) -> int:
+    if n is None:
+        raise OptionValueError("this method needs n, the number of rows")
+    if n > MOST_ROWS:
+        raise OptionValueError(f"n={n:,} is more than {MOST_ROWS:,}")
+    return n
+
+
+def _spread(factors: Sequence[Factor], points: Any) -> Columns:
+    return [factor.spread(column) for factor, column in zip(factors, np.asarray(points).T, strict=True)]
+
+
+METHODS: Final[Mapping[str, Callable[[Sequence[Factor], int | None, int], Columns]]] = {
+    "full_factorial": _full_factorial,
+    "fractional_factorial": _fractional_factorial,
+    "latin_hypercube": _latin_hypercube,
+    "sobol": _sobol,
+    "halton": _halton,
+    "plackett_burman": _plackett_burman,
+    "central_composite": _central_composite,
+    "one_at_a_time": _one_at_a_time,
+    "saltelli": _saltelli,
+}

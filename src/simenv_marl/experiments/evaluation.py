@@ -1,0 +1,352 @@
+"""Contenders on the same seeds: who does better, by how much, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.plan import Plan
+from ..errors import OptionValueError, shown
+from ..many.collect import check_numbers, checked_seeds
+from ..many.spread import progress_bar, spread
+from .extras import needed
+from .playing import (
+    TEAM,
+    Metrics,
+    Outcome,
+    Policies,
+    Returns,
+    checked_contenders,
+    checked_metrics,
+    checked_options,
+    contender_plan,
+    play,
+    play_many,
+    points_of,
+    team_value,
+)
+from .statistics import improvement, interval, seeds_needed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure, SubFigure
+    from pandas import DataFrame, Series
+
+__all__ = ["Evaluation", "evaluate"]
+
+FIRST: Final = 16
+"""After how many seeds it is first looked whether intervals are narrow enough: those of fewer are not to be trusted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What contenders have come to on the same seeds. Made by ``evaluate``.
+
+    Attributes:
+        frame: A row for each contender, seed and agent, and one for the team, whose ``agent`` is ``"team"``. Columns:
+            ``contender``, ``seed``, ``agent``, ``return`` (the sum of its rewards), ``length`` (the number of its
+            decisions; of the team, of all) and the metrics, which are the same in all rows of an episode.
+        baseline: The contender that all others are compared with; None if there is none.
+        confidence: Of the intervals.
+    """
+
+    frame: DataFrame
+    baseline: str | None
+    confidence: float
+
+    def __repr__(self) -> str:
+        values = self.values()
+        return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
+
+    def values(self, of: str = "return") -> DataFrame:
+        """The team's values: a row for each seed, a column for each contender.
+
+        Args:
+            of: ``"return"``, ``"length"`` or the name of a metric.
+
+        Raises:
+            OptionValueError: There is no such column.
+        """
+        if of not in self.frame.columns or of in ("contender", "seed", "agent"):
+            raise OptionValueError(f"of={shown(of)} is no column with values; there are {list(self.frame.columns[3:])}")
+        team = self.frame[self.frame["agent"] == TEAM]
+        names = list(dict.fromkeys(team["contender"]))
+        seeds = list(dict.fromkeys(team["seed"]))
+        return team.pivot(index="seed", columns="contender", values=of).loc[seeds, names]
+
+    def summary(self, of: str = "return") -> DataFrame:
+        """The mean of the team's values for each contender, with its interval.
+
+        Args:
+            of: ``"return"``, ``"length"`` or the name of a metric.
+
+        Returns:
+            Indexed by contender: ``mean``, ``low`` and ``high``; with a baseline also ``difference``,
+            ``difference_low`` and ``difference_high``: by how much it does better on the same seeds.
+
+        Raises:
+            OptionValueError: There is no such column.
+        """
+        pandas, values, rows = needed("pandas", "summary"), self.values(of), {}
+        for name in values.columns:
+            own = values[name].to_numpy(np.float64)
+            rows[name] = [own.mean(), *interval(own, self.confidence)]
+            if self.baseline is not None:
+                apart = own - values[self.baseline].to_numpy(np.float64)
+                rows[name] += [apart.mean(), *interval(apart, self.confidence)]
+        columns = ["mean", "low", "high"]
+        if self.baseline is not None:
+            columns += ["difference", "difference_low", "difference_high"]
+        table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=columns)
+        return table.rename_axis("contender")
+
+    def improvement(self, of: str = "return") -> DataFrame:
+        """The probability that a contender does better than the baseline on a seed, where ties count half.
+
+        Args:
+            of: ``"return"``, ``"length"`` or the name of a metric.
+
+        Returns:
+            Indexed by contender: ``probability``, ``low`` and ``high``.
+
+        Raises:
+            OptionValueError: There is no baseline, or no such column.
+        """
+        pandas, rows = needed("pandas", "improvement"), {}
+        for name, apart in self._differences(of).items():
+            rows[name] = improvement(apart, self.confidence)
+        table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=["probability", "low", "high"])
+        return table.rename_axis("contender")
+
+    def seeds_needed(self, difference: float, *, power: float = 0.8, of: str = "return") -> Series[float]:
+        """How many seeds would tell a difference from the baseline, as far as the seeds that there are can say.
+
+        Args:
+            difference: The mean difference that is to be told from none.
+            power: How often it is to be told: 0.8 is four times out of five.
+            of: ``"return"``, ``"length"`` or the name of a metric.
+
+        Returns:
+            By contender, the number of seeds (by the paired t-test, at ``confidence``); infinity where no number of
+            seeds is large enough.
+
+        Raises:
+            OptionValueError: There is no baseline or no such column, or an argument cannot have its value.
+        """
+        _check_number("difference", difference)
+        if difference == 0 or not 0 < power < 1:
+            raise OptionValueError(f"difference must not be 0, and power lie between 0 and 1, not {shown(power)}")
+        apart = self._differences(of)
+        found = {name: seeds_needed(own, difference, self.confidence, power) for name, own in apart.items()}
+        counts: Series[float] = needed("pandas", "seeds_needed").Series(found, name="seeds", dtype=float)
+        return counts.rename_axis("contender")
+
+    def _differences(self, of: str) -> dict[str, NDArray[np.float64]]:
+        if self.baseline is None:
+            raise OptionValueError("there is no baseline to compare with; give evaluate a baseline=")
+        values = self.values(of)
+        base = values[self.baseline].to_numpy(np.float64)
+        return {name: values[name].to_numpy(np.float64) - base for name in values.columns if name != self.baseline}
+
+    def plot(self, of: str = "return", *, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
+        """Draw each seed as a line from contender to contender and, with a baseline, the differences seed by seed.
+
+        Args:
+            of: ``"return"``, ``"length"`` or the name of a metric.
+            figure: Where to draw. None: a new figure.
+
+        Returns:
+            The figure. Notebooks show a new one where it is the last value of a cell; ``savefig`` saves it.
+
+        Raises:
+            OptionValueError: There is no such column.
+            MissingExtraError: Matplotlib is missing.
+        """
+        from .pictures import draw_pairs
+
+        drawn: Figure | SubFigure = draw_pairs(self.values(of), self.summary(of), self.baseline, of, figure)
+        return drawn
+
+
+def evaluate(
+    simulation: Any,
+    contenders: Mapping[str, Policies],
+    *,
+    seeds: Iterable[int],
+    points: Any = None,
+    baseline: str | None = None,
+    metric: Any = None,
+    team: Callable[[Returns], Any] | None = None,
+    confidence: float = 0.95,
+    width: float | None = None,
+    batched: bool = False,
+    batch_size: int = 1024,
+    workers: int = 0,
+    progress: bool = False,
+    **options: Any,
+) -> Evaluation:
+    """Have contenders meet the same seeds.
+
+    Args:
+        simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
+        contenders: From a name to policies, as ``simulate`` takes them. ``{}``: the model as it is.
+        seeds: What the simulations are reset with; all different.
+        points: The decision points, as ``generate_env`` takes them. Agents for whom a contender has no policy are left
+            to their rule, and have returns like all others.
+        baseline: The contender that the others are compared with.
+        metric: A callable of the simulation after its end, whose column is ``metric``, or a dict of them by column.
+            Numbers, strings or None.
+        team: What the returns of an episode make together; None: their sum. It gets the returns of the agents, which
+            are numbers (``max`` serves) and a mapping by agent (``lambda returns: returns["waterer_0"]``).
+        confidence: Of the intervals.
+        width: Stop as soon as the interval of every difference from the baseline (without one: of every mean) is at
+            most this wide; ``seeds`` are then those that there may be. Looked at from 16 seeds on, now and then.
+        batched: Whether policies are those of ``simulate_many``, which answer many decisions at once.
+        batch_size: How many simulations may be suspended together, if so.
+        workers: How many processes share the work: see ``simulate_many``.
+        progress: Whether to show a bar, by ``tqdm``.
+        **options: As ``simulate`` takes them.
+
+    Returns:
+        The evaluation.
+
+    Raises:
+        OptionValueError: An argument cannot have its value. Nothing has run.
+        MissingExtraError: pandas, SciPy, joblib or tqdm is missing.
+        SimEnvError: Something else cannot work; the leaf says what.
+        BaseException: Whatever a model, a mapping, a policy or a metric raises, with a note that says of which seed.
+    """
+    needed("pandas", "evaluate"), needed("scipy.stats", "evaluate")
+    found = checked_contenders(contenders)
+    _check(found, baseline, confidence, width, team)
+    places = checked_seeds(seeds)
+    check_distinct(places)
+    check_numbers(batch_size, workers)
+    checked_options(options)
+    metrics = checked_metrics(metric)
+    size = int(batch_size) if batched else 0
+    common = (simulation, points, options, points_of(found), metrics, size)
+    plans = _plans(found, *common[:4])  # made here also where the work is done elsewhere, so that errors come before
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in found}
+    done = 0
+    with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar:
+        while done < len(places):
+            lot = places[done : _next(done, len(places), width)]
+            for name, known in outcomes.items():
+                if workers:
+                    arguments = ({name: found[name]}, *common)
+                    parts = spread(_play_part, arguments, lot, int(workers), size)
+                    known += [outcome for _, part in parts for outcome in part]
+                else:
+                    known += _play(plans[name], lot, metrics, size)
+                if bar is not None:
+                    bar.update(len(lot))
+            done += len(lot)
+            if width is not None and done >= FIRST and _widest(outcomes, team, baseline, confidence) <= width:
+                break
+    return Evaluation(_frame(places[:done], outcomes, tuple(metrics), team), baseline, float(confidence))
+
+
+def _next(done: int, number: int, width: float | None) -> int:
+    """Up to which seed it goes on before intervals are looked at again: each look takes its time, too."""
+    return number if width is None else min(number, max(FIRST, done + max(4, done // 8)))
+
+
+def _widest(outcomes: Mapping[str, Sequence[Outcome]], team: Any, baseline: str | None, confidence: float) -> float:
+    values = {
+        name: np.array([team_value(team, outcome.returns) for outcome in known]) for name, known in outcomes.items()
+    }
+    if baseline is not None:
+        base = values.pop(baseline)
+        values = {name: own - base for name, own in values.items()}
+    bounds = [interval(own, confidence) for own in values.values()]
+    return max((high - low for low, high in bounds), default=0.0)
+
+
+def _plans(
+    contenders: Mapping[str, Policies], simulation: Any, points: Any, options: Mapping[str, Any], named: Sequence[Any]
+) -> dict[str, Plan]:
+    return {name: contender_plan(simulation, policies, points, options, named) for name, policies in contenders.items()}
+
+
+def _play_part(
+    contender: Mapping[str, Policies],
+    simulation: Any,
+    points: Any,
+    options: Mapping[str, Any],
+    named: Sequence[Any],
+    metrics: Metrics,
+    size: int,
+    seeds: list[int],
+) -> list[Outcome]:
+    """In a worker: play a part of a contender's episodes."""
+    (plan,) = _plans(contender, simulation, points, options, named).values()
+    return _play(plan, seeds, metrics, size)
+
+
+def _play(plan: Plan, seeds: Sequence[int], metrics: Metrics, size: int) -> list[Outcome]:
+    """Play episodes of a contender; ``size`` of them at once, or one by one where that is 0."""
+    if not size:
+        return [play(plan, seed, metrics) for seed in seeds]
+    outcomes: dict[int, Outcome] = {}
+    play_many(plan, seeds, size, metrics, outcomes.__setitem__)
+    return [outcomes[place] for place in range(len(seeds))]
+
+
+def _frame(seeds: Sequence[int], outcomes: Mapping[str, Sequence[Outcome]], metrics: Sequence[str], team: Any) -> Any:
+    columns: dict[str, list[Any]] = {name: [] for name in ("contender", "seed", "agent", "return", "length", *metrics)}
+    for contender, known in outcomes.items():
+        for seed, outcome in zip(seeds, known, strict=True):
+            for row in rows_of(outcome, team):
+                values = (contender, seed, *row, *outcome.metrics.values())
+                for column, value in zip(columns.values(), values, strict=True):
+                    column.append(value)
+    return needed("pandas", "evaluate").DataFrame(columns)
+
+
+def rows_of(outcome: Outcome, team: Any) -> list[tuple[str, float, int]]:
+    """Agent, return and length: of each agent, and of the team."""
+    rows = [(agent, value, outcome.lengths[agent]) for agent, value in outcome.returns.items()]
+    return [*rows, (TEAM, team_value(team, outcome.returns), sum(outcome.lengths.values()))]
+
+
+# -- what is checked before anything runs ---------------------------------------------------------
+
+
+def check_distinct(seeds: Sequence[int]) -> None:
+    """Make sure that there are seeds, and each but once.
+
+    Raises:
+        OptionValueError: It is otherwise.
+    """
+    if not seeds:
+        raise OptionValueError("seeds must be some integers, such as range(32): there are none")
+    twice = next((seed for seed in seeds if seeds.count(seed) > 1), None) if len(set(seeds)) < len(seeds) else None
+    if twice is not None:
+        raise OptionValueError(f"the seed {twice} is there twice: it would bring the same again, and count as more")
+
+
+def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: Any) -> None:
+    if not contenders:
+        raise OptionValueError("contenders must be some, such as {'rule': {}}: there are none")
+    if baseline is not None and baseline not in contenders:
+        raise OptionValueError(f"the baseline {shown(baseline)} is none of the contenders: {', '.join(contenders)}")
+    _check_number("confidence", confidence)
+    if not 0 < confidence < 1:
+        raise OptionValueError(f"confidence must lie between 0 and 1, not {shown(confidence)}")
+    if width is not None:
+        _check_number("width", width)
+        if width <= 0:
+            raise OptionValueError(f"width must be positive, not {shown(width)}")
+    if team is not None and not callable(team):
+        raise OptionValueError(f"team must be a callable of the returns, or None, not {shown(team)}")
+
+
+def _check_number(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not isfinite(value):
+        raise OptionValueError(f"{name} must be a finite number, not {shown(value)}")

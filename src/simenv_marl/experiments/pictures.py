@@ -1,0 +1,144 @@
+"""Pictures of what experiments have found."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ..many.plots import ABSENT, COLOURS, INK, PALE, style
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+LINES: Final = 200
+"""So many seeds at most are drawn as lines."""
+
+
+def _bare(axes: Any, *, grid: str) -> None:
+    axes.tick_params(labelsize=8, colors=INK, color=PALE)
+    axes.grid(axis=grid, color=ABSENT, linewidth=0.7)
+    axes.set_axisbelow(True)
+
+
+def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: str, figure: Any) -> Any:
+    """Draw the values of contenders seed by seed, and their differences from the baseline.
+
+    Args:
+        values: A row for each seed, a column for each contender.
+        summary: The means, with their intervals, by contender.
+        baseline: The contender to compare with; None: no differences are drawn.
+        of: What the values are.
+        figure: Where to draw; None: a new figure.
+    """
+    names = list(values.columns)
+    others = [name for name in names if name != baseline]
+    panels = 2 if baseline is not None and others else 1
+    with style("plot") as new_figure:
+        if figure is None:
+            figure = new_figure(2.2 + 1.1 * len(names) + (1.2 + 1.1 * len(others)) * (panels - 1), 4.2)
+        ratios = [len(names), len(others)][:panels]
+        drawn = figure.subplots(1, panels, squeeze=False, width_ratios=ratios)[0]
+        _draw_values(drawn[0], values, summary, f"{of} of the team")
+        if panels == 2:
+            _draw_differences(drawn[1], values, summary, str(baseline), others)
+    return figure
+
+
+def _draw_values(axes: Any, values: DataFrame, summary: DataFrame, what: str) -> None:
+    """A line for each seed, from contender to contender."""
+    names, places = list(values.columns), np.arange(len(values.columns))
+    numbers = values.to_numpy(np.float64)
+    for row in numbers[:LINES]:
+        axes.plot(places, row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
+    for place, name in enumerate(names):
+        colour = COLOURS[place % len(COLOURS)]
+        axes.scatter(
+            np.full(len(numbers), place), numbers[:, place], 14, color=colour, alpha=0.5, linewidths=0, zorder=2
+        )
+        _mark(axes, place, *summary.loc[name, ["mean", "low", "high"]])
+    axes.set_xticks(places, names)
+    axes.set_xlim(-0.5, len(names) - 0.5)
+    axes.set_ylabel(what)
+    axes.set_title(f"{len(values)} seeds, each a line")
+    _bare(axes, grid="y")
+
+
+def _draw_differences(axes: Any, values: DataFrame, summary: DataFrame, baseline: str, others: list[str]) -> None:
+    """A dot for each seed: by how much a contender does better on it."""
+    axes.axhline(0.0, color=INK, linewidth=0.8, zorder=1)
+    base, names = values[baseline].to_numpy(np.float64), list(values.columns)
+    for place, name in enumerate(others):
+        apart = values[name].to_numpy(np.float64) - base
+        across = place + 0.24 * (2 * (np.arange(len(apart)) * 0.618034 % 1) - 1)  # spread evenly, in no order
+        colour = COLOURS[names.index(name) % len(COLOURS)]
+        axes.scatter(across, apart, 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
+        _mark(axes, place, *summary.loc[name, ["difference", "difference_low", "difference_high"]])
+    axes.set_xticks(range(len(others)), others)
+    axes.set_xlim(-0.5, len(others) - 0.5)
+    axes.set_ylabel(f"more than {baseline}, on the same seed")
+    axes.set_title("differences")
+    _bare(axes, grid="y")
+
+
+def _mark(axes: Any, place: float, mean: float, low: float, high: float) -> None:
+    bars = None if np.isnan(low) else [[max(0.0, mean - low)], [max(0.0, high - mean)]]
+    axes.errorbar([place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5)
+    axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), textcoords="offset points", va="center", fontsize=8.5)
+
+
+# -- effects --------------------------------------------------------------------------------------
+
+DRAWN: Final = 4
+"""So many interactions at most are drawn."""
+
+
+def draw_effects(effects: Any, figure: Any) -> Any:
+    """Draw main effects in a row and, below them, the strongest interactions.
+
+    Args:
+        effects: The effects.
+        figure: Where to draw; None: a new figure.
+    """
+    factors = list(dict.fromkeys(effects.main.index.get_level_values("factor")))
+    pairs = [pair for pair, strength in effects.interactions["strength"].items() if strength > 0][:DRAWN]
+    columns = max(len(factors), len(pairs))
+    with style("plot") as new_figure:
+        if figure is None:
+            figure = new_figure(max(3.2, 2.3 * columns), 2.8 * (2 if pairs else 1))
+        rows = figure.subplots(2 if pairs else 1, columns, squeeze=False)
+        for axes in rows[0][1 : len(factors)]:
+            axes.sharey(rows[0][0])
+        for axes, factor in zip(rows[0], factors, strict=False):
+            own = effects.main.loc[factor]
+            bars = [(own["mean"] - own["low"]).clip(lower=0), (own["high"] - own["mean"]).clip(lower=0)]
+            axes.errorbar(
+                range(len(own)), own["mean"], yerr=bars, fmt="o-", color=COLOURS[0], linewidth=1, markersize=4
+            )
+            _levels_below(axes, list(own.index), factor)
+        rows[0][0].set_ylabel(f"{effects.of}, mean")
+        for axes, (one, other) in zip(rows[-1], pairs, strict=False):
+            table = effects.cells(one, other)
+            for place, level in enumerate(table.columns):
+                colour = COLOURS[place % len(COLOURS)]
+                axes.plot(
+                    range(len(table)), table[level].to_numpy(), "o-", color=colour, markersize=4, label=_short(level)
+                )
+            _levels_below(axes, list(table.index), one)
+            axes.legend(title=other, fontsize=7, title_fontsize=8)
+        for axes in [*rows[0][len(factors) :], *(rows[-1][len(pairs) :] if pairs else ())]:
+            axes.set_visible(False)
+    return figure
+
+
+def _levels_below(axes: Any, levels: list[Any], factor: str) -> None:
+    axes.set_xticks(range(len(levels)), [_short(level) for level in levels])
+    axes.set_xlim(-0.4, len(levels) - 0.6)
+    axes.set_xlabel(factor)
+    _bare(axes, grid="y")
+
+
+def _short(level: Any) -> str:
+    if hasattr(level, "left"):
+        return f"{level.left:.3g} to {level.right:.3g}"
+    return f"{level:.4g}" if isinstance(level, float) else str(level)

@@ -1,0 +1,154 @@
+"""Which combinations of factors are run."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simenv_marl import OptionValueError, design
+
+SIZED = ("latin_hypercube", "sobol", "halton")
+TWO_LEVELS = ("fractional_factorial", "plackett_burman")
+METHODS = ("full_factorial", *TWO_LEVELS, *SIZED, "central_composite", "one_at_a_time", "saltelli")
+
+ranges = st.one_of(
+    st.tuples(st.integers(-50, 50), st.integers(1, 60)).map(lambda pair: (pair[0], pair[0] + pair[1])),
+    st.tuples(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6)).map(lambda pair: (pair[0], pair[0] + pair[1])),
+)
+levels = st.lists(st.one_of(st.integers(), st.booleans(), st.none(), st.text(max_size=3)), min_size=1, max_size=4,
+                  unique_by=lambda level: (type(level), level))  # fmt: skip
+factors = st.dictionaries(st.text(min_size=1, max_size=3), st.one_of(ranges, levels), min_size=1, max_size=4)
+
+
+def allowed(value, given):
+    if isinstance(given, tuple):
+        whole = all(type(bound) is int for bound in given)
+        return type(value) is (int if whole else float) and given[0] <= value <= given[1]
+    return any(type(value) is type(level) and value == level for level in given)
+
+
+def values(table, name):
+    return table[name].tolist()
+
+
+@settings(max_examples=60)
+@given(factors=factors, method=st.sampled_from(METHODS), n=st.sampled_from([2, 4, 8, 16]), seed=st.integers(0, 99))
+def test_values_are_of_the_factors_and_designs_are_repeatable(factors, method, n, seed):
+    chosen = n if method in (*SIZED, "saltelli") else None
+    try:
+        table = design(factors, method, chosen, seed=seed)
+    except OptionValueError:
+        few = any(isinstance(given, list) and len(given) != 2 for given in factors.values())
+        ranges = all(isinstance(given, tuple) for given in factors.values())
+        assert (method in TWO_LEVELS and few) or (method == "central_composite" and not (ranges and len(factors) > 1))
+        return
+    assert list(table.columns) == list(factors)
+    for name, given_ in factors.items():
+        assert all(allowed(value, given_) for value in values(table, name)), (name, given_)
+    assert design(factors, method, chosen, seed=seed).equals(table)
+    if method in SIZED:
+        assert len(table) == n
+
+
+def test_columns_have_the_types_of_the_factors():
+    table = design({"i": (1, 4), "f": (0.0, 1), "s": ["a", "b"], "b": [True, False], "o": ["a", 1], "n": [3, 1]})
+    assert [dtype.kind for dtype in table.dtypes[["i", "f", "b", "o", "n"]]] == ["i", "f", "b", "O", "i"]
+    assert set(map(type, values(table, "s"))) == {str}
+
+
+def test_a_full_factorial_has_all_combinations():
+    table = design({"a": [3, 1], "b": ["x", "y", "z"], "c": (0.0, 1.0)}, n=3)
+    expected = list(itertools.product([3, 1], "xyz", [0.0, 0.5, 1.0]))
+    assert list(table.itertuples(index=False, name=None)) == expected
+    assert values(design({"c": (1, 2)}, n=9), "c") == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("number", "n"), [(3, 4), (4, 8), (5, 8), (5, 16), (6, 16), (7, 8), (8, 16), (15, 16), (9, 128)]
+)
+def test_a_fraction_is_balanced_and_orthogonal(number, n):
+    table = design({f"x{place}": (-1, 1) for place in range(number)}, "fractional_factorial", n)
+    matrix = table.to_numpy()
+    assert len(table) == n
+    assert (matrix.T @ matrix == n * np.eye(number)).all()
+    assert (matrix.sum(axis=0) == 0).all()
+
+
+@pytest.mark.parametrize(("number", "n"), [(4, 8), (6, 16), (8, 16)])
+def test_main_effects_are_not_mixed_with_interactions_where_that_can_be(number, n):
+    matrix = design({f"x{place}": (-1, 1) for place in range(number)}, "fractional_factorial", n).to_numpy()
+    for one, other in itertools.combinations(range(number), 2):
+        assert not (matrix.T @ (matrix[:, one] * matrix[:, other])).any()
+
+
+@pytest.mark.parametrize("number", [*range(1, 20), 24, 27])
+def test_plackett_burman_is_orthogonal_in_few_runs(number):
+    table = design({f"x{place}": (-1, 1) for place in range(number)}, "plackett_burman")
+    matrix = table.to_numpy()
+    assert len(table) % 4 == 0
+    assert number < len(table) <= number + 8
+    assert (matrix.T @ matrix == len(table) * np.eye(number)).all()
+
+
+def test_a_latin_hypercube_has_one_row_in_each_slice():
+    table = design({"f": (0.0, 10.0), "i": (1, 10), "s": list("abcde")}, "latin_hypercube", 10, seed=3)
+    assert sorted(int(value) for value in table["f"]) == list(range(10))
+    assert sorted(table["i"]) == list(range(1, 11))
+    assert sorted(table["s"]) == sorted("aabbccddee")
+    assert not table.equals(design({"f": (0.0, 10.0), "i": (1, 10), "s": list("abcde")}, "latin_hypercube", 10, seed=4))
+
+
+def test_one_at_a_time_changes_one_factor():
+    table = design({"a": (0, 10), "b": ["x", "y", "z"], "c": (0.0, 1.0)}, "one_at_a_time")
+    rows = list(table.itertuples(index=False, name=None))
+    assert rows[0] == (5, "x", 0.5)
+    assert all(sum(a != b for a, b in zip(row, rows[0], strict=True)) == 1 for row in rows[1:])
+    assert rows[1:] == [(0, "x", 0.5), (10, "x", 0.5), (5, "y", 0.5), (5, "z", 0.5), (5, "x", 0.0), (5, "x", 1.0)]
+
+
+def test_a_central_composite_design_stays_within_its_ranges():
+    table = design({"a": (0.0, 2.0), "b": (-4.0, 4.0)}, "central_composite")
+    assert len(table) == 9
+    assert (table.min().tolist(), table.max().tolist()) == ([0.0, -4.0], [2.0, 4.0])
+    assert not table.duplicated().any()
+
+
+@pytest.mark.parametrize(
+    ("match", "arguments"),
+    [
+        ("must be a dict", ({},)),
+        ("must be a dict", ([1],)),
+        ("has no levels", ({"a": []},)),
+        ("twice", ({"a": [1, 2, 1]},)),
+        ("a tuple is a range", ({"a": (1, 2, 3)},)),
+        ("a tuple is a range", ({"a": ("x", "y")},)),
+        ("a tuple is a range", ({"a": (0.0, float("inf"))},)),
+        ("is empty", ({"a": (2, 2)},)),
+        ("must be a range", ({"a": "levels"},)),
+        ("must be a range", ({"a": 3},)),
+        ("must be a string", ({1: [1]},)),
+        ("method must be one of", ({"a": [1]}, "best")),
+        ("needs n", ({"a": (0, 1)}, "sobol")),
+        ("positive integer", ({"a": (0, 1)}, "sobol", 0)),
+        ("power of two", ({"a": (0, 1), "b": (0, 1), "c": (0, 1)}, "fractional_factorial", 6)),
+        ("power of two", ({"a": (0, 1), "b": (0, 1), "c": (0, 1)}, "fractional_factorial", 2)),
+        ("power of two", ({"a": (0, 1), "b": (0, 1), "c": (0, 1)}, "fractional_factorial", 16)),
+        ("two levels", ({"a": [1, 2, 3], "b": (0, 1)}, "fractional_factorial")),
+        ("two levels", ({"a": [1, 2, 3], "b": (0, 1)}, "plackett_burman")),
+        ("has 4 runs", ({"a": (0, 1)}, "plackett_burman", 8)),
+        ("one of ranges", ({"a": [1, 2], "b": (0, 1)}, "central_composite")),
+        ("two factors", ({"a": (0, 1)}, "central_composite")),
+        ("power of two", ({"a": (0, 1)}, "saltelli", 3)),
+        ("more than 10,000,000", ({f"x{i}": list(range(100)) for i in range(4)},)),
+    ],
+)
+def test_what_cannot_be_is_refused(match, arguments):
+    with pytest.raises(OptionValueError, match=match):
+        design(*arguments)
+
+
+def test_a_seed_that_is_none_is_refused():
+    with pytest.raises(OptionValueError, match="seed"):
+        design({"a": (0, 1)}, "sobol", 4, seed=-1)

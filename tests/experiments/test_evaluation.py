@@ -1,0 +1,245 @@
+"""Contenders on the same seeds."""
+
+import builtins
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from simenv_marl import (
+    RULE,
+    AgentError,
+    MissingExtraError,
+    OptionValueError,
+    UnknownPointError,
+    aec_env,
+    evaluate,
+    make_step,
+    simulate,
+)
+from tests.worlds.shops import OBSERVED, POINTS, Shop, level, much, much_of_many, some, some_of_many
+
+SEEDS = range(12)
+CONTENDERS = {"rule": {}, "much": {"keeper": much}}
+
+
+def returns_by_hand(policies, seed, **options):
+    """The returns of an AEC environment that is played with the same policies."""
+    env = aec_env(Shop, POINTS, **options)
+    env.reset(seed=seed)
+    found = {}
+    while env.agents:
+        name = env.agent_selection
+        observation, reward, terminated, truncated, _ = env.last()
+        found[name] = found.get(name, 0.0) + reward
+        policy = policies.get(name, lambda observation: RULE)
+        env.step(None if terminated or truncated else policy(observation))
+    return found
+
+
+def test_the_frame_has_a_row_for_each_agent_and_one_for_the_team():
+    found = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, metric={"level": level})
+    frame = found.frame
+    assert list(frame.columns) == ["contender", "seed", "agent", "return", "length", "level"]
+    assert len(frame) == 2 * len(SEEDS) * 3
+    for name, policies in CONTENDERS.items():
+        for seed in SEEDS:
+            rows = frame[(frame.contender == name) & (frame.seed == seed)].set_index("agent")
+            assert list(rows.index) == ["keeper", "helper", "team"]
+            expected = returns_by_hand(policies, seed)
+            assert rows.loc[["keeper", "helper"], "return"].to_dict() == expected
+            assert rows.loc["team", "return"] == sum(expected.values())
+            assert rows["length"].to_dict() == {"keeper": 3, "helper": 3, "team": 6}
+            assert set(rows["level"]) == {simulate(Shop, policies, points=POINTS, seed=seed).level}
+
+
+@pytest.mark.parametrize("arguments", [{"workers": 2}, {"batched": True}, {"batched": True, "workers": 2}], ids=str)
+def test_the_same_comes_of_all_ways_to_run_it(arguments):
+    contenders = {"rule": {}, "much": {"keeper": much_of_many if arguments.get("batched") else much}}
+    alone = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, metric=level)
+    assert evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, metric=level, **arguments).frame.equals(alone.frame)
+    assert "metric" in alone.frame.columns
+
+
+def test_batched_policies_answer_many():
+    asked = []
+
+    def policy(observations):
+        asked.append(len(observations))
+        return some_of_many(observations)
+
+    evaluate(Shop, {"some": {"keeper": policy}}, seeds=SEEDS, points=POINTS, batched=True)
+    assert max(asked) == len(SEEDS)
+
+
+def test_the_summary_is_paired_by_seed():
+    contenders = {"rule": {}, "some": {"keeper": some}}
+    found = evaluate(Shop, contenders, seeds=range(32), points=POINTS, baseline="rule")
+    summary, values = found.summary(), found.values()
+    assert summary.index.name == "contender"
+    assert list(summary.index) == ["rule", "some"]
+    assert list(summary.columns) == ["mean", "low", "high", "difference", "difference_low", "difference_high"]
+    assert summary.loc["rule", ["difference", "difference_low", "difference_high"]].tolist() == [0.0, 0.0, 0.0]
+    apart = (values["some"] - values["rule"]).to_numpy()
+    assert summary.loc["some", "difference"] == pytest.approx(apart.mean())
+    expected = stats.bootstrap((apart,), np.mean, n_resamples=9999, rng=1).confidence_interval
+    assert summary.loc["some", ["difference_low", "difference_high"]].tolist() == pytest.approx(
+        [expected.low, expected.high], abs=0.2 * (expected.high - expected.low) + 1e-9
+    )
+    assert (summary["low"] < summary["mean"]).all()
+    assert (summary["mean"] < summary["high"]).all()
+    assert list(evaluate(Shop, CONTENDERS, seeds=[1, 2], points=POINTS).summary().columns) == ["mean", "low", "high"]
+    assert np.isnan(evaluate(Shop, CONTENDERS, seeds=[1], points=POINTS).summary()["low"]).all()
+
+
+def test_wider_intervals_are_surer():
+    widths = []
+    for confidence in (0.8, 0.99):
+        found = evaluate(Shop, {"rule": {}}, seeds=SEEDS, points=POINTS, confidence=confidence).summary()
+        widths.append(float((found["high"] - found["low"]).iloc[0]))
+    assert widths[0] < widths[1]
+
+
+def test_the_probability_of_improvement_counts_ties_half():
+    found = evaluate(Shop, {"a": {}, "same": {}, "much": {"keeper": much}}, seeds=SEEDS, points=POINTS, baseline="a")
+    assert found.improvement()["probability"].to_dict() == {"same": 0.5, "much": 1.0}
+
+
+def test_how_many_seeds_would_tell_a_difference():
+    contenders = {"rule": {}, "some": {"keeper": some}}
+    found = evaluate(Shop, contenders, seeds=range(40), points=POINTS, baseline="rule")
+    apart = (found.values()["some"] - found.values()["rule"]).std()
+    assert found.seeds_needed(apart / 2)["some"] == pytest.approx(34, abs=1)
+    assert found.seeds_needed(apart / 2, power=0.99)["some"] > found.seeds_needed(apart / 2)["some"]
+    for arguments in ({"difference": 0}, {"difference": "a"}, {"difference": 1, "power": 1}):
+        with pytest.raises(OptionValueError):
+            found.seeds_needed(**arguments)
+    with pytest.raises(OptionValueError, match="no baseline"):
+        evaluate(Shop, contenders, seeds=[1, 2], points=POINTS).seeds_needed(1)
+
+
+def test_the_number_of_seeds_is_that_of_the_t_test():
+    from simenv_marl.experiments.statistics import seeds_needed
+
+    apart = np.random.default_rng(0).normal(size=200)
+    number = seeds_needed(apart / apart.std(ddof=1), 0.5, 0.95, 0.8)
+    assert number == pytest.approx(34, abs=1)  # as tables of power have it
+    assert seeds_needed(np.zeros(3), 0.5, 0.95, 0.8) == 2
+    assert seeds_needed(apart, 1e-9, 0.95, 0.8) == float("inf")
+
+
+def test_it_stops_as_soon_as_intervals_are_narrow_enough():
+    found = evaluate(Shop, CONTENDERS, seeds=range(400), points=POINTS, baseline="rule", width=1e9)
+    assert len(found.values()) == 16
+    found = evaluate(Shop, {"rule": {}}, seeds=range(400), points=POINTS, width=2.0)
+    summary = found.summary()
+    assert 16 < len(found.values()) < 400
+    assert float((summary["high"] - summary["low"]).iloc[0]) <= 2.0
+    assert len(evaluate(Shop, {"rule": {}}, seeds=range(40), points=POINTS, width=1e-9).values()) == 40
+
+
+@pytest.mark.parametrize(
+    "team", [max, lambda returns: max(returns.values()), lambda returns: returns["keeper"], lambda r: dict(r)["keeper"]]
+)
+def test_the_team_is_what_its_user_makes_of_the_returns(team):
+    found = evaluate(Shop, {"much": {"keeper": much}}, seeds=[1], points=POINTS, team=team)
+    rows = found.frame.set_index("agent")["return"]
+    assert rows["team"] == rows["keeper"] > rows["helper"]
+
+
+def test_pairs_are_drawn():
+    found = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, baseline="rule", metric=level)
+    values, differences = found.plot("metric").axes
+    assert sum(len(line.get_xdata()) == 2 for line in values.lines) == len(SEEDS)
+    assert len(differences.collections[0].get_offsets()) == len(SEEDS)
+    assert len(evaluate(Shop, CONTENDERS, seeds=[1], points=POINTS).plot().axes) == 1
+
+
+def refused(match, error=OptionValueError, **arguments):
+    made = []
+
+    def factory():
+        made.append(1)
+        return Shop()
+
+    given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
+    with pytest.raises(error, match=match):
+        evaluate(factory, given.pop("contenders"), **given)
+    assert len(made) <= len(given["points"])  # looked at, and not run
+
+
+@pytest.mark.parametrize(
+    ("match", "arguments"),
+    [
+        ("there are none", {"contenders": {}}),
+        ("must be a dict", {"contenders": [much]}),
+        ("must be a string", {"contenders": {1: {}}}),
+        ("must be a dict from agents", {"contenders": {"a": much}}),
+        ("must be callable", {"contenders": {"a": {"keeper": 3}}}),
+        ("baseline 'x' is none of the contenders: rule, much", {"baseline": "x"}),
+        ("there are none", {"seeds": []}),
+        ("seed 3 is there twice", {"seeds": [3, 4, 3]}),
+        ("iterable of integers", {"seeds": 3}),
+        ("confidence", {"confidence": 1.0}),
+        ("confidence", {"confidence": "much"}),
+        ("width", {"width": 0}),
+        ("team", {"team": "sum"}),
+        ("metric", {"metric": "level"}),
+        ("called like another column", {"metric": {"seed": level}}),
+        ("workers", {"workers": -2}),
+        ("said by contenders", {"policies": {}}),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_runs(match, arguments):
+    refused(match, **arguments)
+
+
+def test_a_policy_of_an_unknown_agent_is_refused():
+    refused("nobody", UnknownPointError, contenders={"rule": {}, "a": {"nobody": much}})
+
+
+def test_an_agent_must_not_be_called_team():
+    points = {Shop.order: make_step(**OBSERVED, action_space_mapping=int, reward_mapping=level, agent="team")}
+    with pytest.raises(AgentError, match="team"):
+        evaluate(Shop, {"rule": {}}, seeds=[1], points=points)
+
+
+def test_metrics_are_numbers_strings_or_none():
+    values = {"f": lambda s: np.float32(0.5), "n": lambda s: None, "s": lambda s: "a", "a": lambda s: np.array(3)}
+    row = evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric=values).frame.iloc[0]
+    assert [row["f"], row["n"], row["s"], row["a"]] == [0.5, None, "a", 3]
+    with pytest.raises(OptionValueError, match="metric 'x' must be a number"):
+        evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, metric={"x": lambda s: [1]})
+
+
+def test_errors_tell_of_which_seed():
+    def failing(observation):
+        raise ZeroDivisionError("here")
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        evaluate(Shop, {"a": {"keeper": failing}}, seeds=[7], points=POINTS)
+    assert any("seed 7" in note for note in caught.value.__notes__)
+
+
+def test_a_missing_package_is_told_with_its_extra(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest, **kwargs):
+        if name.startswith("pandas"):
+            raise ImportError(name)
+        return real(name, *rest, **kwargs)
+
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingExtraError, match=r"simenv-marl\[experiments\]"):
+        evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS)
+
+
+def test_importing_the_package_imports_none_of_what_experiments_need():
+    code = (
+        "import sys, simenv_marl; print([m for m in ('pandas', 'scipy.stats', 'pydoe', 'SALib') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

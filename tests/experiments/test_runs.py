@@ -1,0 +1,407 @@
+"""Every row of a design, every contender, every seed: stored as it is run, and resumed."""
+
+import errno
+import json
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simenv_marl import OptionValueError, StoreError, UnknownPointError, Variant, evaluate, run_experiment
+from simenv_marl.experiments import store as stores
+from simenv_marl.experiments.playing import Outcome
+from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
+
+DESIGN = pd.DataFrame({"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]})
+ROOT = Path(__file__).parents[2]
+
+
+def run(store, design=DESIGN, make=Shop, **arguments):
+    policies = {"much": {"keeper": much}, "some": {"keeper": some}}
+    given = {"policies": policies, "seeds": range(4), "points": POINTS, "metric": {"level": level}, **arguments}
+    return run_experiment(make, design, store=store, **given)
+
+
+def lines(store):
+    """All whole lines of a store."""
+    whole = (line for path in store.glob("*.jsonl") for line in path.read_bytes().split(b"\n")[:-1])
+    return [json.loads(line) for line in whole]
+
+
+def test_the_table_is_tidy_and_in_order(tmp_path):
+    frame = run(tmp_path)
+    others = ["contender", "seed", "agent", "return", "length", "level", "status", "error"]
+    assert list(frame.columns) == ["days", "price", "kind", *others]
+    assert frame[["days", "price", "kind"]].dtypes.equals(DESIGN.dtypes)
+    runs = frame[frame.agent == "team"]
+    expected = [
+        (*row, name, seed) for row in DESIGN.values.tolist() for name in ("rule", "much", "some") for seed in range(4)
+    ]
+    assert runs[["days", "price", "kind", "contender", "seed"]].values.tolist() == [list(row) for row in expected]
+    failed = runs[runs.status == "error"]
+    assert set(failed["kind"]) == {"faulty"}
+    assert set(failed["seed"]) == {1, 3}
+    assert set(failed["error"]) == {"ZeroDivisionError: no change"}
+    assert failed["return"].isna().all()
+    good = frame[(frame["kind"] == "plain") & (frame["days"] == 2)].drop(
+        columns=["days", "price", "kind", "status", "error"]
+    )
+    alone = evaluate(
+        lambda: Shop(2, 2.0), {"rule": {}, "much": {"keeper": much}, "some": {"keeper": some}}, seeds=range(4),
+        points=POINTS, metric={"level": level},
+    )  # fmt: skip
+    assert good.reset_index(drop=True).equals(alone.frame)
+
+
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_the_table_is_the_same_for_every_number_of_workers(workers, tmp_path):
+    alone = run(tmp_path / "alone")
+    assert run(tmp_path / "shared", workers=workers).equals(alone)
+    assert len({path.name.split("-")[2] for path in (tmp_path / "shared").glob("*.jsonl")}) <= workers
+
+
+@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batch_size": 2}], ids=str)
+def test_batched_policies_bring_the_same(arguments, tmp_path):
+    policies = {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}}
+    assert run(tmp_path / "b", policies=policies, batched=True, **arguments).equals(run(tmp_path / "a"))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda days, price, kind: Shop(days, price, kind),
+        lambda days, price, kind: Variant("v", Shop, parameters={"days": days, "price": price, "kind": kind}),
+        lambda days, price, kind: lambda: Shop(days, price, kind),
+        lambda **row: type("Sub", (Shop,), {"__init__": lambda self: Shop.__init__(self, **row)}),
+        Variant("v", Shop),
+    ],
+)
+def test_whatever_makes_simulations(make, tmp_path):
+    assert run(tmp_path / "a", make=make).equals(run(tmp_path / "b"))
+
+
+def test_points_may_differ_from_row_to_row(tmp_path):
+    class Own(Shop):
+        def __init__(self, who):
+            super().__init__()
+            self.points = {point: definition for point, definition in POINTS.items() if definition.agent != who}
+
+    design = pd.DataFrame({"who": ["helper", "keeper", "helper", "none"]})
+    frame = run_experiment(Own, design, seeds=[1, 2], store=tmp_path)
+    agents = frame[frame.seed == 1].groupby("who", sort=False)["agent"].agg(set).to_dict()
+    assert agents == {"helper": {"keeper", "team"}, "keeper": {"helper", "team"}, "none": {"keeper", "helper", "team"}}
+
+
+def test_each_run_is_a_line_with_its_provenance(tmp_path):
+    run(tmp_path)
+    known = lines(tmp_path)
+    assert len(known) == 3 * 3 * 4
+    assert {(entry["status"], entry["error"]) for entry in known} == {
+        ("ok", None), ("error", "ZeroDivisionError: no change")
+    }  # fmt: skip
+    entry = next(entry for entry in known if entry["contender"] == "some" and entry["seed"] == 2)
+    provenance = entry["provenance"]
+    assert provenance["seed"] == 2
+    assert provenance["simulation"] == "tests.worlds.shops.Shop"
+    assert provenance["policies"] == {"keeper": "tests.worlds.shops.some"}
+    assert "numpy" in provenance["dependencies"]
+
+
+def test_what_is_known_is_not_run_again(tmp_path):
+    calls = []
+
+    def make(days):
+        calls.append(days)
+        return Shop(days)
+
+    def again(days, seeds=range(3), policies=None):
+        calls.clear()
+        return run_experiment(make, {"days": days}, policies=policies, seeds=seeds, points=POINTS, store=tmp_path)
+
+    first = again([1, 2])
+    assert again([1, 2]).equals(first)
+    assert len(calls) <= 1  # it is looked at
+    assert again([1, 2], range(2)).equals(first[first.seed < 2].reset_index(drop=True))
+    again([3, 1, 2], range(4), {"much": {"keeper": much}})
+    assert len(lines(tmp_path)) == 3 * 4 * 2
+    with pytest.warns(UserWarning, match="1 rows that this design does not have"):
+        assert again([1, 2]).equals(first)
+
+
+def test_a_torn_last_line_is_a_run_that_is_not_known(tmp_path):
+    first = run(tmp_path)
+    (path,) = tmp_path.glob("*.jsonl")
+    whole = path.read_bytes()
+    for cut in (1, 20, 700):
+        path.write_bytes(whole[:-cut])
+        assert run(tmp_path).equals(first)
+        for other in set(tmp_path.glob("*.jsonl")) - {path}:
+            other.unlink()
+    path.write_bytes(whole.replace(b'"status":"ok"', b'"status:"ok"', 1))
+    with pytest.warns(UserWarning, match="line 1 of .* cannot be read"):
+        assert run(tmp_path).equals(first)
+
+
+def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
+    Shop.change = False
+    try:
+        design = {"days": [1]}
+
+        def make(days):
+            shop = Shop(days)
+            if not Shop.change:
+                raise OSError("no licence")
+            return shop
+
+        def again(**arguments):
+            return run_experiment(make, design, seeds=[1], points=POINTS, store=tmp_path, **arguments)
+
+        assert again()["error"].tolist() == ["OSError: no licence"]
+        Shop.change = True
+        assert again()["status"].tolist() == ["error"]
+        assert again(retry_errors=True)["status"].tolist() == ["ok"] * 3
+        assert again()["status"].tolist() == ["ok"] * 3
+    finally:
+        del Shop.change
+
+
+def test_the_same_row_twice_is_run_once_and_stands_there_twice(tmp_path):
+    frame = run(tmp_path, pd.concat([DESIGN, DESIGN]))
+    half = len(frame) // 2
+    assert frame[half:].reset_index(drop=True).equals(frame[:half])
+    assert len(lines(tmp_path)) == 36
+
+
+scalars = st.one_of(
+    st.floats(), st.integers(), st.booleans(), st.none(), st.text(max_size=5), st.floats(width=32).map(np.float32),
+    st.integers(-9, 9).map(np.int64),
+)  # fmt: skip
+
+
+@given(row=st.dictionaries(st.text(max_size=4), scalars, max_size=4), values=st.lists(scalars, max_size=4))
+def test_values_come_back_as_they_were(row, values, tmp_path_factory):
+    plain = [value.item() if isinstance(value, np.generic) else value for value in values]
+    row = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
+    outcome = Outcome({"a": 0.1}, {"a": 1}, dict(zip("abcd", plain, strict=False)))
+    folder = tmp_path_factory.mktemp("store")
+    stores.prepare(folder, list(row), [])
+    writer = stores.Writer(folder, "s")
+    writer.write(stores.line_of(row, "rule", 3, stores.Known(outcome, None), '{"seed":3}'))
+    writer.close()
+    (((key, contender, seed), known),) = stores.read(folder, list(row)).runs.items()
+    assert (contender, seed) == ("rule", 3)
+    assert same(json.loads(key), row)
+    assert same(known.outcome.metrics, outcome.metrics)
+
+
+def same(one, other):
+    return list(one) == list(other) and all(
+        type(one[key]) is type(other[key])
+        and (
+            one[key] == other[key] or (isinstance(one[key], float) and math.isnan(one[key]) and math.isnan(other[key]))
+        )
+        for key in one
+    )
+
+
+def test_factors_and_metrics_that_are_no_numbers_stay_what_they_are(tmp_path):
+    class Holder:
+        def __init__(self, thing):
+            self.thing = thing
+
+        def reset(self):
+            pass
+
+        def run(self):
+            pass
+
+    things = [1, 1.0, True, "1", None, math.inf, -0.0, 2**70]
+    design = pd.DataFrame({"thing": pd.Series(things, dtype=object)})
+    frame = run_experiment(Holder, design, seeds=[0], points=POINTS, metric=lambda s: s.thing, store=tmp_path)
+    for column in ("thing", "metric"):
+        assert [(type(value), value) for value in frame[column]] == [(type(value), value) for value in things]
+    assert math.copysign(1, frame["metric"][6]) == -1
+
+
+# -- what cannot be -------------------------------------------------------------------------------
+
+
+def one_argument(days):
+    return Shop(days)
+
+
+@pytest.mark.parametrize(
+    ("match", "arguments"),
+    [
+        ("cannot be called with the factors", {"make": one_argument}),
+        ("must be a callable of the factors", {"make": Shop()}),
+        ("cannot be called with the parameters", {"make": Variant("v", one_argument)}),
+        ("factor 'seed' is called like", {"design": {"seed": [1]}}),
+        ("factor 'error' is called like", {"design": {"error": [1]}}),
+        ("metric 'days' is called like", {"metric": {"days": level}}),
+        ("has no rows", {"design": DESIGN[:0]}),
+        ("must be a string", {"design": pd.DataFrame([[1]])}),
+        ("cannot be stored", {"design": {"days": [object()]}}),
+        ("must be a DataFrame", {"design": 3}),
+        ("there are none", {"seeds": []}),
+        ("'rule' is the model as it is", {"policies": {"rule": {"keeper": much}}}),
+        ("nobody", {"policies": {"a": {"nobody": much}}}),
+        ("unknown|no option", {"nonsense": 3}),
+        ("team", {"team": 3}),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, tmp_path):
+    with pytest.raises((OptionValueError, UnknownPointError, TypeError), match=match):
+        run(tmp_path / "store", **arguments)
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_store_of_another_experiment_is_refused(tmp_path):
+    run(tmp_path)
+    with pytest.raises(OptionValueError, match="its factors are"):
+        run(tmp_path, DESIGN[["days"]])
+    with pytest.raises(OptionValueError, match="its metrics are"):
+        run(tmp_path, metric=None)
+    with pytest.raises(OptionValueError, match="of which this design has none"):
+        run(tmp_path, DESIGN.assign(days=7))
+    with pytest.warns(UserWarning, match="1 rows that this design does not have"):
+        run(tmp_path, DESIGN[1:])
+    assert len(run(tmp_path)) > 0
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("")
+    with pytest.raises(OptionValueError, match="store of no experiment"):
+        run(other)
+
+
+def test_another_version_of_a_package_is_warned_of(tmp_path):
+    first = run(tmp_path)
+    (path,) = tmp_path.glob("*.jsonl")
+    path.write_bytes(path.read_bytes().replace(f'"numpy":"{np.__version__}"'.encode(), b'"numpy":"1.0"'))
+    with pytest.warns(UserWarning, match=f"numpy 1.0 then, {np.__version__} now"):
+        assert run(tmp_path).equals(first)
+
+
+def test_a_full_disk_is_told_and_what_is_stored_stays(tmp_path, monkeypatch):
+    real, written = os.write, []
+
+    def write(file, data):
+        if len(written) == 5:
+            real(file, data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written.append(data)
+        return real(file, data)
+
+    for batched in (False, True):
+        written.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(stores.os, "write", write)
+            with pytest.raises(StoreError, match="No space left"):
+                run(tmp_path / str(batched), policies=None, batched=batched)
+        assert len(lines(tmp_path / str(batched))) == 5
+        assert run(tmp_path / str(batched), policies=None).equals(run(tmp_path / "whole", policies=None))
+
+
+def test_a_store_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError):
+        run(tmp_path / "file")
+
+
+def test_progress_is_shown(tmp_path, capsys):
+    run(tmp_path, progress=True)
+    assert "36/36" in capsys.readouterr().err
+    run(tmp_path, progress=True, seeds=range(5), workers=2)
+    assert "45/45" in capsys.readouterr().err
+
+
+# -- killed ---------------------------------------------------------------------------------------
+
+SCRIPT = """
+    import sys
+    sys.path.insert(0, sys.argv[3])
+    import pandas as pd
+    from simenv_marl import run_experiment
+    from tests.worlds.shops import POINTS, Shop, level, some
+
+    if __name__ == "__main__":
+        design = pd.DataFrame({"days": range(1, 9), "price": 0.5, "kind": ["slow"] * 7 + ["faulty"]})
+        frame = run_experiment(Shop, design, policies={"some": {"keeper": some}}, seeds=range(6), points=POINTS,
+                               metric=level, store=sys.argv[1], workers=int(sys.argv[2]))
+        frame.to_pickle(sys.argv[1] + ".table")
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_path):
+    script, store = tmp_path / "script.py", tmp_path / "store"
+    script.write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
+    chance, kills, known = random.Random(workers), 0, 0
+
+    def start(folder, number):
+        command = [sys.executable, script, folder, str(number), ROOT]
+        return subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE)
+
+    for _ in range(100):
+        with start(store, workers) as process:
+            begun = len(list(store.glob("*.jsonl")))
+            deadline = time.monotonic() + 60  # until it has begun to run
+            while process.poll() is None and len(list(store.glob("*.jsonl"))) == begun and time.monotonic() < deadline:
+                time.sleep(0.005)
+            try:
+                process.wait(chance.uniform(0.0, 0.8 if workers else 0.25))
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                kills += 1
+            process.wait()
+        now = len(lines(store))
+        assert now >= known
+        known = now
+        if (tmp_path / "store.table").exists():
+            break
+    assert kills >= (1 if workers else 3)
+    with start(tmp_path / "undisturbed", 0) as process:
+        process.wait()
+    tables = [pd.read_pickle(tmp_path / f"{name}.table") for name in ("store", "undisturbed")]
+    assert tables[0].equals(tables[1])
+    keys = [(json.dumps(entry["factors"]), entry["contender"], entry["seed"]) for entry in lines(store)]
+    assert len(set(keys)) == 8 * 2 * 6
+    if not workers:
+        assert len(keys) == len(set(keys))
+
+
+PURE = """
+    import sys, pandas as pd
+    from simenv_marl import run_experiment
+
+    class Sum:
+        def __init__(self, a):
+            self.a = a
+        def reset(self, seed):
+            self.seed = seed
+        def run(self):
+            self.y = self.a + self.seed
+
+    frame = run_experiment(Sum, {"a": [1, 2]}, seeds=[5, 6], metric=lambda s: s.y, store=sys.argv[1])
+    print(frame[["a", "seed", "agent", "return", "metric"]].values.tolist())
+"""
+
+
+def test_models_that_decide_nothing_have_metrics(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(textwrap.dedent(PURE), encoding="utf-8")
+    done = subprocess.run([sys.executable, script, tmp_path / "s"], capture_output=True, text=True, check=True)
+    expected = [[a, seed, "team", 0.0, a + seed] for a in (1, 2) for seed in (5, 6)]
+    assert done.stdout.strip() == str(expected)

@@ -52,15 +52,15 @@ test-oldest: .venv-oldest/.oldest
 	touch $@
 
 # Local clusters, on the loopback address alone. Each has an environment of its own, because of what it pins.
-test-clusters: .venv-dask/.many .venv-ray/.many
+test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 	.venv-dask/bin/python -m tests.clusters.check dask
 	RAY_USAGE_STATS_ENABLED=0 .venv-ray/bin/python -m tests.clusters.check ray
 
-.venv-dask/.many: CLUSTER := dask[distributed]>=2025.1
-.venv-ray/.many: CLUSTER := ray>=2.40
-.venv-dask/.many .venv-ray/.many: pyproject.toml
+.venv-dask/.experiments: CLUSTER := dask[distributed]>=2025.1
+.venv-ray/.experiments: CLUSTER := ray>=2.40
+.venv-dask/.experiments .venv-ray/.experiments: pyproject.toml
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
-	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[many]' '$(CLUSTER)'
+	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[experiments]' '$(CLUSTER)'
 	touch $@
 
 lint: .venv/.test

@@ -24,6 +24,7 @@ SECTIONS = (
     "many",
     "branches",
     "wolf_sheep",
+    "experiments",
     "greenhouse",
 )
 """In the order in which they run. The greenhouse comes last, and each is imported when it runs, because the

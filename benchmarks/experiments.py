@@ -1,0 +1,117 @@
+"""What an experiment costs beside its model, what workers bring to it, and what it is worth to pair seeds.
+
+Overheads and intervals are measured wherever this runs; two workers only where it is not pinned to one core: run
+``python -m benchmarks.core --only experiments``.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+from examples.greenhouse_coop.env import GreenhouseSim
+from examples.greenhouse_coop.experiment.questions import BEST_CONSTANTS, FINAL
+from examples.greenhouse_coop.train import VENTILATOR, Crew, learn
+from tqdm import tqdm  # type: ignore[import-untyped]
+
+from benchmarks.measure import Section, now
+from benchmarks.noop import Model
+from simenv_marl import design, evaluate, run_experiment
+
+ROWS = 10_000
+WORK = 10e-3
+"""Seconds that a run of the slow model takes."""
+
+GENERATIONS = 15
+"""For how long the pair is trained: half a minute."""
+
+
+class Turn:
+    """A simulation that decides once, so that the machinery is all that remains."""
+
+    points = (f"{Model.__module__}.Model.left",)
+
+    def __init__(self, x: float = 0.0, n: int = 0) -> None:
+        self.x, self.n = x, n
+
+    def reset(self, seed: int) -> None:
+        self.model = Model()
+
+    def run(self) -> None:
+        self.model.left()
+
+
+class SlowTurn(Turn):
+    """The same, after a while of work."""
+
+    def run(self) -> None:
+        end = time.perf_counter() + WORK
+        while time.perf_counter() < end:
+            pass
+        self.model.left()
+
+
+def experiment(make: type, rows: int, workers: int) -> float:
+    """Seconds that an experiment takes, all of it; the processor's, where it is one process."""
+    table = design({"x": (0.0, 1.0), "n": (1, 1000)}, "sobol", rows)
+    clock = time.perf_counter if workers else now
+    with tempfile.TemporaryDirectory() as folder:
+        start = clock()
+        run_experiment(make, table, seeds=[0], store=folder, metric=lambda turn: turn.x, workers=workers)
+        return clock() - start
+
+
+def wall(rows: int, workers: int) -> float:
+    """The same of the slow model, by the wall clock."""
+    table = design({"x": (0.0, 1.0), "n": (1, 1000)}, "sobol", rows)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        run_experiment(SlowTurn, table, seeds=[0], store=folder, workers=workers)
+        return time.perf_counter() - start
+
+
+def widths(generations: int) -> tuple[float, float]:
+    """How wide the interval of the difference is, paired by seed and not: a trained pair against the best constants."""
+    with tqdm(disable=True) as bar, Crew(1, bar) as crew:
+        trained = learn(crew, BEST_CONSTANTS, generations, np.random.default_rng(0))
+    contenders: dict[str, Any] = {"constants": BEST_CONSTANTS, "trained": trained}
+    found = evaluate(
+        GreenhouseSim, contenders, seeds=FINAL, baseline="constants", team=lambda returns: returns[VENTILATOR]
+    )
+    values = found.values()
+    paired = found.summary().loc["trained", ["difference_low", "difference_high"]]
+    generator, number = np.random.default_rng(0), len(values)
+    draws = generator.integers(number, size=(2, 5000, number))
+    apart = values["trained"].to_numpy()[draws[0]].mean(1) - values["constants"].to_numpy()[draws[1]].mean(1)
+    low, high = np.quantile(apart, (0.025, 0.975))
+    return float(paired.iloc[1] - paired.iloc[0]), float(high - low)
+
+
+def measure(rounds: int, number: int) -> Section:
+    """Measure experiments.
+
+    Args:
+        rounds: Not used: the many rows of one round are enough.
+        number: How many rows there are at most: a smoke run has few.
+    """
+    rows = min(ROWS, number)
+    section = Section("Experiments", "milliseconds per run, seconds")
+    experiment(Turn, min(rows, 200), 0)  # what is imported and looked up once
+    overhead = experiment(Turn, rows, 0) / rows * 1e3
+    section.ratio(f"milliseconds per run beside the model, {rows:,} rows, one process", overhead, 1.0, 0.3, 3)
+    section.time("a run beside its model, milliseconds", overhead)
+    if (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) == 1:
+        section.remarks.append("Experiments: pinned to one core, so that two workers were not measured.")
+    else:
+        few = min(rows, 2000)
+        wall(16, 2)  # the workers start
+        alone, shared = wall(few, 0), wall(few, 2)
+        section.ratio("a model of 10 ms: one process / two workers", alone / shared, 1.8, 1.95, at_least=True)
+        section.time(f"{few} runs of 10 ms, one process, seconds", alone)
+        section.time(f"{few} runs of 10 ms, two workers, seconds", shared)
+    paired, unpaired = widths(GENERATIONS if rows == ROWS else 1)
+    section.ratio("width of the interval of a difference, paired / unpaired, 32 seeds", paired / unpaired, 0.5, 0.33)
+    return section

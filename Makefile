@@ -3,10 +3,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-clients test-rllib test-wrappers test-oldest test-clusters coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan test test-clients test-rllib test-wrappers test-oldest test-clusters coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
+
+plan: .venv/.demo
+	$(BIN)/python -m examples.greenhouse_coop.plan
 
 test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random

@@ -23,6 +23,7 @@ def draw(
     alive: Mapping[str, NDArray[Any]],
     poured: Mapping[str, NDArray[Any]],
     folder: Path,
+    name: str = "greenhouse.png",
 ) -> Path:
     """Draw the picture.
 
@@ -31,11 +32,12 @@ def draw(
         alive: Likewise, the plants alive by seed and day.
         poured: Likewise, the litres poured by seed and day.
         folder: Where to put it; is made if need be.
+        name: What it is called there.
 
     Returns:
         The path of the picture.
     """
-    colours = dict(zip(returns, COLOURS, strict=True))
+    colours = dict(zip(returns, (COLOURS[0], *COLOURS[1 - len(returns) :]), strict=True))
     figure = Figure(figsize=(12, 5.6), layout="constrained")
     FigureCanvasAgg(figure)  # no window, no state of pyplot
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.05), height_ratios=(1.5, 1))
@@ -43,7 +45,7 @@ def draw(
     _draw_alive(days := figure.add_subplot(grid[0, 1]), alive, colours)
     _draw_poured(figure.add_subplot(grid[1, 1], sharex=days), poured, colours)
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "greenhouse.png"
+    path = folder / name
     figure.savefig(path, dpi=150)
     return path
 

@@ -1,0 +1,204 @@
+"""The greenhouse, kept by plans: nothing is trained.
+
+``python -m examples.greenhouse_coop.plan`` (or ``make plan``) has the waterer try out nine amounts of water each day,
+in branches of a few days whose weather is drawn anew, before it pours the best of them. Once the model's own rule goes
+on in the branches, and once the best constant amount. It prints a table and draws a picture.
+
+Branches run on all cores, so the greenhouses are kept one after the other. What a branch costs is mostly the start of
+its process, which is the dearer the more the process has imported: what the picture needs is imported when all
+greenhouses have been kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simenv_marl import RULE, RolloutPolicy, collect_episodes
+
+from .env import DAYS, MOST_WATER, OBSERVED, GreenhouseSim
+from .model import PLANTS, Greenhouse
+
+WATERER, VENTILATOR = "waterer_0", "ventilator_0"
+
+HELD_OUT: Final = 1_000_000
+"""The greenhouses of ``make demo``: seeds from here on."""
+
+LITRES: Final = tuple(range(0, 161, 20))
+"""What the waterer tries out each day."""
+
+EXCHANGES: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""What the ventilator tries out, where it plans as well."""
+
+OUT: Final = Path(__file__).parent / "out"
+
+
+# -- policies -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Chooses the same always, for one observation or for many."""
+
+    value: float
+
+    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Choose an action."""
+        return np.full((*observation.shape[:-1], 1), self.value, np.float32)
+
+
+BEST: Final = {WATERER: Constant(0.084), VENTILATOR: Constant(1.0)}
+"""The best constant pair that ``make demo`` finds: 84 litres, and all of the air."""
+
+
+def days_left(env: Any) -> float:
+    """What is still to come, at most: each plant that is alive is worth as much as it brings if it stays so."""
+    greenhouse: Greenhouse = env.unwrapped.simulation.greenhouse
+    return greenhouse.alive / PLANTS * (DAYS - greenhouse.day)
+
+
+def share_alive(env: Any) -> float:
+    """What is still to come, valued too low: as if there was one more day."""
+    return float(env.unwrapped.simulation.greenhouse.alive / PLANTS)
+
+
+class CountingPlanner(RolloutPolicy):
+    """A planner that says beside each action how many days its branches have simulated, as the extra ``days``."""
+
+    def __init__(self, actions: Sequence[float], horizon: int, **options: Any) -> None:
+        """Make a planner.
+
+        Args:
+            actions: The candidates, as numbers.
+            horizon: For how many days they are tried out.
+            **options: As ``RolloutPolicy`` takes them.
+        """
+        super().__init__([np.array([action], np.float32) for action in actions], horizon=horizon, **options)
+        self._horizon = horizon
+
+    def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
+        """Decide. Within a branch of another planner, where nothing is tried out, there is the action alone."""
+        values = self.choose(_environment)
+        if not values.counts.any():
+            return values.best
+        day = _environment.simulation.greenhouse.day
+        return values.best, {"days": int(values.counts.sum()) * min(self._horizon, DAYS - day)}
+
+
+def water_planner(
+    base: Any = RULE, horizon: int = 3, futures: int = 2, rest: Callable[[Any], float] | None = days_left
+) -> CountingPlanner:
+    """A waterer that plans.
+
+    Args:
+        base: What is poured in branches from the second day on: ``RULE`` or a policy.
+        horizon: For how many days an amount is tried out.
+        futures: How much weather it is tried out in, on average.
+        rest: What comes after these days.
+    """
+    litres = [amount / MOST_WATER for amount in LITRES]
+    return CountingPlanner(litres, horizon, base=base, futures=futures, terminal_value=rest)
+
+
+def air_planner(base: Any = RULE, horizon: int = 3, futures: int = 2) -> CountingPlanner:
+    """A ventilator that plans, likewise."""
+    return CountingPlanner(EXCHANGES, horizon, base=base, futures=futures, terminal_value=days_left)
+
+
+# -- keeping greenhouses --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Kept:
+    """How greenhouses have fared.
+
+    Attributes:
+        returns: ``(seeds,)``: the return of the team, which is the ventilator's.
+        alive: ``(seeds, days + 1)``: the plants alive at the beginning of each day and at the end.
+        poured: ``(seeds, days)``: litres.
+        simulated: Days in branches, for an episode.
+    """
+
+    returns: NDArray[np.float64]
+    alive: NDArray[np.float64]
+    poured: NDArray[np.float64]
+    simulated: float
+
+
+def keep(policies: Mapping[str, Any], seeds: Sequence[int], *, progress: bool = False) -> Kept:
+    """Keep greenhouses.
+
+    Args:
+        policies: Who decides; ``RULE`` for those whom no policy leads.
+        seeds: Of the greenhouses.
+        progress: Whether to show a bar.
+    """
+    team = {WATERER: RULE, VENTILATOR: RULE} | dict(policies)
+    found = collect_episodes(GreenhouseSim, team, seeds=seeds, batch_size=1, progress=progress)
+    air, water = found[VENTILATOR], found[WATERER]
+    share = OBSERVED.index("share of the plants that are alive")
+    alive, poured = np.zeros((len(seeds), DAYS + 1)), np.zeros((len(seeds), DAYS))
+    alive[air.episodes, air.steps] = air.observations[:, share] * PLANTS
+    alive[range(len(seeds)), air.lengths] = air.last_observations[:, share] * PLANTS
+    poured[water.episodes, water.steps] = water.actions[:, 0] * MOST_WATER
+    simulated = sum(float(each.extras["days"].sum()) for each in found.values() if "days" in each.extras)
+    return Kept(air.returns, alive, poured, simulated / len(seeds))
+
+
+def teams(futures: int) -> dict[str, Mapping[str, Any]]:
+    """Who is compared, by title."""
+    air = {VENTILATOR: BEST[VENTILATOR]}
+    return {
+        "rule": {},
+        "best constant pair": BEST,
+        "watering planned over the rule": air | {WATERER: water_planner(RULE, 3, futures)},
+        "watering planned over the pair": air | {WATERER: water_planner(BEST[WATERER], 3, futures)},
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> dict[str, Kept]:
+    """Keep greenhouses, and show how they have fared as a table and as a picture."""
+    parser = argparse.ArgumentParser(description="Keep a greenhouse by plans.")
+    parser.add_argument("--seeds", type=int, default=32, help="greenhouses to keep (default: %(default)s)")
+    parser.add_argument("--futures", type=int, default=2, help="for each amount of water (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder for the picture (default: beside this file)")
+    options = parser.parse_args(arguments)
+    kept = {}
+    for title, policies in teams(options.futures).items():
+        print(title, flush=True)
+        kept[title] = keep(policies, range(HELD_OUT, HELD_OUT + options.seeds), progress=True)
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from .picture import draw
+
+    table = Table(title=f"{options.seeds} greenhouses of make demo: mean ± standard deviation")
+    table.add_column("who decides")
+    for column in ("return", f"alive, day {DAYS}", "litres poured", "days in branches"):
+        table.add_column(column, justify="right")
+    for title, own in kept.items():
+        values = (own.returns, ".1f"), (own.alive[:, -1], ".0f"), (own.poured.sum(axis=1), ".0f")
+        cells = [f"{np.mean(each):{form}} ± {np.std(each):<4{form}}" for each, form in values]
+        table.add_row(title, *cells, f"{own.simulated:,.0f}")
+    console = Console()
+    console.print(table)
+    path = draw(
+        {title: own.returns.tolist() for title, own in kept.items()},
+        {title: own.alive for title, own in kept.items()},
+        {title: own.poured for title, own in kept.items()},
+        options.out,
+        "plan.png",
+    )
+    console.print(f"Picture: {path}", soft_wrap=True)
+    return kept
+
+
+if __name__ == "__main__":
+    main()

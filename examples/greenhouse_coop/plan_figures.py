@@ -1,0 +1,164 @@
+"""What plans of the greenhouse are worth, against what they cost and how far they reach, in pictures.
+
+``python -m examples.greenhouse_coop.plan_figures`` draws ``plan-budget.png`` and ``plan-horizon.png``, and writes the
+table ``plan.md``, into ``docs/figures``. It takes some ten minutes on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from simenv_marl import RULE
+
+from .plan import (
+    BEST,
+    HELD_OUT,
+    LITRES,
+    VENTILATOR,
+    WATERER,
+    Kept,
+    air_planner,
+    days_left,
+    keep,
+    share_alive,
+    water_planner,
+)
+
+FIGURES: Final = Path(__file__).parents[2] / "docs" / "figures"
+
+BEST_TRAINED: Final = 84.9
+"""What the best has come to that was ever trained here: CMA-ES, by ``make demo``."""
+
+Make = Callable[[int, int], Mapping[str, Any]]
+"""Makes a team whose plans reach so far, in so many futures."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line in a picture.
+
+    Attributes:
+        title: What it is of.
+        make: Makes its teams.
+        style: How it is drawn.
+    """
+
+    title: str
+    make: Make
+    style: Mapping[str, Any]
+
+
+def water(base: Any, rest: Any) -> Make:
+    """Watering is planned, ventilation is at full."""
+    return lambda horizon, futures: {
+        WATERER: water_planner(base, horizon, futures, rest),
+        VENTILATOR: BEST[VENTILATOR],
+    }
+
+
+def both(horizon: int, futures: int) -> Mapping[str, Any]:
+    """Both are planned over the model's own rules."""
+    return {WATERER: water_planner(RULE, horizon, futures), VENTILATOR: air_planner(RULE, horizon, futures)}
+
+
+LINES: Final = (
+    Line("over the pair, then days left", water(BEST[WATERER], days_left), {"color": "#1b6f5f"}),
+    Line(
+        "over the pair, then one more day", water(BEST[WATERER], share_alive), {"color": "#1b6f5f", "linestyle": "--"}
+    ),
+    Line("over the rule, then days left", water(RULE, days_left), {"color": "#d1812c"}),
+    Line("over the rule, then one more day", water(RULE, share_alive), {"color": "#d1812c", "linestyle": "--"}),
+    Line("both planned over the rules, then days left", both, {"color": "#8c8c8c"}),
+)
+
+Point = tuple[str, int, int, Kept]
+"""The title of a line, the horizon, the futures, and how the greenhouses have fared."""
+
+
+def sweep(lines: Sequence[Line], horizons: Sequence[int], futures: Sequence[int], seeds: Sequence[int]) -> list[Point]:
+    """Keep greenhouses with plans of each kind, and say how they fare."""
+    found = []
+    for line in lines:
+        for horizon in horizons:
+            for number in futures:
+                kept = keep(line.make(horizon, number), seeds)
+                print(f"{line.title}; {horizon} days, {number} futures: {kept.returns.mean():.1f}", flush=True)
+                found.append((line.title, horizon, number, kept))
+    return found
+
+
+def draw(points: Sequence[Point], along: Callable[[Point], float], label: str, path: Path) -> None:
+    """Draw the mean return of each line.
+
+    Args:
+        points: What was found.
+        along: What a point's place is on the axis.
+        label: The axis' name.
+        path: Where to put the picture.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # here, for no process that forks is to carry it
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    axes = figure.add_subplot()
+    for line in LINES:
+        own = [point for point in points if point[0] == line.title]
+        if own:
+            means = [point[3].returns.mean() for point in own]
+            axes.plot([along(point) for point in own], means, marker="o", markersize=4, label=line.title, **line.style)
+    axes.axhline(BEST_TRAINED, color="#7fb3d3", linewidth=1, label="best that was trained")
+    axes.set_xscale("log")
+    ticks = sorted({along(point) for point in points})
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.set_xlabel(label)
+    axes.set_ylabel("mean return")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+
+
+def table(points: Sequence[Point]) -> str:
+    """Make the table, in Markdown."""
+    lines = [
+        "| who plans, and what comes after the horizon | horizon, days | branches a decision | return |"
+        " days in branches, an episode |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for title, horizon, number, kept in points:
+        lines.append(
+            f"| {title} | {horizon} | {number * len(LITRES)} | {kept.returns.mean():.1f} | {kept.simulated:,.0f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Keep greenhouses, draw both pictures and write the table."""
+    parser = argparse.ArgumentParser(description="Draw what plans are worth.")
+    parser.add_argument("--seeds", type=int, default=3, help="greenhouses for each point (default: %(default)s)")
+    parser.add_argument("--horizons", type=int, nargs="+", default=[1, 2, 3, 6, 12], metavar="DAYS")
+    parser.add_argument("--futures", type=int, nargs="+", default=[1, 2, 4, 8], metavar="NUMBER")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for it all (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    seeds = range(HELD_OUT, HELD_OUT + options.seeds)
+    reaching = sweep(LINES, options.horizons, [1], seeds)
+    spending = sweep(LINES[:2], [3], options.futures, seeds)
+    draw(
+        reaching,
+        lambda point: point[1],
+        "horizon, days (nine branches a decision)",
+        options.figures / "plan-horizon.png",
+    )
+    branches = f"branches a decision ({len(LITRES)} amounts; horizon of three days)"
+    draw(spending, lambda point: point[2] * len(LITRES), branches, options.figures / "plan-budget.png")
+    (options.figures / "plan.md").write_text(table([*reaching, *spending]) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

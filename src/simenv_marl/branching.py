@@ -77,27 +77,8 @@ def branch(
         OptionValueError: There is no such method, or not here; or ``seeds`` are not n non-negative integers.
         BaseException: What the function or ``reseed`` raises, with a note that says in which continuation.
     """
-    view = getattr(env, "unwrapped", env)
-    if not isinstance(view, View):
-        raise ViewError(f"branch continues environments of one simulation, and {shown(env)} is none")
-    if isinstance(n, bool) or not isinstance(n, int) or n < 0:
-        raise OptionValueError(f"n must be a number of continuations, not {shown(n)}")
-    if method not in (None, *METHODS):
-        raise OptionValueError(f"method must be None or one of {', '.join(map(repr, METHODS))}, not {shown(method)}")
-    forks = hasattr(os, "fork") and view.driver == "greenlet"
-    if method == "fork" and not forks:
-        raise OptionValueError(
-            'method="fork" needs a platform that can fork, and driver="greenlet": a forked process has none of the'
-            ' other threads; use "replay"'
-        )
-    if not time_limit > 0:
-        raise OptionValueError(f"time_limit must be a number of seconds, not {shown(time_limit)}")
-    view.check_pending()
-    if _depth.get() == DEEPEST:
-        raise BranchError(
-            f"branches are nested {DEEPEST} deep: a policy that branches its environment is asked again in its"
-            " branches, and so on without end; action_values and RolloutPolicy leave what is decided there to a base"
-        )
+    view = _checked(env, n, method, time_limit)
+    forks = _can_fork(view)
     if seeds is not None:
         view.check_reseed()
         function = _in_other_futures(function, _checked_seeds(seeds, n))
@@ -110,6 +91,39 @@ def branch(
     if obstacles or not forks or method == "replay":
         return [_replayed(env, view, function, number) for number in range(n)]
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
+
+
+def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
+    """The environment that is to be continued, without its wrappers.
+
+    Raises:
+        SimEnvError: As ``branch``.
+    """
+    view = getattr(env, "unwrapped", env)
+    if not isinstance(view, View):
+        raise ViewError(f"branch continues environments of one simulation, and {shown(env)} is none")
+    if isinstance(n, bool) or not isinstance(n, int) or n < 0:
+        raise OptionValueError(f"n must be a number of continuations, not {shown(n)}")
+    if method not in (None, *METHODS):
+        raise OptionValueError(f"method must be None or one of {', '.join(map(repr, METHODS))}, not {shown(method)}")
+    if method == "fork" and not _can_fork(view):
+        raise OptionValueError(
+            'method="fork" needs a platform that can fork, and driver="greenlet": a forked process has none of the'
+            ' other threads; use "replay"'
+        )
+    if not isinstance(time_limit, (int, float)) or not time_limit > 0:
+        raise OptionValueError(f"time_limit must be a number of seconds, not {shown(time_limit)}")
+    view.check_pending()
+    if _depth.get() == DEEPEST:
+        raise BranchError(
+            f"branches are nested {DEEPEST} deep: a policy that branches its environment is asked again in its"
+            " branches, and so on without end; action_values and RolloutPolicy leave what is decided there to a base"
+        )
+    return view
+
+
+def _can_fork(view: View) -> bool:
+    return hasattr(os, "fork") and view.driver == "greenlet"
 
 
 # -- other futures --------------------------------------------------------------------------------

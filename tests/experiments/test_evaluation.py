@@ -197,7 +197,7 @@ def test_what_cannot_be_is_refused_before_anything_runs(match, arguments):
 
 
 def test_a_policy_of_an_unknown_agent_is_refused():
-    refused("nobody", UnknownPointError, contenders={"rule": {}, "a": {"nobody": much}})
+    refused("stranger", UnknownPointError, contenders={"rule": {}, "a": {"stranger": much}})
 
 
 def test_an_agent_must_not_be_called_team():

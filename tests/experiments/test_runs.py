@@ -256,7 +256,7 @@ def one_argument(days):
         ("must be a DataFrame", {"design": 3}),
         ("there are none", {"seeds": []}),
         ("'rule' is the model as it is", {"policies": {"rule": {"keeper": much}}}),
-        ("nobody", {"policies": {"a": {"nobody": much}}}),
+        ("stranger", {"policies": {"a": {"stranger": much}}}),
         ("unknown|no option", {"nonsense": 3}),
         ("team", {"team": 3}),
     ],

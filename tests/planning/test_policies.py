@@ -424,7 +424,7 @@ def test_policies_that_branch_do_not_ask_each_other_for_ever(method):
     simulate(Duel, {"left": branches, "right": branches}, points=points(), seed=5)
     assert len(calls) == 12
     for number, (first, second) in enumerate(seen):
-        assert len(first[1]) == len(second[1]) == number + 1  # nobody was asked there
+        assert len(first[1]) == len(second[1]) == number + 1  # no policy was asked there
     assert seen[0][1][0] == pytest.approx(worth("left", 1, None, horizon=1))
     branches.base = lambda observation: 2
     del seen[:], calls[:]

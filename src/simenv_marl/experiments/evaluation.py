@@ -25,6 +25,7 @@ from .playing import (
     checked_contenders,
     checked_metrics,
     checked_options,
+    checked_team,
     contender_plan,
     play,
     play_many,
@@ -224,26 +225,19 @@ def evaluate(
     needed("pandas", "evaluate"), needed("scipy.stats", "evaluate")
     found = checked_contenders(contenders)
     _check(found, baseline, confidence, width, team)
-    places = checked_seeds(seeds)
-    check_distinct(places)
+    places = distinct_seeds(seeds)
     check_numbers(batch_size, workers)
     checked_options(options)
-    metrics = checked_metrics(metric)
-    size = int(batch_size) if batched else 0
+    metrics, size = checked_metrics(metric), int(batch_size) if batched else 0
     common = (simulation, points, options, points_of(found), metrics, size)
     plans = _plans(found, *common[:4])  # made here also where the work is done elsewhere, so that errors come before
-    outcomes: dict[str, list[Outcome]] = {name: [] for name in found}
-    done = 0
+    outcomes, done = {name: list[Outcome]() for name in found}, 0
     with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar:
         while done < len(places):
             lot = places[done : _next(done, len(places), width)]
             for name, known in outcomes.items():
-                if workers:
-                    arguments = ({name: found[name]}, *common)
-                    parts = spread(_play_part, arguments, lot, int(workers), size)
-                    known += [outcome for _, part in parts for outcome in part]
-                else:
-                    known += _play(plans[name], lot, metrics, size)
+                arguments = ({name: found[name]}, *common)
+                known += _spread(arguments, lot, int(workers)) if workers else _play(plans[name], lot, metrics, size)
                 if bar is not None:
                     bar.update(len(lot))
             done += len(lot)
@@ -272,6 +266,11 @@ def _plans(
     contenders: Mapping[str, Policies], simulation: Any, points: Any, options: Mapping[str, Any], named: Sequence[Any]
 ) -> dict[str, Plan]:
     return {name: contender_plan(simulation, policies, points, options, named) for name, policies in contenders.items()}
+
+
+def _spread(arguments: tuple[Any, ...], seeds: list[int], workers: int) -> list[Outcome]:
+    """Have workers play the episodes of a contender."""
+    return [outcome for _, part in spread(_play_part, arguments, seeds, workers, arguments[-1]) for outcome in part]
 
 
 def _play_part(
@@ -318,17 +317,19 @@ def rows_of(outcome: Outcome, team: Any) -> list[tuple[str, float, int]]:
 # -- what is checked before anything runs ---------------------------------------------------------
 
 
-def check_distinct(seeds: Sequence[int]) -> None:
-    """Make sure that there are seeds, and each but once.
+def distinct_seeds(given: Iterable[int]) -> list[int]:
+    """The seeds; there are some, and each but once.
 
     Raises:
         OptionValueError: It is otherwise.
     """
+    seeds = checked_seeds(given)
     if not seeds:
         raise OptionValueError("seeds must be some integers, such as range(32): there are none")
     twice = next((seed for seed in seeds if seeds.count(seed) > 1), None) if len(set(seeds)) < len(seeds) else None
     if twice is not None:
         raise OptionValueError(f"the seed {twice} is there twice: it would bring the same again, and count as more")
+    return seeds
 
 
 def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: Any) -> None:
@@ -343,8 +344,7 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: An
         _check_number("width", width)
         if width <= 0:
             raise OptionValueError(f"width must be positive, not {shown(width)}")
-    if team is not None and not callable(team):
-        raise OptionValueError(f"team must be a callable of the returns, or None, not {shown(team)}")
+    checked_team(team)
 
 
 def _check_number(name: str, value: Any) -> None:

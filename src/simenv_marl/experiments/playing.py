@@ -74,6 +74,16 @@ class Returns(tuple[float, ...]):
         return zip(self._names, self, strict=True)
 
 
+def checked_team(team: Any) -> None:
+    """Make sure that something can make one value of the returns of agents.
+
+    Raises:
+        OptionValueError: It cannot.
+    """
+    if team is not None and not callable(team):
+        raise OptionValueError(f"team must be a callable of the returns, or None, not {shown(team)}")
+
+
 def team_value(team: Callable[[Returns], Any] | None, returns: Mapping[str, float]) -> float:
     """What the returns of all agents of an episode make together.
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from ..core.processes import pack
 from ..errors import OptionValueError, SimEnvError, StoreError, shown, told, warn_user
-from ..many.collect import check_numbers, checked_seeds
+from ..many.collect import check_numbers
 from ..many.spread import progress_bar, spread
-from .evaluation import check_distinct, rows_of
+from .evaluation import distinct_seeds, rows_of
 from .extras import needed
 from .playing import (
     COLUMNS,
@@ -30,6 +30,7 @@ from .playing import (
     checked_contenders,
     checked_metrics,
     checked_options,
+    checked_team,
     play,
     play_many,
     points_of,
@@ -99,8 +100,7 @@ def run_experiment(
         policies: Contenders besides ``"rule"``, the model as it is: from a name to policies of ``simulate``.
         seeds: What the simulations are reset with; all different.
         points: The decision points, as ``generate_env`` takes them.
-        metric: A callable of the simulation after its end, whose column is ``metric``, or a dict of them by column.
-            Numbers, strings or None.
+        metric: As ``evaluate`` takes it.
         team: What the returns of an episode make together, as in ``evaluate``; None: their sum.
         store: The folder of the experiment, which is made where it is missing.
         batched: Whether policies are those of ``simulate_many``. The seeds of a row are then run together.
@@ -125,38 +125,41 @@ def run_experiment(
     needed("pandas", "run_experiment")
     contenders = _contenders(policies)
     table, rows = checked_design(design)
-    metrics = checked_metrics(metric, list(table.columns))
-    places = checked_seeds(seeds)
-    check_distinct(places)
-    check_numbers(batch_size, workers)
-    checked_options(options)
-    if team is not None and not callable(team):
-        raise OptionValueError(f"team must be a callable of the returns, or None, not {shown(team)}")
-    for row in rows[:1]:
-        checked_make(make, row)
-    size = int(batch_size) if batched else 0
+    metrics, size = checked_metrics(metric, list(table.columns)), int(batch_size) if batched else 0
+    places = distinct_seeds(seeds)
+    _check(make, rows, batch_size, workers, options, team)
     workshop = (make, contenders, points, options, points_of(contenders))
     made_with = _try(Workshop(*workshop), rows, contenders)
-    folder = Path(store)
+    folder, keys, factors = Path(store), [written(row) for row in rows], list(table.columns)
     arguments = (*workshop, metrics, size, folder, uuid4().hex[:12])
     if workers:
         pack(arguments)  # what cannot be sent to other processes is found out before
-    prepare(folder, list(table.columns), list(metrics))
-    stored = read(folder, list(table.columns))
-    keys = [written(row) for row in rows]
+    prepare(folder, factors, list(metrics))
+    stored = read(folder, factors)
     _compare(folder, stored, keys, made_with)
     missing = list(_missing(rows, keys, contenders, places, stored, retry=retry_errors))
-    total = len(set(keys)) * len(contenders) * len(places)
-    with progress_bar(total, "run", total - len(missing)) if progress else nullcontext() as bar:
-        for number in _work(arguments, missing, int(workers), len(places) if batched else 1):
+    total = len(set(keys)) * len(contenders) * len(places) if progress else None
+    _run_missing(arguments, missing, int(workers), len(places) if batched else 1, total)
+    return _frame(table, keys, list(contenders), places, read(folder, factors), list(metrics), team)
+
+
+def _run_missing(arguments: Any, missing: list[Run], workers: int, at_once: int, total: int | None) -> None:
+    """Run what is missing, with a bar where it is said how many runs there are in all."""
+    with nullcontext() if total is None else progress_bar(total, "run", total - len(missing)) as bar:
+        for number in _work(arguments, missing, workers, at_once):
             if bar is not None:
                 bar.update(number)
-    if missing:
-        stored = read(folder, list(table.columns))
-    return _frame(table, keys, list(contenders), places, stored, list(metrics), team)
 
 
 # -- what is checked before anything runs ---------------------------------------------------------
+
+
+def _check(make: Any, rows: Any, batch_size: Any, workers: Any, options: Mapping[str, Any], team: Any) -> None:
+    check_numbers(batch_size, workers)
+    checked_options(options)
+    checked_team(team)
+    for row in rows[:1]:
+        checked_make(make, row)
 
 
 def _contenders(policies: Any) -> dict[str, Policies]:
@@ -292,7 +295,7 @@ def _do_part(*arguments: Any) -> None:
     *others, runs = arguments
     parent = _parents.setdefault(os.getpid(), os.getppid())
     for _ in _do(*others, runs=runs):
-        if os.getppid() != parent:  # it was killed, and nobody waits for this any more
+        if os.getppid() != parent:  # it was killed, and nothing waits for this any more
             return
 
 

@@ -33,7 +33,7 @@ VIEWS = pytest.mark.parametrize("view", [aec_env, parallel_env, joint_env, singl
 # -- the tree -------------------------------------------------------------------------------------
 
 LEAVES = [value for value in vars(errors).values() if inspect.isclass(value) and issubclass(value, SimEnvError)]
-BUILTINS = (ValueError, TypeError, LookupError, RuntimeError, AssertionError, ImportError)
+BUILTINS = (ValueError, TypeError, LookupError, RuntimeError, AssertionError, ImportError, OSError)
 
 
 def test_there_is_one_root():

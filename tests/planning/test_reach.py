@@ -3,6 +3,7 @@
 import os
 import random
 import time
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -288,3 +289,22 @@ def test_time_limits_candidates_and_terminal_values():
     assert [planner.choose(env).best for _ in range(2)] == [2, 2]
     told = action_values(env, futures=1, horizon=1, terminal_value=lambda env: np.array([7.0]))
     assert told.means.tolist() == [8, 9, 10]
+
+
+@dataclass(frozen=True)
+class Unchanging(Exception):
+    """An error that refuses to be changed."""
+
+    value: int
+
+
+@pytest.mark.parametrize("method", ["fork", "replay"])
+def test_errors_that_refuse_to_be_changed_come_as_themselves(method):
+    class Fragile(Pair):
+        def run(self):
+            self.first()
+            raise Unchanging(1)
+
+    env = begun(single_env(Fragile, [Pair.first]))
+    with pytest.raises(Unchanging):
+        action_values(env, futures=1, method=method)

@@ -37,6 +37,25 @@ def asks_for_environment(policy: Any) -> bool:
     return asks_for(policy, ENVIRONMENT)
 
 
+def base_of(base: Any, agent: str) -> Any:
+    """Who decides for an agent where a base does: one by agent is looked up, and a planner is its own base.
+
+    Args:
+        base: ``RULE``, a policy, or a dict of these by agent.
+        agent: The agent.
+
+    Returns:
+        ``RULE`` or a policy; one that asks for the environment only where it has no attribute ``base``.
+    """
+    while True:
+        if isinstance(base, Mapping):
+            base = base.get(agent, RULE)
+        elif hasattr(base, "base") and asks_for_environment(base):
+            base = base.base
+        else:
+            return base
+
+
 class AskingPolicy:
     """A policy that is given the environment, with its decision pending.
 
@@ -77,13 +96,9 @@ class AskingPolicy:
 
     def _by_base(self, observation: Any, info: Any, agent: str) -> Any:
         """What the policy's base answers for an agent."""
-        base = getattr(self.policy, "base", RULE)
-        if isinstance(base, Mapping):
-            base = base.get(agent, RULE)
-        if base is RULE or not callable(base):
+        base = base_of(getattr(self.policy, "base", RULE), agent)
+        if base is RULE or not callable(base) or asks_for_environment(base):
             return RULE
-        if asks_for_environment(base):
-            return AskingPolicy(base)._by_base(observation, info, agent)
         return base(observation, info) if takes_info(base) else base(observation)
 
     def answer(self, observation: Any, info: Any, environment: Any) -> Any:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from numbers import Real
@@ -12,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from ..core.asking import PLANNING
-from ..core.rng import process_kept
 from ..errors import OptionValueError, shown
 from ..simulation import RULE
 from .players import Player, player_of
@@ -79,8 +77,11 @@ class Lookahead:
         Returns:
             What each decision of the agent has brought, discounted; what comes after the horizon is the last one's.
         """
-        with _planning(), process_kept():
+        planning = PLANNING.set(True)
+        try:
             return self._play(player_of(env, self.base), actions)
+        finally:
+            PLANNING.reset(planning)
 
     def _play(self, player: Player, actions: Sequence[Any]) -> list[float]:
         player.begin()
@@ -120,12 +121,3 @@ def is_number(value: Any) -> bool:
 def within_a_branch() -> bool:
     """Whether this runs in a branch in which a candidate is tried out: planners are their own bases there."""
     return PLANNING.get()
-
-
-@contextmanager
-def _planning() -> Iterator[None]:
-    token = PLANNING.set(True)
-    try:
-        yield
-    finally:
-        PLANNING.reset(token)

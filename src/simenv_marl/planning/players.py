@@ -14,22 +14,12 @@ from gymnasium import spaces
 
 from ..core.actions import ILLEGAL, action_check, mask_allows
 from ..core.agent import Agent
-from ..core.asking import AskingPolicy
+from ..core.asking import AskingPolicy, base_of
 from ..core.roster import two_arguments
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv, View
 from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, ViewError, shown
 from ..simulation import RULE
-
-
-class Planner:
-    """A policy that plans. In a branch in which a candidate is tried out, it is its own base.
-
-    Attributes:
-        base: Who decides after a candidate.
-    """
-
-    base: Any
 
 
 class Player:
@@ -56,7 +46,7 @@ class Player:
         self.own: Agent = self.episode.pending or self.episode.consulted
         self.agent = self.own.name
         self.over = False
-        self._policies: dict[str, Callable[..., Any]] = {}
+        self._policies: dict[str, Any] = {}
         self._seen: Any = None  # the observation and the info that the latest step has brought
 
     # -- before anything moves --------------------------------------------------------------------
@@ -174,14 +164,13 @@ class Player:
 
     def _ask(self, name: str, observation: Any, info: Any) -> Any:
         """What an agent's base answers."""
-        base: Any = self.base if name == self.agent or isinstance(self.base, Mapping) else RULE
-        while isinstance(base, (Mapping, Planner)):
-            base = base.base if isinstance(base, Planner) else base.get(name, RULE)
-        if base is RULE:
-            return RULE
-        policy = self._policies.get(name)
+        policy: Any = self._policies.get(name)
         if policy is None:
-            policy = self._policies[name] = two_arguments(base)
+            own: Any = self.base if name == self.agent or isinstance(self.base, Mapping) else RULE
+            base = base_of(own, name)
+            policy = self._policies[name] = base if base is RULE else two_arguments(base)
+        if policy is RULE:
+            return RULE
         if isinstance(policy, AskingPolicy):
             return policy.answer(observation, info, self.env)
         return policy(observation, info)

@@ -13,11 +13,10 @@ from ..errors import OptionValueError, shown
 from ..simulation import RULE
 from .futures import Futures
 from .lookahead import Lookahead, is_count, within_a_branch
-from .players import Planner
 from .values import ActionValues, base_value, valued
 
 
-class RolloutPolicy(Planner):
+class RolloutPolicy:
     """A policy that looks one decision ahead of a base, and spends its branches on the candidates that are in the race.
 
     By sequential halving (Karnin, Koren and Somekh, 2013): the budget is divided among rounds, in each of which all

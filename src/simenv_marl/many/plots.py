@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MissingExtraError, OptionValueError, shown
+from ..errors import OptionValueError, shown
+from .extras import needed
 from .plot_data import (
     CHARTED,
     ENDS,
@@ -65,14 +66,11 @@ def style(what: str) -> Iterator[Any]:
     Raises:
         MissingExtraError: Matplotlib is missing.
     """
-    try:
-        from matplotlib import rc_context
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError(f"{what} needs matplotlib: install simenv-marl[plots]") from None
+    rc_context = needed("matplotlib", what, extra="plots").rc_context
+    make = needed("matplotlib.figure", what, extra="plots").Figure
 
     def new_figure(width: float, height: float) -> Any:
-        figure: Any = Figure(figsize=(width, height), layout="constrained")
+        figure: Any = make(figsize=(width, height), layout="constrained")
         figure._repr_png_ = lambda: _png(figure)  # of notebooks that have not been told what figures are
         return figure
 

@@ -9,7 +9,7 @@ from math import ceil
 from typing import Any
 
 from ..core.processes import pack, pack_error, unpack, unpack_error
-from ..errors import MissingExtraError
+from .extras import needed
 
 
 def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
@@ -23,15 +23,7 @@ def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
     Raises:
         MissingExtraError: tqdm is not installed.
     """
-    try:
-        from tqdm.auto import tqdm  # type: ignore[import-untyped]
-    except ImportError:
-        raise _missing("progress=True", "tqdm") from None
-    return tqdm(total=total, unit=unit, initial=done)
-
-
-def _missing(what: str, package: str) -> MissingExtraError:
-    return MissingExtraError(f"{what} needs {package}: install simenv-marl[many]")
+    return needed("tqdm.auto", "progress=True", extra="many").tqdm(total=total, unit=unit, initial=done)
 
 
 def spread(
@@ -60,10 +52,7 @@ def spread(
         WorkerError: An error in a worker cannot be brought here as itself.
         BaseException: What the work raises.
     """
-    try:
-        import joblib
-    except ImportError:
-        raise _missing(f"workers={workers}", "joblib") from None
+    joblib = needed("joblib", f"workers={workers}", extra="many")
     processes = max(1, joblib.effective_n_jobs(workers))
     size = max(1, ceil(len(seeds) / (share * processes)), min(least, ceil(len(seeds) / processes)))
     parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from benchmarks.measure import Contender, Section, alone, ratio, side_by_side
-from benchmarks.noop import Alone, Model
+from benchmarks.noop import Alone, Busy, Model
 from simenv_marl import branch, reseed_generators, single_env
 
 BRANCHES, STEPS = 20, 10
@@ -137,21 +137,15 @@ def bare(env: Any, number: int) -> Any:
 # -- in a process of its own ----------------------------------------------------------------------
 
 
-class Busy(Alone):
-    """One agent, whose simulation takes its time."""
+class Slow(Busy):
+    """A simulation that takes so many milliseconds for a decision."""
 
-    def run(self) -> None:
-        model, clock = self.model, time.thread_time_ns
-        while True:
-            until = clock() + int(MILLISECONDS * 1e6)
-            while clock() < until:
-                pass
-            model.left()
+    nanoseconds = int(MILLISECONDS * 1e6)
 
 
 def cores(rounds: int) -> tuple[float, float, float]:
     """How much faster branches are on two cores than one after the other; and the milliseconds of both."""
-    env = single_env(Busy, Model.left)
+    env = single_env(Slow, Model.left)
     env.reset(seed=0)
     both = os.sched_getaffinity(0)
 

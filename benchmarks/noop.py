@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE, State
@@ -72,6 +73,20 @@ class Alone(Turns):
     def run(self) -> None:
         model = self.model
         while True:
+            model.left()
+
+
+class Busy(Alone):
+    """One agent, whose simulation takes its time, of the processor."""
+
+    nanoseconds = 0
+
+    def run(self) -> None:
+        model, clock = self.model, time.thread_time_ns
+        while True:
+            until = clock() + self.nanoseconds
+            while clock() < until:
+                pass
             model.left()
 
 

@@ -23,7 +23,7 @@ from gymnasium.vector import AsyncVectorEnv
 
 from benchmarks.hand_written import TemplateEnv
 from benchmarks.measure import Section, alone, ratio, side_by_side
-from benchmarks.noop import Alone, Model
+from benchmarks.noop import Busy, Model
 from benchmarks.vector import ours, steps
 from simenv_marl import vector_env
 
@@ -144,16 +144,10 @@ class Threads:
 # -- in processes of their own --------------------------------------------------------------------
 
 
-class Busy(Alone):
-    """One agent, whose simulation takes its time."""
+class Slow(Busy):
+    """A simulation that takes so many microseconds for a decision."""
 
-    def run(self) -> None:
-        model, clock = self.model, time.thread_time_ns
-        while True:
-            until = clock() + int(MICROSECONDS * 1000)
-            while clock() < until:
-                pass
-            model.left()
+    nanoseconds = int(MICROSECONDS * 1000)
 
 
 def memory(number: int = 10_000) -> float:
@@ -176,7 +170,7 @@ def _resident() -> float:
 
 def cores(rounds: int, size: int = 64) -> tuple[float, float, float]:
     """How much faster two workers are than one process; and the microseconds of both."""
-    envs = {workers: vector_env(Busy, Model.left, num_envs=size, workers=workers) for workers in (0, 2)}
+    envs = {workers: vector_env(Slow, Model.left, num_envs=size, workers=workers) for workers in (0, 2)}
     times = side_by_side(
         {str(workers): steps(env, size, size * 20, time.perf_counter) for workers, env in envs.items()}, rounds
     )

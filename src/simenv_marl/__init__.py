@@ -9,6 +9,7 @@ The rooms of the package; each imports only from those below it::
     envs                                views: an episode read as a PettingZoo or Gymnasium environment
     many                                policies back in the model, in one simulation or in many at once; pictures
     core                                what happens when: plans, stacks, sessions, episodes, agents
+    remote                              simulators outside Python: processes that call for decisions
     decision                            make_step: definitions and decision points
     hooks                               functions that stand in front of a model's own; handlers around their calls
     simulation                          what a simulation is; RULE and TRUNCATED
@@ -62,6 +63,7 @@ from .planning.policy import RolloutPolicy
 from .planning.tree import TreeSearchPolicy
 from .planning.values import ActionValues, action_values
 from .registration import register_simulation
+from .remote.process import ProcessSimulation
 from .simulation import RULE, TRUNCATED, SimulationInterface
 
 __version__ = "0.1.0"
@@ -78,6 +80,7 @@ __all__ = [
     "Effects",
     "Evaluation",
     "Mixture",
+    "ProcessSimulation",
     "RolloutPolicy",
     "SimulationAECEnv",
     "SimulationEnv",

@@ -13,7 +13,7 @@ from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
 from types import FunctionType
-from typing import Any
+from typing import Any, Final
 from weakref import WeakSet, WeakValueDictionary
 
 import numpy as np
@@ -262,6 +262,9 @@ def inverse(definition: Definition) -> dict[Any, Any] | None:
 
 # -- decision points ------------------------------------------------------------------------------
 
+BY_NAME: Final = "simenv_marl_point"
+"""An attribute of functions that are found by a name of a simulation's own, and not in a module: that name."""
+
 _REGISTRY: WeakValueDictionary[str, DecisionPoint] = WeakValueDictionary()
 """The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
 
@@ -273,13 +276,15 @@ class DecisionPoint:
         hook: The hook of the function.
         definition: The latest definition, which the bare name means; None for a point that was named from
             outside and is a decision point for some environments alone.
+        removed_by: What ends its agents under every definition, as ``removed_by`` of ``make_step``; functions or names.
     """
 
-    __slots__ = ("__weakref__", "definition", "hook")
+    __slots__ = ("__weakref__", "definition", "hook", "removed_by")
 
     def __init__(self, hook: Hook) -> None:
         self.hook = hook
         self.definition: Definition | None = None
+        self.removed_by: dict[Any, Mapped | None] = {}
 
     def __repr__(self) -> str:
         return f"<DecisionPoint {self.name}>"

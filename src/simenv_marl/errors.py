@@ -28,6 +28,11 @@
     |-- ReentrancyError      (RuntimeError)  an environment used while it is moving
     |-- WrongThreadError     (RuntimeError)  a thread or process that cannot go on from here
     |-- MissingExtraError    (ImportError)   a package that only an extra installs
+    |-- ProcessError         (RuntimeError)  a simulator in another process, and what went wrong with it
+    |   |-- ProcessDiedError    (ChildProcessError)  ... it could not be started, has ended, or has closed its pipe
+    |   |-- ProcessTimeoutError (TimeoutError)  ... it has not answered, or not read what it was sent
+    |   |-- RemoteError                         ... its model has raised an error
+    |   `-- WireError           (ValueError)    ... it has sent, or was to be sent, what the wire does not allow
     |-- StoreError           (OSError)       a store of an experiment that cannot be read or written
     |-- WorkerError          (RuntimeError)  a process with simulations that died, or has raised what cannot be told
     `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
@@ -60,7 +65,11 @@ __all__ = [
     "ObservationError",
     "OptionValueError",
     "PatchError",
+    "ProcessDiedError",
+    "ProcessError",
+    "ProcessTimeoutError",
     "ReentrancyError",
+    "RemoteError",
     "ResetNeededError",
     "RewardError",
     "SimEnvError",
@@ -71,6 +80,7 @@ __all__ = [
     "UnknownPointError",
     "UnknownTargetError",
     "ViewError",
+    "WireError",
     "WorkerError",
     "WrongThreadError",
 ]
@@ -254,6 +264,26 @@ class WrongThreadError(SimEnvError, RuntimeError):
 
 class WorkerError(SimEnvError, RuntimeError):
     """A process with simulations in it died, or something was raised there that cannot be told here as it was."""
+
+
+class ProcessError(SimEnvError, RuntimeError):
+    """Something went wrong with a simulator in another process; the leaf says what."""
+
+
+class ProcessDiedError(ProcessError, ChildProcessError):
+    """The process could not be started, has ended, or has closed its pipe."""
+
+
+class ProcessTimeoutError(ProcessError, TimeoutError):
+    """The process has not answered in time, or has not read what it was sent."""
+
+
+class RemoteError(ProcessError):
+    """The model in the process has raised an error. Its text stands here; nothing of it is imported."""
+
+
+class WireError(ProcessError, ValueError):
+    """The process has sent, or was to be sent, what the wire does not allow."""
 
 
 class StoreError(SimEnvError, OSError):

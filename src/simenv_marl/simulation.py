@@ -48,7 +48,8 @@ class SimulationInterface(ABC):
       name is going to be called, so that agents can be observed before their first decision.
     - ``close(self)``: lets go of what must stay open until the last observations were made (files, connections,
       licences). Called once for each ``reset`` that has succeeded: before the next one, when the environment is
-      closed, or when it is gone.
+      closed, or when it is gone. ``close(self, last)`` is told whether it is one of the latter two, for what it keeps
+      from one episode to the next (a process, a connection).
     - ``time(self)``: its clock, from which ``info["time"]`` and ``info["elapsed"]`` come.
     - ``reseed(self, seed)``: seeds its generators in place, so that the chance that lies ahead is drawn anew: for
       ``branch`` with ``seeds``. ``reseed_generators(self, seed)`` does it for the usual cases.
@@ -125,7 +126,7 @@ def resetter(simulation: Any) -> Callable[[int | None, dict[str, Any] | None], N
         A function of seed and options that resets the simulation with as much of them as it takes. Its
         attribute of the signature is looked at once, here.
     """
-    seeded, optioned = _taken(simulation.reset)
+    seeded, optioned = _taken(simulation.reset, "seed"), _taken(simulation.reset, "options")
 
     def reset(seed: int | None, options: dict[str, Any] | None) -> None:
         arguments: dict[str, Any] = {}
@@ -138,19 +139,31 @@ def resetter(simulation: Any) -> Callable[[int | None, dict[str, Any] | None], N
     return reset
 
 
-_TAKEN: WeakKeyDictionary[Any, tuple[bool, bool]] = WeakKeyDictionary()
+def closer(simulation: Any) -> Callable[[bool], None] | None:
+    """Find out whether a simulation has a ``close``, and what that takes.
+
+    Returns:
+        A function of whether no reset follows; None where there is nothing to close.
+    """
+    close = getattr(simulation, "close", None)
+    if close is None:
+        return None
+    return (lambda last: close(last=last)) if _taken(close, "last") else lambda last: close()
+
+
+_TAKEN: WeakKeyDictionary[Any, dict[str, bool]] = WeakKeyDictionary()
 """By function: what it takes. To find that out takes longer than all else that a simulation is made ready by."""
 
 
-def _taken(reset: Any) -> tuple[bool, bool]:
-    """Whether a ``reset`` takes a seed, and options."""
-    function = reset.__func__ if type(reset) is MethodType and type(reset.__func__) is FunctionType else None
-    found = None if function is None else _TAKEN.get(function)
-    if found is None:
-        found = takes(reset, "seed"), takes(reset, "options")
-        if function is not None:
-            _TAKEN[function] = found
-    return found
+def _taken(method: Any, name: str) -> bool:
+    """Whether a method of a simulation takes a keyword argument of that name."""
+    function = method.__func__ if type(method) is MethodType and type(method.__func__) is FunctionType else None
+    if function is None:
+        return takes(method, name)
+    known = _TAKEN.setdefault(function, {})
+    if name not in known:
+        known[name] = takes(method, name)
+    return known[name]
 
 
 def takes(function: Callable[..., Any], name: str) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from ..decision import DecisionPoint, Definition
@@ -31,7 +32,7 @@ from .bound import BoundPoint, DeferredPolicy, given_simulation
 from .drivers import Spare
 from .events import Answered, Decision, Ended, Removed, Told
 from .options import Options
-from .points import NamedPoint, find_points, have_instances, locate, owner_class, portable, stand_ins
+from .points import NamedPoint, find_points, have_instances, locate, own_points, owner_class, portable, stand_ins
 from .roster import assign, call_the_roll, declared_agents, name_agents, names_agents
 from .variant import Variant
 
@@ -88,8 +89,9 @@ class Plan:
         ends_agents: bool = False,
         spare: list[Spare] | None = None,
         variant: Variant | None = None,
+        own: Mapping[DecisionPoint, Definition] = MappingProxyType({}),
     ) -> None:
-        self.source, self.options, self._named = source, options, named
+        self.source, self.options, self._named, self._own = source, options, named, own
         self.variant = variant
         self._spare = [] if spare is None else spare  # the simulation that was looked at, until an environment takes it
         self.render_modes, self.render_fps = render_modes, render_fps
@@ -105,7 +107,7 @@ class Plan:
             raise AgentError(
                 f"agent={shown(options.agent)} names no agent; the agents are {', '.join(filter(None, agents))}"
             )
-        by_point, self.policies, extra = assign(options.policies or {}, named, agents)
+        by_point, self.policies, extra = assign(options.policies or {}, named, agents, own)
         self._everything, self._by_point = [*named, *extra], by_point
         self.hooks: list[Hook] = [point.point.hook for point in self._everything]
         self.plugins = Plugins(options.plugins) if options.plugins else None
@@ -269,7 +271,7 @@ class Plan:
 
     def _find_removals(self, *, warns: bool) -> None:
         for binding in self.points:
-            for name, agent in binding.definition.removed_by.items():
+            for name, agent in (*binding.point.removed_by.items(), *binding.definition.removed_by.items()):
                 point, _ = locate(name)
                 removal = self._cross(point, Removed(point))
                 if not isinstance(removal, Removed):
@@ -329,11 +331,12 @@ class Plan:
             model = made.simulation
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
         required = not unanswered or others is not None or names_agents(checked.policies)
-        named = find_points(points, model, required=required)
+        own = own_points(model)
+        named = find_points(points, model, own, required=required)
         return cls(
             source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded, others=others,
             render_fps=getattr(model, "render_fps", RENDER_FPS), spare=spare, variant=variant,
-            ends_agents=issubclass(model if isinstance(model, type) else type(model), SimulationInterface),
+            ends_agents=issubclass(model if isinstance(model, type) else type(model), SimulationInterface), own=own,
         )  # fmt: skip
 
     def __deepcopy__(self, memory: Any) -> Plan:
@@ -400,7 +403,7 @@ class Plan:
     def _like(self, named: list[NamedPoint], options: Options) -> Plan:
         return Plan(
             self.source, named, options, self.render_modes, render_fps=self.render_fps, spare=self._spare,
-            variant=self.variant, ends_agents=self._ends_agents,
+            variant=self.variant, ends_agents=self._ends_agents, own=self._own,
         )  # fmt: skip
 
 

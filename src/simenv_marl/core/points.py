@@ -7,12 +7,13 @@ needs it: for all others the function stays what it was.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from sys import modules
 from types import FunctionType, MappingProxyType
 from typing import Any, Final
 
-from ..decision import DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
+from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
 from ..errors import DefinitionError, PatchError, UnknownPointError, shown
 from ..hooks.attached import title
 from ..hooks.hook import Hook, beneath, hook_of
@@ -65,6 +66,8 @@ def portable(key: Any, name: str | None = None) -> Any:
     function = unwrapped(key)
     if not isinstance(function, FunctionType):
         return key
+    if hasattr(function, BY_NAME):
+        return getattr(function, BY_NAME)
     name = name or f"{function.__module__}.{function.__qualname__}"
     if leads_there(name):
         return name
@@ -86,7 +89,22 @@ class Member:
         return getattr, (self._owner, self._name)
 
 
-def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[NamedPoint]:
+def own_points(simulation: Any) -> dict[DecisionPoint, Definition]:
+    """The definitions that a simulation gives to its own points, in its attribute ``points``.
+
+    What is not to be found is left out: it is told of where it is asked for.
+    """
+    given = getattr(simulation, "points", None)
+    own: dict[DecisionPoint, Definition] = {}
+    for key, definition in given.items() if isinstance(given, Mapping) else ():
+        with suppress(UnknownPointError, PatchError):
+            own[locate(key)[0]] = definition
+    return own
+
+
+def find_points(
+    points: Any, simulation: Any, own: Mapping[DecisionPoint, Definition] | None = None, *, required: bool = True
+) -> list[NamedPoint]:
     """Find all that ``points=`` names.
 
     Args:
@@ -94,6 +112,7 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
             attribute ``points`` of the simulation, else all decorated points. What is named without a definition has
             the one that the simulation's ``points`` gives it, if they do.
         simulation: The simulation.
+        own: Its ``own_points``, if they are known.
         required: Whether all decorated points are meant where none is named, and not none.
 
     Returns:
@@ -104,20 +123,20 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
         DefinitionError: A function has no definition, or a dict's value is none.
         PatchError: A function was named that cannot be made a decision point.
     """
-    own = getattr(simulation, "points", None)
+    if own is None:
+        own = own_points(simulation)
     if points is None:
-        points = own
+        points = getattr(simulation, "points", None)
     if points is None:
         if not required:
             return []
         points = _all_registered()
     if isinstance(points, Mapping):
-        found = [find_point(key, definition) for key, definition in points.items()]
+        found = [find_point(key, definition, own=own) for key, definition in points.items()]
     else:
         if isinstance(points, str) or not hasattr(points, "__iter__"):
             points = [points]
-        given = {locate(key)[0]: definition for key, definition in own.items()} if isinstance(own, Mapping) else {}
-        found = [find_point(key, given=given) for key in points]
+        found = [find_point(key, own=own) for key in points]
     if not found:
         raise UnknownPointError("no decision point was named: points is empty")
     for number, named in enumerate(found):
@@ -127,14 +146,14 @@ def find_points(points: Any, simulation: Any, *, required: bool = True) -> list[
 
 
 def find_point(
-    key: Any, definition: Any = None, *, given: Mapping[DecisionPoint, Definition] = MappingProxyType({})
+    key: Any, definition: Any = None, *, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})
 ) -> NamedPoint:
     """Find one decision point.
 
     Args:
         key: A dotted name, or a function.
         definition: The definition to use it with. None: the one that it was decorated with.
-        given: Those that a simulation gives to what was not decorated, or was and is named.
+        own: Those that a simulation gives to its own points.
 
     Returns:
         The point, with the definition.
@@ -144,8 +163,9 @@ def find_point(
     """
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {shown(definition)}")
-    point, own = locate(key)
-    definition = definition or own or given.get(point) or point.definition
+    by_name = {point.name: point for point in own if hasattr(point.rule, BY_NAME)}
+    point, given = (by_name[key], None) if isinstance(key, str) and key in by_name else locate(key)
+    definition = definition or given or own.get(point) or point.definition
     if definition is None:
         raise DefinitionError(
             f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from sys import modules
 from typing import Any
 
-from ..decision import DecisionPoint, unwrapped
+from ..decision import DecisionPoint, Definition, unwrapped
 from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, shown
 from ..simulation import RULE
 from .asking import AskingPolicy, asks_for_environment, takes_info
@@ -79,9 +79,19 @@ def call_the_roll(
 
 
 def assign(
-    policies: Mapping[Any, Any], named: list[NamedPoint], agents: list[str | None]
+    policies: Mapping[Any, Any],
+    named: list[NamedPoint],
+    agents: list[str | None],
+    own: Mapping[DecisionPoint, Definition],
 ) -> tuple[dict[DecisionPoint, Any], dict[str, Any], list[NamedPoint]]:
-    """Find out whom each policy answers for: a point (maybe one that was not named yet) or an agent."""
+    """Find out whom each policy answers for: a point (maybe one that was not named yet) or an agent.
+
+    Args:
+        policies: By agent or point.
+        named: The points that were named.
+        agents: The agent of each; None where a callable names them.
+        own: The simulation's own points.
+    """
     by_point: dict[DecisionPoint, Any] = {}
     by_agent: dict[str, Any] = {}
     extra: list[NamedPoint] = []
@@ -93,7 +103,7 @@ def assign(
         point = next((p for p in named if key == p.point.name or unwrapped(key) is p.point.rule), None)
         if point is None:
             try:
-                point = find_point(key)
+                point = find_point(key, own=own)
             except SimEnvError as error:
                 if policy is RULE and isinstance(error, DefinitionError):
                     continue  # its rule decides there anyway

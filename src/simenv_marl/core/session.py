@@ -19,7 +19,7 @@ from gymnasium.utils import seeding
 
 from ..errors import BranchError, OptionValueError, annotate, shown, warn_user
 from ..hooks.places import Held
-from ..simulation import make_simulation, resetter
+from ..simulation import closer, make_simulation, resetter
 from .contexts import Claim, at_work
 from .draws import WatchedDriver, is_watched, watched
 from .drivers import DRIVERS, run_job
@@ -164,15 +164,19 @@ class Session:
             finally:
                 self._starting = False
 
-    def _close_simulation(self) -> None:
-        """Call the simulation's ``close`` on its stack, once for each reset that has succeeded."""
-        close = getattr(self.simulation, "close", None)
-        if not self._open or close is None:
+    def _close_simulation(self, *, last: bool = False) -> None:
+        """Call the simulation's ``close`` on its stack, once for each reset that has succeeded.
+
+        Args:
+            last: Whether no reset follows.
+        """
+        close = closer(self.simulation) if self._open else None
+        if close is None:
             return
         self._open, self._starting = False, True
         try:
             with self.at_work():
-                self._run(close)
+                self._run(partial(close, last))
         finally:
             self._starting = False
 
@@ -382,7 +386,7 @@ class Session:
             if self.episode is None and not self._starting:
                 self._closed = True
                 try:
-                    self._close_simulation()
+                    self._close_simulation(last=True)
                 finally:
                     self._put_away()
 
@@ -399,7 +403,7 @@ class Session:
 
     def _close_abandoned(self) -> None:
         try:
-            self._close_simulation()
+            self._close_simulation(last=True)
         except Exception as error:
             warn_user(f"a simulation that was abandoned raised {shown(error)} when it was closed", ResourceWarning)
 

@@ -1,0 +1,88 @@
+"""The calls of a simulator's decision points, as mappings see them, and the functions that stand for the points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+from ..decision import BY_NAME, point_for
+from ..hooks.hook import Hook
+from ..simulation import RULE
+
+
+class RemoteCall:
+    """An entity's latest call of a decision point: what mappings, ``agent`` and ``apply`` get.
+
+    The call's arguments are its attributes and items: ``call.level``, ``call["queue-length"]``. Of one entity at one
+    point it is one object, which changes from call to call.
+
+    Attributes:
+        point: The name of the decision point.
+        entity: Who decides, as the process names it; None where it names no entity.
+        time: The process's time; None where it tells none.
+    """
+
+    __slots__ = ("__dict__", "__weakref__", "entity", "point", "time")
+
+    def __init__(self, point: str, entity: Any) -> None:
+        self.point, self.entity = point, entity
+        self.time: float | None = None
+
+    def __getitem__(self, name: str) -> Any:
+        return self.__dict__[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.__dict__
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.__dict__)
+
+    def __len__(self) -> int:
+        return len(self.__dict__)
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"the call of {self.point} has no argument {name!r}; it has {', '.join(self.__dict__) or 'none'}"
+        )
+
+    def __repr__(self) -> str:
+        arguments = "".join(f", {name}={value!r}" for name, value in self.__dict__.items())
+        return f"RemoteCall({self.point}, entity={self.entity!r}, time={self.time!r}{arguments})"
+
+
+class Point(NamedTuple):
+    """What stands for a decision point of a simulator.
+
+    Attributes:
+        decide: Its decision function. Called with a ``RemoteCall``, it returns the decision, or ``RULE``.
+        remove: Called with the latest call of an entity that is gone: it ends the entity's agent.
+    """
+
+    decide: Callable[[RemoteCall], Any]
+    remove: Callable[[RemoteCall], None]
+
+
+@cache
+def point_named(name: str) -> Point:
+    """The functions that stand for a decision point of that name, in all simulators."""
+
+    def decide(call: RemoteCall) -> Any:
+        return RULE
+
+    def remove(call: RemoteCall) -> None:
+        pass
+
+    deciding, removing = _hook(decide, name), _hook(remove, f"{name} (removed)")
+    functions = Point(deciding.stand_in(), removing.stand_in())
+    point_for(deciding).removed_by[functions.remove] = None
+    return functions
+
+
+def _hook(function: Any, name: str) -> Hook:
+    """The hook of a function that is found by a name of its own."""
+    setattr(function, BY_NAME, name)
+    function.__name__, function.__qualname__ = name.rpartition(".")[2], name
+    hook = Hook(function, name)
+    hook.bound = hook.alone = hook.exposed = True
+    return hook

@@ -1,0 +1,304 @@
+"""A simulator's process, and the lines that go to and fro.
+
+Every wait has an end. What the process writes on its standard error is read whenever the process is waited for, so that
+it is not held up by it; the last of it stands in errors. The process leads a group of its own, which ends with it.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
+from time import monotonic, sleep
+from typing import Any, Final, NoReturn, TypeGuard
+from weakref import finalize
+
+from ..errors import ProcessDiedError, ProcessTimeoutError, SimEnvError, WireError, WrongThreadError, told, warn_user
+from .wire import DESCRIPTORS, LONGEST, VERSION, decode
+
+CHUNK: Final = 1 << 16
+
+REMEMBERED: Final = 4096
+"""How many bytes of what it has last written on its standard error stand in errors."""
+
+GRACE: Final = 2.0
+"""For how many seconds is waited for a process to end by itself."""
+
+
+class _Process:
+    """A process and its descriptors, which end together.
+
+    Attributes:
+        reading, writing: This side's ends of the two pipes.
+        stderr: Where its standard error is read.
+        last: What was last read there.
+    """
+
+    def __init__(self, command: Sequence[str], env: Mapping[str, str], cwd: Any) -> None:
+        theirs_in, self.writing = os.pipe()
+        self.reading, theirs_out = os.pipe()
+        self.last = bytearray()
+        self._owner, self._ended = os.getpid(), False
+        try:
+            self._popen = Popen(
+                command,
+                stdin=DEVNULL,
+                stderr=PIPE,
+                pass_fds=(theirs_in, theirs_out),
+                env={**env, DESCRIPTORS: f"{theirs_in},{theirs_out}"},
+                cwd=cwd,
+                start_new_session=True,  # it and all that it starts can be ended; interrupts at a terminal are not its
+            )
+        except BaseException:
+            os.close(self.writing)
+            os.close(self.reading)
+            raise
+        finally:
+            os.close(theirs_in)
+            os.close(theirs_out)
+        assert self._popen.stderr is not None
+        self.number, self.stderr = self._popen.pid, self._popen.stderr.fileno()
+        for descriptor in (self.reading, self.writing, self.stderr):
+            os.set_blocking(descriptor, False)
+
+    @property
+    def owned(self) -> bool:
+        """Whether this is the process that has started it, and no fork of that."""
+        return os.getpid() == self._owner
+
+    def listen(self) -> bool:
+        """Read what is there of its standard error; return whether more may come."""
+        try:
+            chunk = os.read(self.stderr, CHUNK)
+        except BlockingIOError:
+            return True
+        self.last += chunk
+        del self.last[:-REMEMBERED]
+        return bool(chunk)
+
+    def exit_code(self) -> int | None:
+        """With what it has exited, or minus the signal that has ended it; None as long as it runs.
+
+        It is not reaped: until then no other group can have its number.
+        """
+        if self._popen.returncode is not None or not hasattr(os, "waitid"):
+            return self._popen.poll()
+        try:
+            found = os.waitid(os.P_PID, self.number, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+        except ChildProcessError:  # something else in this process has reaped it
+            return self._popen.poll()
+        if found is None:
+            return None
+        return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
+
+    def wait(self, patience: float) -> int | None:
+        """Wait for its exit for so many seconds; return its exit code."""
+        deadline, pause = monotonic() + patience, 0.0005
+        while (code := self.exit_code()) is None and monotonic() < deadline:
+            self.listen()
+            sleep(pause)
+            pause = min(2 * pause, 0.02)
+        return code
+
+    def end(self, patience: float) -> None:
+        """Close its pipes, and end it and its group; in a fork of this process, let go of it.
+
+        Args:
+            patience: For how many seconds it may take to end by itself.
+        """
+        if self._ended:
+            return
+        self._ended = True
+        os.close(self.writing)
+        os.close(self.reading)
+        if self.owned:
+            self.wait(patience)
+            with suppress(ProcessLookupError, PermissionError):  # there is none of the group left
+                os.killpg(self.number, signal.SIGKILL)
+            try:
+                self._popen.wait(GRACE)
+            except TimeoutExpired:
+                warn_user(f"the process {self.number} was killed and has not ended yet", ResourceWarning)
+            for _ in range(REMEMBERED):  # others may still write, as those who have left the group
+                before = bytes(self.last)
+                if not self.listen() or self.last == before:
+                    break
+        else:
+            self._popen.returncode = 0  # it is waited for elsewhere
+        assert self._popen.stderr is not None
+        self._popen.stderr.close()
+
+
+class Child:
+    """A simulator in a process of its own, which speaks the wire.
+
+    Attributes:
+        points: The names of its decision points.
+        can: What else it can, such as "reseed".
+    """
+
+    def __init__(
+        self, command: Sequence[str], timeout: float, env: Mapping[str, str] | None = None, cwd: Any = None
+    ) -> None:
+        """Start it, and read what it says of itself.
+
+        Args:
+            command: The program and its arguments.
+            timeout: For how many seconds to wait for each line.
+            env: The environment variables that it sees; None: those of this process.
+            cwd: The folder in which it runs; None: that of this process.
+
+        Raises:
+            ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or does not speak as it should.
+        """
+        self.timeout = timeout
+        self._received = bytearray()
+        self._searched = 0  # of what was received
+        try:
+            self._process = _Process(command, os.environ if env is None else env, cwd)
+        except (OSError, ValueError) as error:
+            raise ProcessDiedError(f"{command[0]!r} cannot be started: {told(error)}") from error
+        self._finalizer = finalize(self, self._process.end, GRACE)
+        self._name = f"the process {self._process.number} ({command[0]})"
+        self._poll = select.poll()
+        self._poll.register(self._process.reading, select.POLLIN)
+        self._poll.register(self._process.stderr, select.POLLIN)
+        hello = self.receive()
+        version, points, can = hello.get("hello"), hello.get("points"), hello.get("can", [])
+        if version is None:
+            self.fail(WireError(f"{self._name} has begun with {hello}, and not with a hello"))
+        if type(version) is not int or version != VERSION:
+            self.fail(WireError(f"{self._name} speaks version {version} of the wire; this is version {VERSION}"))
+        if not _are_strings(points) or not _are_strings(can):
+            self.fail(WireError(f'{self._name} has said {hello}; its "points" and "can" must be lists of strings'))
+        self.points: frozenset[str] = frozenset(points)
+        self.can: frozenset[str] = frozenset(can)
+
+    def __str__(self) -> str:
+        return self._name
+
+    # -- lines ------------------------------------------------------------------------------------
+
+    def receive(self) -> dict[str, Any]:
+        """Wait for the next frame.
+
+        Raises:
+            ProcessDiedError: The process has ended, or has closed its pipe.
+            ProcessTimeoutError: Nothing came.
+            WireError: It has sent something else than a frame.
+        """
+        self._check_owner()
+        received, deadline = self._received, 0.0
+        while True:
+            end = received.find(b"\n", self._searched)
+            if end >= LONGEST or (end < 0 and len(received) >= LONGEST):
+                self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
+            if end >= 0:
+                line = bytes(received[:end])
+                del received[: end + 1]
+                self._searched = 0
+                try:
+                    return decode(line)
+                except WireError as error:
+                    self.fail(WireError(f"{self} has sent {error}"))
+            self._searched = len(received)
+            deadline = deadline or monotonic() + self.timeout
+            self._wait(self._process.reading, deadline, "half a line" if received else "nothing")
+            chunk = os.read(self._process.reading, CHUNK)
+            if not chunk:
+                self._died()
+            received += chunk
+
+    def send(self, lines: bytes) -> None:
+        """Send lines.
+
+        Where the process has gone, nothing comes of it: ``receive`` tells, for it may have said why.
+
+        Raises:
+            ProcessTimeoutError: It does not read.
+        """
+        self._check_owner()
+        deadline, writing, reading = 0.0, self._process.writing, self._process.reading
+        while lines:
+            try:
+                lines = lines[os.write(writing, lines) :]
+            except BrokenPipeError:
+                return
+            except BlockingIOError:
+                deadline = deadline or monotonic() + self.timeout
+                self._poll.unregister(reading)
+                self._poll.register(writing, select.POLLOUT)
+                self._wait(writing, deadline, "nothing, and does not read")
+                self._poll.unregister(writing)
+                self._poll.register(reading, select.POLLIN)
+
+    def _wait(self, descriptor: int, deadline: float, sent: str) -> None:
+        """Wait until a descriptor is ready; read what comes on standard error meanwhile."""
+        while True:
+            left = deadline - monotonic()
+            ready = self._poll.poll(max(0.0, left) * 1000)
+            if not ready and left <= 0:
+                self.fail(ProcessTimeoutError(f"{self} {self._state()}; it has sent {sent} for {self.timeout:g} s"))
+            found = False
+            for which, _ in ready:
+                found = found or which == descriptor
+                if which == self._process.stderr and not self._process.listen():
+                    self._poll.unregister(which)
+            if found:
+                return
+
+    def _check_owner(self) -> None:
+        if not self._process.owned:
+            raise WrongThreadError(
+                f"{self} belongs to another process, of which this one is a fork; reset() starts one for this one"
+            )
+
+    # -- ends -------------------------------------------------------------------------------------
+
+    @property
+    def usable(self) -> bool:
+        """Whether it was not ended, and is no other process's."""
+        return self._finalizer.alive and self._process.owned
+
+    def exit_code(self) -> int | None:
+        """With what it has exited, or minus the signal that has ended it; None as long as it runs."""
+        return self._process.exit_code()
+
+    def fail(self, error: SimEnvError) -> NoReturn:
+        """End the process at once, and raise an error, with the last that it wrote on its standard error."""
+        self.end(patience=0.0)
+        text = self._process.last.decode(errors="replace").strip()
+        raise type(error)(f"{error}. The last that it wrote on its standard error:\n{text}" if text else str(error))
+
+    def end(self, patience: float = GRACE) -> None:
+        """Close its pipes, and end it and all that it has started.
+
+        Args:
+            patience: For how many seconds it may take to end by itself.
+        """
+        self._finalizer.detach()
+        self._process.end(patience)
+
+    def _died(self) -> NoReturn:
+        """Raise the error of a process that has closed its pipe."""
+        self._process.wait(GRACE)
+        half = " in the middle of a line" if self._received else ""
+        self.fail(ProcessDiedError(f"{self} has closed its pipe{half}, and {self._state()}"))
+
+    def _state(self) -> str:
+        code = self.exit_code()
+        if code is None:
+            return "still runs"
+        if code >= 0:
+            return f"has exited with code {code}"
+        try:
+            return f"was killed by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"was killed by signal {-code}"
+
+
+def _are_strings(value: Any) -> TypeGuard[list[str]]:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)

@@ -1,0 +1,350 @@
+"""A simulation whose model runs in a process of its own, and calls for decisions over a pair of pipes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from types import NoneType
+from typing import Any, Final, NoReturn
+
+from ..decision import BY_NAME, Definition
+from ..errors import (
+    BranchError,
+    DefinitionError,
+    OptionValueError,
+    ProcessDiedError,
+    RemoteError,
+    SimEnvError,
+    SimulationError,
+    UnknownPointError,
+    WireError,
+    annotate,
+    shown,
+)
+from ..simulation import RULE, TRUNCATED, SimulationInterface
+from .calls import RemoteCall, point_named
+from .child import GRACE, Child
+from .wire import STOP, encode
+
+_ENTITIES: Final = (str, int, NoneType)
+_TIMES: Final = (float, int, NoneType)
+
+
+class _Link:
+    """The process of a simulation, and how far it is in its episode. Never copied.
+
+    Attributes:
+        child: The process; None as long as none was started.
+        state: "idle" between episodes, "waits" for the answer to a call, or "busy" with its model.
+        played: Whether it has ended an episode by itself, after which it may exit.
+        first: The first frame of an episode that was begun and does not run yet.
+        number: Of the latest call.
+        calls: By point and entity, the latest call.
+        time: The latest time that was told; None where none was.
+        seed: With which it is to draw anew before it goes on; None: it is not to.
+    """
+
+    __slots__ = ("calls", "child", "first", "number", "played", "seed", "state", "time")
+
+    def __init__(self) -> None:
+        self.child: Child | None = None
+        self.state = "idle"
+        self.played = False
+        self.begin(None)
+
+    def begin(self, first: dict[str, Any] | None) -> None:
+        """Begin an episode with its first frame."""
+        self.first, self.number, self.played = first, 0, False
+        self.seed: int | None = None
+        self.calls: dict[tuple[str, Any], RemoteCall] = {}
+        self.time: float | None = None
+        if first is not None:
+            self.state = "waits" if "decide" in first else "idle" if "end" in first else "busy"
+            if type(first.get("time")) in (float, int):
+                self.time = float(first["time"])
+
+    def break_off(self) -> None:
+        """End the episode, if one goes on: the process unwinds where it waits, and is ended where it is busy."""
+        child, state, self.state = self.child, self.state, "idle"
+        if child is None or not child.usable:
+            return
+        if state == "waits":
+            with suppress(SimEnvError):  # it is ended then, and the next episode begins in a new one
+                child.send(STOP)
+        elif state == "busy":
+            child.end(patience=0.0)
+
+
+class ProcessSimulation(SimulationInterface):
+    """A simulation whose model runs in a process of its own (POSIX), in whatever language.
+
+    The process is started by the first ``reset``, plays one episode after the other, and is ended when the environment
+    is closed, or gone. It calls for decisions in its own order. What is left to ``RULE`` it decides itself.
+
+    Mappings, ``agent`` and ``apply`` get one object for each entity at a point: the call's arguments are its attributes
+    and items (``call.level``, ``call["queue-length"]``), ``entity`` and ``time`` besides. What ``apply`` returns is
+    sent as the decision; ``RULE`` leaves it to the process.
+
+    Attributes:
+        points: The decision points with their definitions.
+        result: What the process has told at the end of the latest episode; None before.
+    """
+
+    def __init__(
+        self,
+        command: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        points: Mapping[str, Definition],
+        *,
+        timeout: float = 30.0,
+        env: Mapping[str, str] | None = None,
+        cwd: str | os.PathLike[str] | None = None,
+    ) -> None:
+        """Say how the process is started, and what is decided in it.
+
+        Args:
+            command: The program and its arguments; a program without arguments may stand alone.
+            points: From the process's name of a decision point, which serves wherever a dotted name does, to its
+                definition. At points that are not named here the process decides by its own rule.
+            timeout: For how many seconds to wait for each line of the process, and for it to read what it is sent.
+            env: The environment variables that the process sees; None: those of this process.
+            cwd: The folder in which it runs; None: that of this process.
+
+        Raises:
+            OptionValueError: The command or the timeout cannot be such.
+            DefinitionError: The points are no dict from names to definitions.
+        """
+        self.command = _words(command)
+        if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not timeout > 0:
+            raise OptionValueError(f"timeout must be a positive number of seconds, not {shown(timeout)}")
+        self.timeout, self.env, self.cwd = float(timeout), env, cwd
+        self.points = _by_function(points)
+        self.result: Any = None
+        self._link = _Link()
+
+    def __getstate__(self) -> dict[str, Any]:
+        points = {getattr(function, BY_NAME): definition for function, definition in self.points.items()}
+        return {**vars(self), "points": points, "result": None, "_link": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.points, self._link = _by_function(state["points"]), _Link()
+
+    # -- episodes ---------------------------------------------------------------------------------
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Begin an episode: in the process that there is, or in a new one.
+
+        Args:
+            seed: What the process is to seed its generators with.
+            options: What it is to know of the episode besides; JSON.
+
+        Raises:
+            WireError: The options are no JSON, and nothing was sent; or the process does not speak as it should.
+            ProcessDiedError, ProcessTimeoutError: It does not start, or does not answer.
+            UnknownPointError: It does not have the points that were named.
+        """
+        start = encode({"start": {"seed": seed, "options": options or {}}})
+        self.result, link = None, self._link
+        link.break_off()
+        child = link.child
+        if child is not None and child.usable:
+            may_exit = link.played
+            link.state = "busy"
+            try:
+                child.send(start)
+                link.begin(child.receive())
+                return
+            except ProcessDiedError:
+                if not may_exit or child.exit_code() != 0:
+                    raise
+            except BaseException:
+                link.break_off()
+                raise
+        link.child = child = self._started()
+        link.state = "busy"
+        try:
+            child.send(start)
+            link.begin(child.receive())
+        except BaseException:
+            link.break_off()
+            raise
+
+    def _started(self) -> Child:
+        child = Child(self.command, self.timeout, self.env, self.cwd)
+        missing = [name for name in self._names() if name not in child.points]
+        if missing:
+            has = ", ".join(sorted(child.points)) or "none"
+            child.fail(UnknownPointError(f"{child} has no decision point {', '.join(missing)}; it has {has}"))
+        return child
+
+    def run(self) -> Any:
+        """Have the process run through the episode; its calls are those of the points' decision functions.
+
+        Returns:
+            ``TRUNCATED`` where the process says that the end is a limit of time; else None.
+
+        Raises:
+            RemoteError: The model has raised an error.
+            WireError: The process does not speak as it should, or a decision is no JSON.
+            ProcessDiedError, ProcessTimeoutError: It has ended, or does not answer.
+            SimulationError: No episode was begun.
+        """
+        link = self._link
+        child, frame, link.first = link.child, link.first, None
+        if child is None or frame is None:
+            raise SimulationError("run() runs an episode that reset() has begun, and each but once")
+        functions = dict(zip(self._names(), self.points, strict=True))
+        try:
+            while "end" not in frame:
+                if "decide" in frame:
+                    answer = self._answered(child, frame, functions)
+                    link.state = "busy"
+                    child.send(answer)
+                elif "remove" in frame:
+                    self._remove(child, frame)
+                else:
+                    _refuse(child, frame)
+                frame = child.receive()
+            return self._end(child, frame["end"])
+        except BaseException:
+            link.break_off()
+            raise
+
+    def close(self, last: bool = True) -> None:
+        """End the process, if no other episode follows.
+
+        Args:
+            last: Whether none does.
+        """
+        link = self._link
+        if last and link.child is not None:
+            link.break_off()
+            link.child.end(GRACE)
+            link.child = None
+
+    @property
+    def time(self) -> Callable[[], float]:
+        """A method that returns the process's time; not there where the process tells none."""
+        link = self._link
+        if link.time is None:
+            raise AttributeError("the process tells no time")
+        return lambda: link.time  # type: ignore[return-value]
+
+    def reseed(self, seed: int) -> None:
+        """Have the process draw anew what it leaves to chance from here on.
+
+        Raises:
+            BranchError: It has not said that it can.
+        """
+        child = self._link.child
+        if child is None or "reseed" not in child.can:
+            raise BranchError(f'{child or "a process that was not started"} has not said "reseed" among what it can')
+        self._link.seed = int(seed)
+
+    # -- frames -----------------------------------------------------------------------------------
+
+    def _answered(self, child: Child, frame: dict[str, Any], functions: dict[str, Any]) -> bytes:
+        """Have a call decided; return the lines that answer it."""
+        link, number, time, arguments = self._link, frame["decide"], frame.get("time"), frame.get("args")
+        if type(number) is not int or number != link.number + 1:
+            child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
+        name, entity = _checked_call(child, frame.get("point"), frame.get("entity"), arguments)
+        if type(time) not in _TIMES:
+            child.fail(WireError(f"{child} has sent the time {shown(time)} in call {number}, which is no number"))
+        link.number, link.state = number, "waits"
+        if time is not None:
+            link.time = float(time)
+        value: Any = RULE
+        function = functions.get(name)
+        if function is not None:
+            call = link.calls.get((name, entity))
+            if call is None:
+                call = link.calls[name, entity] = RemoteCall(name, entity)
+            call.__dict__, call.time = arguments or {}, link.time
+            value = function(call)
+        seed, link.seed = link.seed, None
+        reseed = b"" if seed is None else b'{"reseed":%d}\n' % seed
+        if value is RULE:
+            return b'%b{"act":%d,"rule":true}\n' % (reseed, number)
+        try:
+            return reseed + encode({"act": number, "value": value})
+        except WireError as error:
+            annotate(error, f"simenv_marl: it is the decision at {name} of {entity!r}")
+            raise
+
+    def _remove(self, child: Child, frame: dict[str, Any]) -> None:
+        """End the agent of an entity that is gone."""
+        arguments = frame.get("args")
+        call = self._link.calls.pop(_checked_call(child, frame.get("point"), frame["remove"], arguments), None)
+        if call is not None:
+            if arguments is not None:
+                call.__dict__ = arguments
+            point_named(call.point).remove(call)
+
+    def _end(self, child: Child, end: Any) -> Any:
+        """Note the end of the episode."""
+        if not isinstance(end, dict):
+            child.fail(
+                WireError(f'{child} has sent the end {shown(end)}; it is an object with "truncated" and "result"')
+            )
+        self._link.state, self._link.played = "idle", True
+        self.result = end.get("result")
+        return TRUNCATED if end.get("truncated") else None
+
+    def _names(self) -> list[str]:
+        return [getattr(function, BY_NAME) for function in self.points]
+
+
+def _words(command: Any) -> list[str]:
+    """The program and its arguments.
+
+    Raises:
+        OptionValueError: They are no such.
+    """
+    words = [command] if isinstance(command, (str, os.PathLike)) else command
+    if not isinstance(words, Sequence) or not words or not all(isinstance(word, (str, os.PathLike)) for word in words):
+        raise OptionValueError(f"command must be a program and its arguments, a list of strings, not {shown(command)}")
+    return [os.fspath(word) for word in words]
+
+
+def _by_function(points: Any) -> dict[Any, Definition]:
+    """The definitions of the decision functions of a dict's names.
+
+    Raises:
+        DefinitionError: It is no dict from names to definitions.
+    """
+    if not isinstance(points, Mapping) or not points:
+        raise DefinitionError(f"points must be a dict from the process's names to definitions, not {shown(points)}")
+    for name, definition in points.items():
+        if not isinstance(name, str) or not name or not isinstance(definition, Definition):
+            raise DefinitionError(
+                "points must go from the process's names to what make_step returns, not"
+                f" {shown(name)}: {shown(definition)}"
+            )
+    return {point_named(name).decide: definition for name, definition in points.items()}
+
+
+def _checked_call(child: Child, name: Any, entity: Any, arguments: Any) -> tuple[str, Any]:
+    """The point and the entity of a frame.
+
+    Raises:
+        WireError: They are none, or its arguments are none.
+    """
+    if not isinstance(name, str) or name not in child.points:
+        child.fail(WireError(f"{child} has called the point {shown(name)}, which is not in its hello"))
+    if type(entity) not in _ENTITIES:
+        child.fail(WireError(f"{child} has called {name} for {shown(entity)}; an entity is a string or an integer"))
+    if arguments is not None and not isinstance(arguments, dict):
+        child.fail(WireError(f"{child} has called {name} with args that are no object: {shown(arguments)}"))
+    return name, entity
+
+
+def _refuse(child: Child, frame: dict[str, Any]) -> NoReturn:
+    """Raise the error that a process tells, or say that its frame is none."""
+    error = frame.get("error")
+    if not isinstance(error, dict):
+        child.fail(WireError(f"{child} has sent what is no frame of the wire: {shown(frame)}"))
+    kind, text, trace = (error.get(name) or "" for name in ("type", "text", "trace"))
+    where = f"\n{trace}" if trace else ""
+    child.fail(RemoteError(f"the model in {child} has raised {kind or 'an error'}: {text}{where}"))

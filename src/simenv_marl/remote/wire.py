@@ -1,0 +1,102 @@
+"""The wire between an environment and a simulator in another process: one JSON object a line, version 1.
+
+What Python's ``json`` reads and writes is narrowed down to what every language can: keys are strings, and numbers that
+are not finite travel as ``{"float": "nan"}``, ``{"float": "inf"}`` and ``{"float": "-inf"}``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from math import inf, isfinite, nan
+from typing import Any, Final, NoReturn
+
+import numpy as np
+
+from ..errors import WireError, shown, told
+
+VERSION: Final = 1
+
+DESCRIPTORS: Final = "SIMENV_MARL_FDS"
+"""The environment variable in which a simulator finds the numbers of its two descriptors, ``"R,W"``."""
+
+LONGEST: Final = 16 << 20
+"""How many bytes a line may have."""
+
+NOT_FINITE: Final = {"nan": nan, "inf": inf, "-inf": -inf}
+
+STOP: Final = b'{"stop":true}\n'
+
+
+def encode(frame: Mapping[str, Any]) -> bytes:
+    """The line of a frame.
+
+    Raises:
+        WireError: Something in it cannot travel, or it is too long.
+    """
+    line = _ENCODER.encode(sendable(frame)).encode() + b"\n"
+    if len(line) > LONGEST:
+        raise WireError(f"a line of {len(line):,} bytes was to be sent, and the longest that may be has {LONGEST:,}")
+    return line
+
+
+def sendable(value: Any, where: str = "") -> Any:
+    """A value made of what JSON has: arrays become lists, and numbers that are not finite become objects.
+
+    Args:
+        value: Numbers, strings, booleans, None, arrays, lists, tuples, and dicts with strings as keys.
+        where: Where it stands in the frame, for the error.
+
+    Raises:
+        WireError: Something else is in it.
+    """
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, float):
+        return float(value) if isfinite(value) else {"float": repr(float(value))}
+    if isinstance(value, (np.ndarray, np.generic)):
+        return sendable(value.tolist(), where)
+    if isinstance(value, (list, tuple)):
+        return [sendable(item, f"{where}[{place}]") for place, item in enumerate(value)]
+    if isinstance(value, Mapping):
+        for key in value:
+            if not isinstance(key, str):
+                raise WireError(
+                    f"{shown(key)} cannot be a key in what is sent to a process; keys are strings{_at(where)}"
+                )
+        return {key: sendable(item, f"{where}[{key!r}]") for key, item in value.items()}
+    raise WireError(f"{shown(value)} cannot be sent to a process: it is no JSON{_at(where)}")
+
+
+def _at(where: str) -> str:
+    return f" (at {where})" if where else ""
+
+
+def decode(line: bytes) -> dict[str, Any]:
+    """The frame of a line.
+
+    Raises:
+        WireError: It is no JSON object in UTF-8.
+    """
+    try:
+        frame = (_WITH_OBJECTS if b'"float"' in line else _DECODER).decode(line.decode())
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"a line that is no JSON in UTF-8 ({told(error)}): {shown(line)}") from None
+    if not isinstance(frame, dict):
+        raise WireError(f"a line that is no JSON object: {shown(line)}")
+    return frame
+
+
+def _number(found: dict[str, Any]) -> Any:
+    """What an object stands for: itself, or a number that is not finite."""
+    name = found.get("float")
+    return NOT_FINITE.get(name, found) if len(found) == 1 and isinstance(name, str) else found
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not in JSON; numbers that are not finite travel as {{'float': 'nan'}}")
+
+
+_ENCODER: Final = json.JSONEncoder(separators=(",", ":"), allow_nan=False, check_circular=False)
+_DECODER: Final = json.JSONDecoder(parse_constant=_refuse)
+_WITH_OBJECTS: Final = json.JSONDecoder(parse_constant=_refuse, object_hook=_number)

@@ -1,0 +1,152 @@
+"""A model of its own process, which speaks the wire: reservoirs that are filled, leak, are given up and come anew.
+
+``python outside.py`` plays it to an environment, or by its own rule where there is none. It needs nothing but Python,
+and nothing of the library, as a simulator in another language would not have it. The tests run the same model in
+their own process, too.
+"""
+
+import json
+import os
+import random
+import sys
+from collections.abc import Callable
+from math import inf, isfinite
+from typing import Any
+
+
+class Stopped(BaseException):
+    """The environment has broken off the episode."""
+
+
+class Reservoirs:
+    """Some reservoirs. Whoever operates one says how much is let in; a broker, now and then, sets the price."""
+
+    def __init__(self, seed: int, options: dict[str, Any]) -> None:
+        self.random = random.Random(seed)
+        self.hours = options.get("hours", 12)
+        self.levels = {"a": 4.0, "b": 6.0}
+        self.price, self.time, self.born, self.log = 1.0, 0.0, 0, []
+
+    def run(self, decide: Callable[..., Any], remove: Callable[[str, str], None]) -> None:
+        """The main loop.
+
+        Args:
+            decide: Called with point, entity, time, arguments and rule; returns the decision.
+            remove: Called with point and entity, when that is gone.
+        """
+        for hour in range(self.hours):
+            self.time = hour / 4
+            for name in sorted(self.levels):
+                if name not in self.levels:
+                    continue
+                level = self.levels[name]
+                inflow = decide(
+                    "reservoir.inflow",
+                    name,
+                    self.time,
+                    {"level": level, "queue-length": hour, "price": self.price},
+                    lambda level=level: round(max(0.0, 5.0 - level), 3),
+                )
+                self.levels[name] = level + inflow - self.random.uniform(0.2, 2.0)
+                self.log.append((hour, name, self.levels[name]))
+                if not 0 < self.levels[name] < 9:
+                    del self.levels[name]
+                    remove("reservoir.inflow", name)
+                    self.born += 1
+                    self.levels[f"new{self.born}"] = self.random.uniform(2, 6)
+            if hour % 3 == 2:
+                self.price = decide(
+                    "broker.price", None, self.time, {"total": sum(self.levels.values())}, lambda: self.price * 1.1
+                )
+
+    def result(self) -> dict[str, Any]:
+        """What came of it."""
+        return {"levels": self.levels, "price": self.price, "log": self.log}
+
+
+# -- the wire -------------------------------------------------------------------------------------
+
+
+def finite(value: Any) -> Any:
+    """Numbers that are not finite, as they travel."""
+    if isinstance(value, float) and not isfinite(value):
+        return {"float": "nan" if value != value else "inf" if value == inf else "-inf"}
+    return value
+
+
+class Wire:
+    """The simulator's end."""
+
+    def __init__(self) -> None:
+        reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
+        self.lines = open(reading, encoding="utf-8")  # noqa: SIM115
+        self.writing = writing
+        self.number = 0
+        self.model: Any = None
+
+    def send(self, frame: dict[str, Any]) -> None:
+        """Send a frame."""
+        self.raw(json.dumps(frame).encode() + b"\n")
+
+    def raw(self, line: bytes) -> None:
+        """Send any bytes."""
+        while line:
+            line = line[os.write(self.writing, line) :]
+
+    def receive(self) -> dict[str, Any]:
+        """Wait for a frame; the process ends where none can come any more."""
+        line = self.lines.readline()
+        if not line:
+            sys.exit()
+        frame: dict[str, Any] = json.loads(line)
+        return frame
+
+    def decide(self, point: str, entity: Any, time: float | None, arguments: Any, rule: Callable[[], Any]) -> Any:
+        """Have something decided."""
+        self.number += 1
+        frame = {"decide": self.number, "point": point, "entity": entity, "time": time, "args": arguments}
+        self.send({name: value for name, value in frame.items() if value is not None})
+        answer = self.receive()
+        if "reseed" in answer:
+            self.model.random.seed(answer["reseed"])
+            answer = self.receive()
+        if "stop" in answer:
+            raise Stopped
+        assert answer["act"] == self.number
+        return rule() if answer.get("rule") else answer["value"]
+
+    def remove(self, point: str, entity: str) -> None:
+        """Say that an entity is gone."""
+        self.send({"remove": entity, "point": point})
+
+    def play(self, make: Callable[[int, dict[str, Any]], Any], points: list[str], episodes: float = inf) -> None:
+        """Play so many episodes."""
+        self.send({"hello": 1, "points": points, "can": ["reseed"]})
+        played = 0
+        while played < episodes:
+            start = self.receive()["start"]
+            self.number, self.model = 0, make(start["seed"], start["options"])
+            try:
+                self.model.run(self.decide, self.remove)
+            except Stopped:
+                continue
+            played += 1
+            truncated = start["options"].get("truncated", False)
+            self.send({"end": {"truncated": truncated, "result": self.model.result()}})
+
+
+POINTS = ["reservoir.inflow", "broker.price"]
+
+
+def main() -> None:
+    """Play to an environment, or by the model's own rule: the result stands on the standard output then."""
+    if "SIMENV_MARL_FDS" in os.environ:
+        Wire().play(Reservoirs, POINTS, float(sys.argv[1]) if len(sys.argv) > 1 else inf)
+        return
+    model = Reservoirs(int(sys.argv[1]), {})
+    model.run(lambda point, entity, time, arguments, rule: rule(), lambda point, entity: None)
+    print(json.dumps(model.result()))
+
+
+if __name__ == "__main__":
+    main()

@@ -23,18 +23,21 @@ class Reservoirs:
 
     def __init__(self, seed: int, options: dict[str, Any]) -> None:
         self.random = random.Random(seed)
-        self.hours = options.get("hours", 12)
+        self.hours, self.words = options.get("hours", 12), options.get("words", 0)
         self.levels = {"a": 4.0, "b": 6.0}
         self.price, self.time, self.born, self.log = 1.0, 0.0, 0, []
 
-    def run(self, decide: Callable[..., Any], remove: Callable[[str, str], None]) -> None:
+    def run(self, decide: Callable[..., Any], remove: Callable[..., None], update: Callable[..., None]) -> None:
         """The main loop.
 
         Args:
             decide: Called with point, entity, time, arguments and rule; returns the decision.
             remove: Called with point and entity, when that is gone.
+            update: Called with point, entity and what its arguments would be by now.
         """
         for hour in range(self.hours):
+            if self.words:
+                print("hm" * self.words, file=sys.stderr)
             self.time = hour / 4
             for name in sorted(self.levels):
                 if name not in self.levels:
@@ -47,10 +50,11 @@ class Reservoirs:
                     {"level": level, "queue-length": hour, "price": self.price},
                     lambda level=level: round(max(0.0, 5.0 - level), 3),
                 )
-                self.levels[name] = level + inflow - self.random.uniform(0.2, 2.0)
+                self.levels[name] = level + inflow - self.random.uniform(0.2, 5.5)
                 self.log.append((hour, name, self.levels[name]))
                 if not 0 < self.levels[name] < 9:
-                    del self.levels[name]
+                    level = self.levels.pop(name)
+                    update("reservoir.inflow", name, {"level": level, "queue-length": hour, "price": self.price})
                     remove("reservoir.inflow", name)
                     self.born += 1
                     self.levels[f"new{self.born}"] = self.random.uniform(2, 6)
@@ -119,6 +123,10 @@ class Wire:
         """Say that an entity is gone."""
         self.send({"remove": entity, "point": point})
 
+    def update(self, point: str, entity: str, arguments: Any) -> None:
+        """Say what the arguments of an entity would be by now."""
+        self.send({"update": entity, "point": point, "args": arguments})
+
     def play(self, make: Callable[[int, dict[str, Any]], Any], points: list[str], episodes: float = inf) -> None:
         """Play so many episodes."""
         self.send({"hello": 1, "points": points, "can": ["reseed"]})
@@ -127,7 +135,7 @@ class Wire:
             start = self.receive()["start"]
             self.number, self.model = 0, make(start["seed"], start["options"])
             try:
-                self.model.run(self.decide, self.remove)
+                self.model.run(self.decide, self.remove, self.update)
             except Stopped:
                 continue
             played += 1
@@ -144,7 +152,7 @@ def main() -> None:
         Wire().play(Reservoirs, POINTS, float(sys.argv[1]) if len(sys.argv) > 1 else inf)
         return
     model = Reservoirs(int(sys.argv[1]), {})
-    model.run(lambda point, entity, time, arguments, rule: rule(), lambda point, entity: None)
+    model.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
     print(json.dumps(model.result()))
 
 

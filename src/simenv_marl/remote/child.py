@@ -190,7 +190,7 @@ class Child:
             ProcessTimeoutError: Nothing came.
             WireError: It has sent something else than a frame.
         """
-        self._check_owner()
+        self._check_usable()
         received, deadline = self._received, 0.0
         while True:
             end = received.find(b"\n", self._searched)
@@ -220,7 +220,7 @@ class Child:
         Raises:
             ProcessTimeoutError: It does not read.
         """
-        self._check_owner()
+        self._check_usable()
         deadline, writing, reading = 0.0, self._process.writing, self._process.reading
         while lines:
             try:
@@ -250,7 +250,9 @@ class Child:
             if found:
                 return
 
-    def _check_owner(self) -> None:
+    def _check_usable(self) -> None:
+        if not self._finalizer.alive:  # its descriptors may be something else's by now
+            raise ProcessDiedError(f"{self} was ended")
         if not self._process.owned:
             raise WrongThreadError(
                 f"{self} belongs to another process, of which this one is a fork; reset() starts one for this one"

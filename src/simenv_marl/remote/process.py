@@ -201,6 +201,8 @@ class ProcessSimulation(SimulationInterface):
                     answer = self._answered(child, frame, functions)
                     link.state = "busy"
                     child.send(answer)
+                elif "update" in frame:
+                    self._update(child, frame)
                 elif "remove" in frame:
                     self._remove(child, frame)
                 else:
@@ -246,22 +248,18 @@ class ProcessSimulation(SimulationInterface):
 
     def _answered(self, child: Child, frame: dict[str, Any], functions: dict[str, Any]) -> bytes:
         """Have a call decided; return the lines that answer it."""
-        link, number, time, arguments = self._link, frame["decide"], frame.get("time"), frame.get("args")
+        link, number = self._link, frame["decide"]
         if type(number) is not int or number != link.number + 1:
             child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
-        name, entity = _checked_call(child, frame.get("point"), frame.get("entity"), arguments)
-        if type(time) not in _TIMES:
-            child.fail(WireError(f"{child} has sent the time {shown(time)} in call {number}, which is no number"))
+        name, entity = self._named(child, frame, frame.get("entity"))
         link.number, link.state = number, "waits"
-        if time is not None:
-            link.time = float(time)
         value: Any = RULE
         function = functions.get(name)
         if function is not None:
             call = link.calls.get((name, entity))
             if call is None:
                 call = link.calls[name, entity] = RemoteCall(name, entity)
-            call.__dict__, call.time = arguments or {}, link.time
+            call.__dict__, call.time = frame.get("args") or {}, link.time
             value = function(call)
         seed, link.seed = link.seed, None
         reseed = b"" if seed is None else b'{"reseed":%d}\n' % seed
@@ -273,14 +271,36 @@ class ProcessSimulation(SimulationInterface):
             annotate(error, f"simenv_marl: it is the decision at {name} of {entity!r}")
             raise
 
+    def _update(self, child: Child, frame: dict[str, Any]) -> None:
+        """Note what the arguments of an entity's latest call would be by now."""
+        call = self._link.calls.get(self._named(child, frame, frame["update"]))
+        if call is not None:
+            call.__dict__, call.time = frame.get("args") or {}, self._link.time
+
     def _remove(self, child: Child, frame: dict[str, Any]) -> None:
         """End the agent of an entity that is gone."""
-        arguments = frame.get("args")
-        call = self._link.calls.pop(_checked_call(child, frame.get("point"), frame["remove"], arguments), None)
+        call = self._link.calls.pop(self._named(child, frame, frame["remove"]), None)
         if call is not None:
-            if arguments is not None:
-                call.__dict__ = arguments
             point_named(call.point).remove(call)
+
+    def _named(self, child: Child, frame: dict[str, Any], entity: Any) -> tuple[str, Any]:
+        """The point and the entity of a frame, whose time is noted.
+
+        Raises:
+            WireError: They, or the frame's arguments or time, are none.
+        """
+        name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
+        if not isinstance(name, str) or name not in child.points:
+            child.fail(WireError(f"{child} has named the point {shown(name)}, which is not in its hello"))
+        if type(entity) not in _ENTITIES:
+            child.fail(WireError(f"{child} has named {shown(entity)} at {name}; an entity is a string or an integer"))
+        if arguments is not None and not isinstance(arguments, dict):
+            child.fail(WireError(f"{child} has sent args for {name} that are no object: {shown(arguments)}"))
+        if type(time) not in _TIMES:
+            child.fail(WireError(f"{child} has sent the time {shown(time)} for {name}, which is no number"))
+        if time is not None:
+            self._link.time = float(time)
+        return name, entity
 
     def _end(self, child: Child, end: Any) -> Any:
         """Note the end of the episode."""
@@ -323,21 +343,6 @@ def _by_function(points: Any) -> dict[Any, Definition]:
                 f" {shown(name)}: {shown(definition)}"
             )
     return {point_named(name).decide: definition for name, definition in points.items()}
-
-
-def _checked_call(child: Child, name: Any, entity: Any, arguments: Any) -> tuple[str, Any]:
-    """The point and the entity of a frame.
-
-    Raises:
-        WireError: They are none, or its arguments are none.
-    """
-    if not isinstance(name, str) or name not in child.points:
-        child.fail(WireError(f"{child} has called the point {shown(name)}, which is not in its hello"))
-    if type(entity) not in _ENTITIES:
-        child.fail(WireError(f"{child} has called {name} for {shown(entity)}; an entity is a string or an integer"))
-    if arguments is not None and not isinstance(arguments, dict):
-        child.fail(WireError(f"{child} has called {name} with args that are no object: {shown(arguments)}"))
-    return name, entity
 
 
 def _refuse(child: Child, frame: dict[str, Any]) -> NoReturn:

@@ -1,0 +1,10 @@
+"""What is outside Python is tested with every driver."""
+
+from tests.conftest import DRIVERS
+
+
+def pytest_generate_tests(metafunc) -> None:
+    chosen = metafunc.config.getoption("--driver")
+    alone = metafunc.definition.get_closest_marker("greenlet") is not None
+    drivers = ["greenlet"] if alone else DRIVERS if chosen == "both" else [chosen]
+    metafunc.parametrize("_driver", drivers, indirect=True)

@@ -1,0 +1,117 @@
+"""The reservoirs of ``tests/worlds/outside.py`` as a simulation: in a process of its own, and in this one."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+from gymnasium import spaces
+
+from simenv_marl import TRUNCATED, ProcessSimulation, SimulationInterface, difference, make_step
+from tests.worlds import faulty, outside
+
+INFLOW = make_step(
+    observation_space=spaces.Box(-50, 50, (2,), np.float64),
+    observation_space_mapping=lambda call: [call.level, call["queue-length"]],
+    action_space=spaces.Box(0, 5, (1,), np.float64),
+    action_space_mapping=lambda action: float(action[0]),
+    reward_mapping=difference(lambda call: call.level),
+    agent=lambda call: call.entity,
+)
+PRICE = make_step(
+    observation_space=spaces.Box(-500, 500, (1,), np.float64),
+    observation_space_mapping=lambda call: [call.total],
+    action_space=spaces.Discrete(3),
+    action_space_mapping={0: 0.5, 1: 1.0, 2: 2.0},
+    reward_mapping=lambda call: -call.total,
+)
+BOTH = {"reservoir.inflow": INFLOW, "broker.price": PRICE}
+
+
+def command(*arguments: str) -> list[str]:
+    """What starts the model in a process of its own."""
+    return [sys.executable, outside.__file__, *arguments]
+
+
+def reservoirs(points=BOTH, **options) -> ProcessSimulation:
+    """The model in a process of its own."""
+    return ProcessSimulation(command(), points, **options)
+
+
+def broken(when: str, what: str, timeout: float = 20.0, points=BOTH) -> ProcessSimulation:
+    """A simulator that does something wrong."""
+    return ProcessSimulation([sys.executable, faulty.__file__, when, what], points, timeout=timeout)
+
+
+def by_its_rule(seed: int, **options) -> dict:
+    """What comes of the model by its own rule, in this process."""
+    model = outside.Reservoirs(seed, options)
+    model.run(lambda point, entity, time, arguments, rule: rule(), lambda *named: None, lambda *named: None)
+    return told(model.result())
+
+
+def told(result: dict) -> dict:
+    """A result as it arrives."""
+    return {**result, "log": [list(row) for row in result["log"]]}
+
+
+# -- the same model in this process ---------------------------------------------------------------
+
+
+class Here(SimulationInterface):
+    """The model in this process: what its process is to be indistinguishable from."""
+
+    def __init__(self) -> None:
+        self.calls: dict = {}
+
+    def reset(self, seed=None, options=None) -> None:
+        self.options = options or {}
+        self.calls = {}
+        self.model = outside.Reservoirs(seed, self.options)
+
+    def run(self):
+        self.model.run(self._decide, self._remove, self._update)
+        return TRUNCATED if self.options.get("truncated") else None
+
+    def time(self) -> float:
+        return self.model.time
+
+    def reseed(self, seed: int) -> None:
+        self.model.random.seed(seed)
+
+    def _decide(self, point, entity, time, arguments, rule):
+        function = {"reservoir.inflow": inflow, "broker.price": price}[point]
+        call = self.calls.setdefault((point, entity), Call())
+        vars(call).update(arguments, entity=entity, rule=rule)
+        return function(call)
+
+    def _update(self, point, entity, arguments) -> None:
+        vars(self.calls[point, entity]).update(arguments)
+
+    def _remove(self, point, entity) -> None:
+        removed(self.calls.pop((point, entity)))
+
+
+class Call:
+    """A call's arguments."""
+
+    def __getitem__(self, name):
+        return vars(self)[name]
+
+
+def inflow(call):
+    return call.rule()
+
+
+def price(call):
+    return call.rule()
+
+
+def removed(call) -> None:
+    """It is gone."""
+
+
+HERE = f"{__name__}."
+BOTH_HERE = {
+    f"{HERE}inflow": replace(INFLOW, removed_by=f"{HERE}removed"),
+    f"{HERE}price": PRICE,
+}

@@ -1,0 +1,248 @@
+"""Whatever a simulator does wrong is told as what it is, in time, and the next episode begins in a new process."""
+
+import os
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from simenv_marl import (
+    RULE,
+    ProcessDiedError,
+    ProcessError,
+    ProcessTimeoutError,
+    RemoteError,
+    UnknownPointError,
+    WireError,
+    WrongThreadError,
+    aec_env,
+    single_env,
+)
+from tests.outside.reservoirs import BOTH, INFLOW, PRICE, broken, by_its_rule, reservoirs
+from tests.outside.test_process import all_told, child, ruled, runs
+from tests.worlds.faulty import AT_ONCE, FAULTS
+
+IN_MID_EPISODE = {
+    "garbage": (WireError, "no JSON"),
+    "no object": (WireError, r"no JSON object.*\[1\]"),
+    "no utf-8": (WireError, "UnicodeDecodeError"),
+    "deep": (WireError, "no JSON"),
+    "nan": (WireError, "NaN is not in JSON"),
+    "unknown frame": (WireError, "no frame of the wire.*desire"),
+    "number": (WireError, "call 7 where call 4 was due"),
+    "number text": (WireError, "call '4' where call 4"),
+    "point": (WireError, r"moon\.phase.*not in its hello"),
+    "entity": (WireError, r"\['a'\] at reservoir\.inflow; an entity is"),
+    "args": (WireError, r"args .* no object: \[1\]"),
+    "time": (WireError, "the time 'now'"),
+    "removed point": (WireError, r"moon\.phase.*not in its hello"),
+    "end": (WireError, "the end True"),
+    "half a line": (ProcessDiedError, "closed its pipe in the middle of a line, and has exited with code 0"),
+    "half a line, silent": (ProcessTimeoutError, "still runs; it has sent half a line for 0.3 s"),
+    "silence": (ProcessTimeoutError, "still runs; it has sent nothing for 0.3 s"),
+    "exit": (ProcessDiedError, "closed its pipe, and has exited with code 0"),
+    "exit 3": (ProcessDiedError, "closed its pipe, and has exited with code 3"),
+    "crash": (ProcessDiedError, "was killed by SIGABRT.*there are many words\na last word"),
+    "kill": (ProcessDiedError, "was killed by SIGKILL"),
+    "closed": (ProcessDiedError, "closed its pipe, and still runs"),
+    "grandchild": (ProcessTimeoutError, "has exited with code 5; it has sent nothing"),
+    "gigabyte": (WireError, "a line of more than 16,777,216 bytes"),
+    "error": (RemoteError, "has raised Flood: a dam broke\ndam.cpp:12"),
+    "error, no object": (WireError, "no frame of the wire.*a dam broke"),
+}
+
+AT_ONCE_TOLD = {
+    "no hello": (WireError, "has begun with .*decide.*, and not with a hello"),
+    "version 2": (WireError, "speaks version 2 of the wire; this is version 1"),
+    "version true": (WireError, "speaks version True"),
+    "points": (WireError, "must be lists of strings"),
+    "other points": (UnknownPointError, r"no decision point .*; it has moon\.phase"),
+    "silence": (ProcessTimeoutError, "sent nothing"),
+    "exit": (ProcessDiedError, "exited with code 0"),
+    "exit 3": (ProcessDiedError, "exited with code 3"),
+    "garbage": (WireError, "Welcome to the simulator"),
+}
+
+
+def test_all_faults_are_tested():
+    assert (IN_MID_EPISODE.keys(), AT_ONCE_TOLD.keys()) == (FAULTS.keys(), AT_ONCE.keys())
+
+
+def patience(what: str) -> float:
+    """For how long to wait for a simulator, in seconds: not long where nothing comes."""
+    return 0.3 if what in ("silence", "half a line, silent", "grandchild") else 20.0
+
+
+@pytest.mark.parametrize("what", IN_MID_EPISODE)
+def test_in_mid_episode(what):
+    kind, text = IN_MID_EPISODE[what]
+    simulation = broken("in mid-episode", what)
+    env = aec_env(simulation, "reservoir.inflow")
+    env.reset(seed=1)
+    number = child(env)
+    env.unwrapped.simulation._link.child.timeout = patience(what)
+    env.step(RULE)
+    env.step(RULE)
+    with pytest.raises(kind, match=f"(?s){text}") as caught:
+        env.step(RULE)
+    assert "there are many words" in str(caught.value)
+    assert isinstance(caught.value, ProcessError)
+    assert not runs(number)
+    env.reset(seed=1, options={"well": True})
+    assert child(env) != number
+    for _ in range(3):
+        env.step(RULE)
+    assert env.terminations == {"a": True}
+    env.close()
+
+
+@pytest.mark.parametrize("what", AT_ONCE_TOLD)
+def test_at_once(what):
+    kind, text = AT_ONCE_TOLD[what]
+    env = aec_env(broken("at once", what, timeout=patience(what)), "reservoir.inflow")
+    if what == "silence":
+        env.unwrapped.simulation.timeout = 1.0
+    for _ in range(2):
+        with pytest.raises(kind, match=f"(?s){text}"):
+            env.reset(seed=1)
+        assert not env.unwrapped.simulation._link.child
+    env.close()
+
+
+def test_a_command_that_leads_nowhere_is_told_with_the_reason():
+    simulation = reservoirs()
+    simulation.command = ["/nowhere/at/all"]
+    with pytest.raises(ProcessDiedError, match=r"'/nowhere/at/all' cannot be started: FileNotFoundError"):
+        aec_env(simulation).reset()
+    simulation.command = [str(Path(__file__))]
+    with pytest.raises(ProcessDiedError, match="PermissionError"):
+        aec_env(simulation).reset()
+
+
+def test_one_process_that_is_killed_leaves_the_others_alone():
+    envs = [aec_env(reservoirs()) for _ in range(4)]
+    for seed, env in enumerate(envs):
+        env.reset(seed=seed)
+        env.step(RULE)
+    os.kill(child(envs[1]), signal.SIGKILL)
+    with pytest.raises(ProcessDiedError, match="SIGKILL"):
+        envs[1].step(RULE)
+    for seed in (0, 2, 3):
+        while envs[seed].agents:
+            _, _, terminated, truncated, _ = envs[seed].last()
+            envs[seed].step(None if terminated or truncated else RULE)
+        assert envs[seed].unwrapped.simulation.result == by_its_rule(seed)
+    all_told(envs[1], 1, ruled)
+    assert envs[1].unwrapped.simulation.result == by_its_rule(1)
+    for env in envs:
+        env.close()
+
+
+def test_a_process_that_was_killed_between_episodes_is_told_of():
+    env = aec_env(reservoirs())
+    all_told(env, 1, ruled)
+    os.kill(child(env), signal.SIGKILL)
+    with pytest.raises(ProcessDiedError, match="SIGKILL"):
+        env.reset(seed=2)
+    all_told(env, 2, ruled)
+    assert env.unwrapped.simulation.result == by_its_rule(2)
+    env.close()
+
+
+def test_a_process_that_does_not_read_is_told_of():
+    env = single_env(broken("in mid-episode", "silence", points={"reservoir.inflow": INFLOW}), agent="a")
+    env.reset(seed=1)
+    simulation = env.unwrapped.simulation
+    simulation._link.child.timeout = 0.3
+    os.kill(child(env), signal.SIGSTOP)
+    with pytest.raises(ProcessTimeoutError, match="does not read"):
+        simulation._link.child.send(bytes(1 << 20))
+    with pytest.raises(ProcessError):
+        env.step(np.ones(1))
+    env.close()
+
+
+def test_what_is_long_crosses_in_both_directions():
+    env = aec_env(reservoirs())
+    env.reset(seed=1, options={"long": ["ö" * 1000] * 2000, "hours": 3})
+    while env.agents:
+        _, _, terminated, truncated, _ = env.last()
+        env.step(None if terminated or truncated else RULE)
+    assert env.unwrapped.simulation.result == by_its_rule(1, hours=3)
+    with pytest.raises(WireError, match=r"longest that may be has 16,777,216"):
+        env.reset(seed=1, options={"long": "o" * (16 << 20)})
+    env.close()
+
+
+def test_a_process_that_writes_much_on_its_standard_error_is_not_held_up():
+    env = aec_env(reservoirs())
+    env.reset(seed=1, options={"hours": 6, "words": 100_000})
+    while env.agents:
+        _, _, terminated, truncated, _ = env.last()
+        env.step(None if terminated or truncated else RULE)
+    assert env.unwrapped.simulation.result == by_its_rule(1, hours=6)
+    env.close()
+
+
+def test_a_fork_cannot_go_on_with_the_process_and_can_begin_anew():
+    env = aec_env(reservoirs())
+    env.reset(seed=1)
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            try:
+                env.step(RULE)
+            except WrongThreadError:
+                all_told(env, 2, ruled)
+                code = 0 if env.unwrapped.simulation.result == by_its_rule(2) else 2
+                env.close()
+        finally:
+            os._exit(code)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    all_told(env, 1, ruled)
+    assert env.unwrapped.simulation.result == by_its_rule(1)
+    env.close()
+
+
+def test_an_error_in_a_mapping_breaks_the_episode_off_and_leaves_the_process():
+    wrong = replace(PRICE, observation_space_mapping=lambda call: [call.total / 0])
+    env = aec_env(reservoirs({**BOTH, "broker.price": wrong}))
+    env.reset(seed=1)
+    number = child(env)
+    with pytest.raises(ZeroDivisionError):
+        all_told(env, 1, ruled)
+    env.reset(seed=1)
+    assert child(env) == number
+    env.close()
+
+
+def test_descriptors_and_processes_are_given_back():
+    before = len(os.listdir("/proc/self/fd"))
+    for what in ("exit 3", "garbage", "silence"):
+        env = aec_env(broken("in mid-episode", what), "reservoir.inflow")
+        env.reset(seed=1)
+        env.unwrapped.simulation._link.child.timeout = 0.3
+        env.step(RULE)
+        env.step(RULE)
+        with pytest.raises(ProcessError):
+            env.step(RULE)
+        env.close()
+    for _ in range(3):
+        with pytest.raises(ProcessDiedError):
+            aec_env(broken("at once", "exit 3")).reset()
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_process_that_does_not_end_is_ended():
+    env = aec_env(broken("in mid-episode", "silence"), "reservoir.inflow")
+    env.reset(seed=1)
+    number = child(env)
+    os.kill(number, signal.SIGSTOP)
+    began = time.monotonic()
+    env.close()
+    assert not runs(number)
+    assert time.monotonic() - began < 20

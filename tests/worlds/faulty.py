@@ -1,0 +1,103 @@
+"""A simulator that does something wrong: ``python faulty.py WHAT``, one of ``FAULTS``, or of ``AT_ONCE``."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+import outside
+
+
+def _grandchild(wire: Any) -> None:
+    """Leave behind what holds the pipes, and go."""
+    subprocess.Popen(["sleep", "600"], pass_fds=(wire.writing, wire.lines.fileno()))
+    os._exit(5)
+
+
+def _close(wire: Any) -> None:
+    os.close(wire.writing)
+    time.sleep(600)
+
+
+def _flood(wire: Any) -> None:
+    os.write(2, b"a last word\n")
+    os.abort()
+
+
+FAULTS: dict[str, Callable[[Any], Any]] = {
+    "garbage": lambda wire: wire.raw(b"hello?\n"),
+    "no object": lambda wire: wire.raw(b"[1]\n"),
+    "no utf-8": lambda wire: wire.raw(b'{"decide": "\xff"}\n'),
+    "deep": lambda wire: wire.raw(b'{"a":' * 100_000 + b"\n"),
+    "nan": lambda wire: wire.raw(b'{"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": NaN}\n'),
+    "unknown frame": lambda wire: wire.send({"desire": 4}),
+    "number": lambda wire: wire.send({"decide": 7, "point": "reservoir.inflow", "entity": "a", "args": {}}),
+    "number text": lambda wire: wire.send({"decide": "4", "point": "reservoir.inflow", "entity": "a", "args": {}}),
+    "point": lambda wire: wire.send({"decide": 4, "point": "moon.phase", "args": {}}),
+    "entity": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": ["a"], "args": {}}),
+    "args": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "args": [1]}),
+    "time": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": "now"}),
+    "removed point": lambda wire: wire.send({"remove": "a", "point": "moon.phase"}),
+    "end": lambda wire: wire.send({"end": True}),
+    "half a line": lambda wire: (wire.raw(b'{"decide": 4'), os._exit(0)),
+    "half a line, silent": lambda wire: (wire.raw(b'{"decide": 4'), time.sleep(600)),
+    "silence": lambda wire: time.sleep(600),
+    "exit": lambda wire: os._exit(0),
+    "exit 3": lambda wire: os._exit(3),
+    "crash": _flood,
+    "kill": lambda wire: os.kill(os.getpid(), signal.SIGKILL),
+    "closed": _close,
+    "grandchild": _grandchild,
+    "gigabyte": lambda wire: [wire.raw(bytes(1 << 20)) for _ in range(1 << 10)],
+    "error": lambda wire: wire.send({"error": {"type": "Flood", "text": "a dam broke", "trace": "dam.cpp:12"}}),
+    "error, no object": lambda wire: wire.send({"error": "a dam broke"}),
+}
+"""What goes wrong in mid-episode, after three decisions."""
+
+AT_ONCE: dict[str, Callable[[Any], Any]] = {
+    "no hello": lambda wire: wire.send({"decide": 1, "point": "reservoir.inflow"}),
+    "version 2": lambda wire: wire.send({"hello": 2, "points": outside.POINTS}),
+    "version true": lambda wire: wire.send({"hello": True, "points": outside.POINTS}),
+    "points": lambda wire: wire.send({"hello": 1, "points": "reservoir.inflow"}),
+    "other points": lambda wire: wire.send({"hello": 1, "points": ["moon.phase"]}),
+    "silence": lambda wire: time.sleep(600),
+    "exit": lambda wire: os._exit(0),
+    "exit 3": lambda wire: os._exit(3),
+    "garbage": lambda wire: wire.raw(b"Welcome to the simulator!\n"),
+}
+"""What goes wrong in place of the hello."""
+
+
+class Faulty:
+    """A model that does it."""
+
+    wire: Any
+    what: str
+
+    def __init__(self, seed: int, options: dict[str, Any]) -> None:
+        self.options = options
+
+    def run(self, decide: Callable[..., Any], *_: Any) -> None:
+        """Decide three times, then do it."""
+        for _ in range(3):
+            decide("reservoir.inflow", "a", None, {"level": 1.0, "queue-length": 0}, lambda: 1.0)
+        if not self.options.get("well"):
+            FAULTS[self.what](self.wire)
+            self.wire.receive()
+
+    def result(self) -> None:
+        """Nothing came of it."""
+
+
+if __name__ == "__main__":
+    Faulty.wire, when, Faulty.what = outside.Wire(), *sys.argv[1:]
+    print("there are many words", file=sys.stderr)
+    if when == "at once":
+        AT_ONCE[Faulty.what](Faulty.wire)
+        time.sleep(600)
+    Faulty.wire.play(Faulty, outside.POINTS)

@@ -1,6 +1,6 @@
-"""The command line: ``python -m simenv_marl check module:Simulation`` and ``... inspect module:Simulation``.
+"""The command line: ``python -m simenv_marl`` with ``check``, ``inspect`` or ``wire-check``.
 
-Exit codes: 0 where all is well, 1 where ``check`` has found errors (or the model fails in ``inspect``), 2 where nothing
+Exit codes: 0 where all is well, 1 where a check has found errors (or the model fails in ``inspect``), 2 where nothing
 could be looked at.
 """
 
@@ -37,8 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     try:
-        simulation = _found(options.simulation)
-        seen = _checked(simulation, options) if options.command == "check" else _inspected(simulation, options)
+        seen = options.look(options)
     except (_UsageError, SimEnvError) as error:
         print(f"simenv_marl: {error}", file=sys.stderr)
         return 2
@@ -51,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m simenv_marl",
         description="Check a simulation before its environments are trusted, or see what there is to be decided in it.",
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="check | inspect")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="check | inspect | wire-check")
     check = commands.add_parser(
         "check",
         help="run it plainly and behind environments, and say what is wrong",
@@ -63,6 +62,8 @@ def _parser() -> argparse.ArgumentParser:
         help="tell its decision points and the order in which they are called",
         description="Tell the decision points of a simulation, and in what order its own rules call them.",
     )
+    check.set_defaults(look=_checked)
+    look.set_defaults(look=_inspected)
     for command in (check, look):
         command.add_argument(
             "simulation", metavar="module:Simulation", help="its class, an instance, or a factory without arguments"
@@ -79,7 +80,28 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument(
         "--time-limit", type=_seconds, default=60.0, metavar="SECONDS", help="for all of it (default: 60)"
     )
+    _add_wire_check(commands)
     return parser
+
+
+def _add_wire_check(commands: Any) -> None:
+    wire = commands.add_parser(
+        "wire-check",
+        help="play with a simulator in another process, and say what it does wrong",
+        description="Play with a simulator that speaks the wire, and say what it does wrong. Exit code: 0 if nothing"
+        " is, 1 if something is.",
+    )
+    wire.set_defaults(look=_wire_checked)
+    wire.add_argument("--seed", type=_number(0), default=1, metavar="N", help="of the episodes (default: 1)")
+    wire.add_argument("--options", type=_json, default={}, metavar="JSON", help="what start is to bring (default: {})")
+    wire.add_argument(
+        "--decisions", type=_number(1), default=1000, metavar="N", help="break off an episode there (default: 1000)"
+    )
+    wire.add_argument(
+        "--timeout", type=_seconds, default=30.0, metavar="SECONDS", help="to wait for each line (default: 30)"
+    )
+    wire.add_argument("--json", action="store_true", help="print JSON in place of text")
+    wire.add_argument("program", metavar="COMMAND", nargs=argparse.REMAINDER, help="the program and its arguments")
 
 
 def _number(least: int) -> Any:
@@ -101,11 +123,32 @@ def _seconds(text: str) -> float:
     return seconds
 
 
-def _checked(simulation: Any, options: argparse.Namespace) -> Any:
+def _json(text: str) -> Any:
+    try:
+        found = json.loads(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise argparse.ArgumentTypeError(f"{text!r} is no JSON object")
+    return found
+
+
+def _wire_checked(options: argparse.Namespace) -> Any:
+    from .remote.check import check_wire
+
+    program = options.program[1:] if options.program[:1] == ["--"] else options.program
+    if not program:
+        raise _UsageError("wire-check needs a command: the simulator's program and its arguments")
+    return check_wire(
+        program, options=options.options, seed=options.seed, decisions=options.decisions, timeout=options.timeout
+    )
+
+
+def _checked(options: argparse.Namespace) -> Any:
     from .testing import check_simulation
 
     return check_simulation(
-        simulation,
+        _found(options.simulation),
         options.points,
         seeds=range(options.seed, options.seed + 3),
         episodes=options.episodes,
@@ -114,9 +157,10 @@ def _checked(simulation: Any, options: argparse.Namespace) -> Any:
     )
 
 
-def _inspected(simulation: Any, options: argparse.Namespace) -> Any:
+def _inspected(options: argparse.Namespace) -> Any:
     from .testing import inspect_simulation
 
+    simulation = _found(options.simulation)
     try:
         return inspect_simulation(simulation, options.points, seed=options.seed)
     except SimEnvError:

@@ -180,7 +180,7 @@ def test_it_runs_without_an_environment():
 # -- views and what is built on them --------------------------------------------------------------
 
 
-@pytest.mark.filterwarnings("ignore:We recommend agents to be named")
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of names and spaces
 def test_the_views_pass_the_tests_of_pettingzoo(make_env):
     api_test(make_env(aec_env, reservoirs(), possible_agents=ROSTER), num_cycles=60)
     parallel_api_test(make_env(parallel_env, reservoirs(), possible_agents=ROSTER), num_cycles=30)

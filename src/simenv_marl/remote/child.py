@@ -103,6 +103,12 @@ class _Process:
             pause = min(2 * pause, 0.02)
         return code
 
+    def close_input(self) -> None:
+        """Close its input, if that is open."""
+        if self.writing >= 0:
+            os.close(self.writing)
+            self.writing = -1
+
     def end(self, patience: float) -> None:
         """Close its pipes, and end it and its group; in a fork of this process, let go of it.
 
@@ -112,7 +118,7 @@ class _Process:
         if self._ended:
             return
         self._ended = True
-        os.close(self.writing)
+        self.close_input()
         os.close(self.reading)
         if self.owned:
             self.wait(patience)
@@ -268,6 +274,10 @@ class Child:
     def exit_code(self) -> int | None:
         """With what it has exited, or minus the signal that has ended it; None as long as it runs."""
         return self._process.exit_code()
+
+    def close_input(self) -> None:
+        """Close its input; what it sends can still be received."""
+        self._process.close_input()
 
     def fail(self, error: SimEnvError) -> NoReturn:
         """End the process at once, and raise an error, with the last that it wrote on its standard error."""

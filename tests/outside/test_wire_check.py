@@ -1,0 +1,119 @@
+"""The check for authors of clients, on simulators that do well, and on those that do not."""
+
+import json
+import sys
+
+import pytest
+
+from simenv_marl.__main__ import main
+from simenv_marl.remote.check import check_wire
+from tests.outside.reservoirs import command
+from tests.worlds import faulty
+
+pytestmark = pytest.mark.greenlet("no environment is made")
+
+WELL = """
+import sys
+sys.path.insert(0, {folder!r})
+import outside
+{change}
+outside.main()
+"""
+
+
+def changed(tmp_path, change):
+    """What starts the reservoirs with some change to them or to their end of the wire."""
+    script = tmp_path / "changed.py"
+    folder = faulty.__file__.rpartition("/")[0]
+    script.write_text(WELL.format(folder=folder, change=change))
+    return [sys.executable, str(script)]
+
+
+def found(report):
+    return {finding.tried: finding.verdict for finding in report.findings}
+
+
+def test_nothing_is_wrong_with_a_simulator_that_does_well():
+    report = check_wire(command())
+    assert report.ok
+    assert len(report.findings) == 15
+    assert found(report).pop("a run without an environment") == "note"  # it wants a seed then
+    assert "nothing is wrong" in str(report)
+    assert check_wire(command("1"), timeout=10).ok  # one episode for each process
+
+
+def test_an_episode_that_does_not_end_is_broken_off():
+    report = check_wire(command(), options={"hours": 10_000}, decisions=20)
+    assert report.ok
+    assert found(report)["an episode by its rule"] == "note"
+
+
+@pytest.mark.parametrize(
+    ("change", "tried"),
+    [
+        ("outside.Wire.play = lambda *_: None", "starts, and says hello"),
+        ("outside.POINTS = []", "starts, and says hello"),
+        ("outside.Reservoirs.run = lambda *_: None", "an episode by its rule"),
+        ("outside.random.Random = lambda seed: outside.random", "two episodes in a row with the same seed"),
+        (
+            "stopped = outside.Stopped\n"
+            "class Stopped(Exception):\n"
+            "    def __init__(self): wire.send({'end': {}})\n"
+            "init = outside.Wire.__init__\n"
+            "def keep(self):\n    global wire\n    wire = self\n    init(self)\n"
+            "outside.Wire.__init__, outside.Stopped = keep, Stopped",
+            "stop in place of the answer to call 1",
+        ),
+        (
+            "receive = outside.Wire.receive\n"
+            "def lenient(self):\n    answer = receive(self)\n"
+            "    return {**answer, 'act': self.number} if 'act' in answer else answer\n"
+            "outside.Wire.receive = lenient",
+            "an answer to another call",
+        ),
+        (
+            "import os\n"
+            "class Short:\n"
+            "    def __init__(self, lines): self.lines = lines\n"
+            "    def readline(self): return os.read(self.lines.fileno(), 4096).decode()\n"
+            "init = outside.Wire.__init__\n"
+            "def short(self):\n    init(self)\n    self.lines = Short(self.lines)\n"
+            "outside.Wire.__init__ = short",
+            "a line of a mebibyte",
+        ),
+        (
+            "import time\n"
+            "receive = outside.Wire.receive\n"
+            "def waits(self):\n"
+            "    try:\n        return receive(self)\n"
+            "    except SystemExit:\n        time.sleep(60)\n"
+            "outside.Wire.receive = waits",
+            "the input's end between episodes",
+        ),
+    ],
+)
+def test_what_is_wrong_is_found(tmp_path, change, tried):
+    report = check_wire(changed(tmp_path, change), timeout=3.0)
+    assert not report.ok
+    assert found(report)[tried] == "wrong", str(report)
+
+
+def test_a_reseed_that_changes_nothing_is_noted(tmp_path):
+    report = check_wire(changed(tmp_path, "outside.random.Random.seed = lambda *_: None"))
+    assert found(report)["reseed"] == "note"
+
+
+def test_the_command_line(capsys):
+    assert main(["wire-check", "--seed", "3", "--", *command()]) == 0
+    assert "nothing is wrong" in capsys.readouterr().out
+    assert main(["wire-check", "--json", "--options", '{"hours": 3}', *command()]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["ok"]
+    assert "broker.price 1" in told["findings"][1]["text"]
+    assert main(["wire-check", "--timeout", "5", sys.executable, "-c", "pass"]) == 1
+    assert "has exited with code 0" in capsys.readouterr().out
+    assert main(["wire-check"]) == 2
+    assert "needs a command" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["wire-check", "--options", "[1]", *command()])
+    assert "no JSON object" in capsys.readouterr().err

@@ -24,6 +24,9 @@ CHUNK: Final = 1 << 16
 REMEMBERED: Final = 4096
 """How many bytes of what it has last written on its standard error stand in errors."""
 
+LONGEST_WAIT: Final = 3600.0
+"""For how many seconds is waited at once; ``poll`` takes no more than some weeks."""
+
 GRACE: Final = 2.0
 """For how many seconds is waited for a process to end by itself."""
 
@@ -162,7 +165,6 @@ class Child:
         """
         self.timeout = timeout
         self._received = bytearray()
-        self._searched = 0  # of what was received
         try:
             self._process = _Process(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
@@ -196,27 +198,25 @@ class Child:
             ProcessTimeoutError: Nothing came.
             WireError: It has sent something else than a frame.
         """
-        self._check_usable()
-        received, deadline = self._received, 0.0
-        while True:
-            end = received.find(b"\n", self._searched)
-            if end >= LONGEST or (end < 0 and len(received) >= LONGEST):
-                self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
-            if end >= 0:
-                line = bytes(received[:end])
-                del received[: end + 1]
-                self._searched = 0
-                try:
-                    return decode(line)
-                except WireError as error:
-                    self.fail(WireError(f"{self} has sent {error}"))
-            self._searched = len(received)
+        received, deadline, searched, reading = self._received, 0.0, 0, self._process.reading
+        while (end := received.find(b"\n", searched)) < 0:
+            searched = len(received)
+            if searched >= LONGEST:
+                break
             deadline = deadline or monotonic() + self.timeout
-            self._wait(self._process.reading, deadline, "half a line" if received else "nothing")
-            chunk = os.read(self._process.reading, CHUNK)
+            self._wait(reading, deadline, "half a line" if received else "nothing")
+            chunk = os.read(reading, CHUNK)
             if not chunk:
                 self._died()
             received += chunk
+        if not 0 <= end < LONGEST:
+            self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
+        line = received[:end]
+        del received[: end + 1]
+        try:
+            return decode(line)
+        except WireError as error:
+            self.fail(WireError(f"{self} has sent {error}"))
 
     def send(self, lines: bytes) -> None:
         """Send lines.
@@ -243,18 +243,17 @@ class Child:
 
     def _wait(self, descriptor: int, deadline: float, sent: str) -> None:
         """Wait until a descriptor is ready; read what comes on standard error meanwhile."""
-        while True:
+        found = False
+        while not found:
             left = deadline - monotonic()
-            ready = self._poll.poll(max(0.0, left) * 1000)
+            ready = self._poll.poll(min(max(0.0, left), LONGEST_WAIT) * 1000)
             if not ready and left <= 0:
                 self.fail(ProcessTimeoutError(f"{self} {self._state()}; it has sent {sent} for {self.timeout:g} s"))
-            found = False
             for which, _ in ready:
-                found = found or which == descriptor
-                if which == self._process.stderr and not self._process.listen():
+                if which == descriptor:
+                    found = True
+                elif not self._process.listen():
                     self._poll.unregister(which)
-            if found:
-                return
 
     def _check_usable(self) -> None:
         if not self._finalizer.alive:  # its descriptors may be something else's by now

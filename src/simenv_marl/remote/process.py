@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from math import inf
 from types import NoneType
 from typing import Any, Final, NoReturn
 
@@ -25,7 +26,7 @@ from ..errors import (
 from ..simulation import RULE, TRUNCATED, SimulationInterface
 from .calls import RemoteCall, point_named
 from .child import GRACE, Child
-from .wire import STOP, encode
+from .wire import STOP, answer, encode
 
 _ENTITIES: Final = (str, int, NoneType)
 _TIMES: Final = (float, int, NoneType)
@@ -115,7 +116,7 @@ class ProcessSimulation(SimulationInterface):
             DefinitionError: The points are no dict from names to definitions.
         """
         self.command = _words(command)
-        if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not timeout > 0:
+        if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < inf:
             raise OptionValueError(f"timeout must be a positive number of seconds, not {shown(timeout)}")
         self.timeout, self.env, self.cwd = float(timeout), env, cwd
         self.points = _by_function(points)
@@ -198,9 +199,9 @@ class ProcessSimulation(SimulationInterface):
         try:
             while "end" not in frame:
                 if "decide" in frame:
-                    answer = self._answered(child, frame, functions)
+                    line = self._answered(child, frame, functions)
                     link.state = "busy"
-                    child.send(answer)
+                    child.send(line)
                 elif "update" in frame:
                     self._update(child, frame)
                 elif "remove" in frame:
@@ -251,25 +252,25 @@ class ProcessSimulation(SimulationInterface):
         link, number = self._link, frame["decide"]
         if type(number) is not int or number != link.number + 1:
             child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
-        name, entity = self._named(child, frame, frame.get("entity"))
+        named = self._named(child, frame, frame.get("entity"))
         link.number, link.state = number, "waits"
-        value: Any = RULE
-        function = functions.get(name)
-        if function is not None:
-            call = link.calls.get((name, entity))
-            if call is None:
-                call = link.calls[name, entity] = RemoteCall(name, entity)
-            call.__dict__, call.time = frame.get("args") or {}, link.time
-            value = function(call)
-        seed, link.seed = link.seed, None
-        reseed = b"" if seed is None else b'{"reseed":%d}\n' % seed
-        if value is RULE:
-            return b'%b{"act":%d,"rule":true}\n' % (reseed, number)
+        function = functions.get(named[0])
+        if function is None:
+            return answer(number, RULE)
+        call = link.calls.get(named)
+        if call is None:
+            call = link.calls[named] = RemoteCall(*named)
+        call.__dict__, call.time = frame.get("args") or {}, link.time
+        value = function(call)
         try:
-            return reseed + encode({"act": number, "value": value})
+            line = answer(number, value)
         except WireError as error:
-            annotate(error, f"simenv_marl: it is the decision at {name} of {entity!r}")
+            annotate(error, f"simenv_marl: it is the decision at {call.point} of {call.entity!r}")
             raise
+        if link.seed is None:
+            return line
+        seed, link.seed = link.seed, None
+        return encode({"reseed": seed}) + line
 
     def _update(self, child: Child, frame: dict[str, Any]) -> None:
         """Note what the arguments of an entity's latest call would be by now."""

@@ -14,6 +14,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 
 from ..errors import WireError, shown, told
+from ..simulation import RULE
 
 VERSION: Final = 1
 
@@ -38,6 +39,23 @@ def encode(frame: Mapping[str, Any]) -> bytes:
     if len(line) > LONGEST:
         raise WireError(f"a line of {len(line):,} bytes was to be sent, and the longest that may be has {LONGEST:,}")
     return line
+
+
+def answer(number: int, value: Any) -> bytes:
+    """The line that answers a call.
+
+    Args:
+        number: Of the call.
+        value: The decision; ``RULE`` leaves it to the process.
+
+    Raises:
+        WireError: As ``encode``.
+    """
+    if value is RULE:
+        return b'{"act":%d,"rule":true}\n' % number
+    if type(value) is float and value - value == 0.0:  # what most decisions are takes no walk through the value
+        return b'{"act":%d,"value":%a}\n' % (number, value)
+    return encode({"act": number, "value": value})
 
 
 def sendable(value: Any, where: str = "") -> Any:
@@ -72,18 +90,21 @@ def _at(where: str) -> str:
     return f" (at {where})" if where else ""
 
 
-def decode(line: bytes) -> dict[str, Any]:
+def decode(line: bytes | bytearray) -> dict[str, Any]:
     """The frame of a line.
 
     Raises:
         WireError: It is no JSON object in UTF-8.
     """
     try:
-        frame = (_WITH_OBJECTS if b'"float"' in line else _DECODER).decode(line.decode())
+        decoder, text = _WITH_OBJECTS if b'"float"' in line else _DECODER, line.decode()
+        frame, end = decoder.raw_decode(text) if text[:1] == "{" else (decoder.decode(text), len(text))
+        if end < len(text) and not text[end:].isspace():
+            raise ValueError(f"more follows after {end} characters")
     except (ValueError, RecursionError) as error:
-        raise WireError(f"a line that is no JSON in UTF-8 ({told(error)}): {shown(line)}") from None
+        raise WireError(f"a line that is no JSON in UTF-8 ({told(error)}): {shown(bytes(line))}") from None
     if not isinstance(frame, dict):
-        raise WireError(f"a line that is no JSON object: {shown(line)}")
+        raise WireError(f"a line that is no JSON object: {shown(bytes(line))}")
     return frame
 
 

@@ -62,6 +62,7 @@ def speak(reading, writing):
 if __name__ == "__main__":
     if "SIMENV_MARL_FDS" in os.environ:
         numbers = os.environ["SIMENV_MARL_FDS"].split(",")
-        speak(open(int(numbers[0])), open(int(numbers[1]), "w"))
+        with open(int(numbers[0])) as reading, open(int(numbers[1]), "w") as writing:
+            speak(reading, writing)
     else:
         print(run(plain_rule, seed=1, days=5))

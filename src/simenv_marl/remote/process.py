@@ -15,6 +15,7 @@ from ..errors import (
     DefinitionError,
     OptionValueError,
     ProcessDiedError,
+    ProcessError,
     RemoteError,
     SimEnvError,
     SimulationError,
@@ -114,7 +115,10 @@ class ProcessSimulation(SimulationInterface):
         Raises:
             OptionValueError: The command or the timeout cannot be such.
             DefinitionError: The points are no dict from names to definitions.
+            ProcessError: The platform is none of POSIX.
         """
+        if os.name != "posix":
+            raise ProcessError("ProcessSimulation needs POSIX: a process elsewhere gets no descriptors")
         self.command = _words(command)
         if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < inf:
             raise OptionValueError(f"timeout must be a positive number of seconds, not {shown(timeout)}")

@@ -1,0 +1,880 @@
+package simenv;
+
+import java.io.EOFException;
+import java.io.FileInputStream;
+import java.io.FileOutputStream;
+import java.io.IOException;
+import java.io.InputStream;
+import java.io.OutputStream;
+import java.io.PrintWriter;
+import java.io.StringWriter;
+import java.lang.reflect.Array;
+import java.math.BigInteger;
+import java.nio.ByteBuffer;
+import java.nio.charset.CharacterCodingException;
+import java.nio.charset.StandardCharsets;
+import java.util.ArrayList;
+import java.util.Arrays;
+import java.util.Collections;
+import java.util.LinkedHashMap;
+import java.util.List;
+import java.util.Map;
+import java.util.Objects;
+import java.util.Set;
+import java.util.concurrent.atomic.AtomicInteger;
+import java.util.concurrent.atomic.AtomicLong;
+import java.util.function.BooleanSupplier;
+import java.util.function.Consumer;
+import java.util.function.DoubleSupplier;
+import java.util.function.Function;
+import java.util.function.IntSupplier;
+import java.util.function.LongConsumer;
+import java.util.function.LongSupplier;
+import java.util.function.Supplier;
+
+/**
+ * A model in Java as an environment of simenv_marl: the model keeps its own main loop, and asks for decisions from
+ * wherever it stands. This one file is the whole client. It needs Java 17 and nothing else; copy it into your sources.
+ *
+ * <pre>{@code
+ * public static void main(String[] arguments) {
+ *     if (!SimEnv.run(List.of("shop.price"), (seed, options) -> new Town(seed).live())) {
+ *         System.out.println(new Town(Long.parseLong(arguments[0])).live()); // there is no environment
+ *     }
+ * }
+ *
+ * // and somewhere deep in the town:
+ * double price = SimEnv.decideDouble("shop.price", name, a -> a.time(day).put("stock", stock), () -> 1.2 * cost);
+ * }</pre>
+ *
+ * <p>An environment starts the JVM with the numbers of two descriptors in {@code SIMENV_MARL_FDS}; the standard streams
+ * stay the model's. Without that variable every decision is its rule, at the cost of a test: not even its arguments are
+ * put together.
+ *
+ * <p>Decisions may come from any thread of the model, one at a time. Threads that decide have to end with their
+ * episode.
+ */
+public final class SimEnv {
+    private static final int VERSION = 1;
+    private static final int LONGEST_LINE = 16 << 20;
+    private static final int LONGEST_TEXT = 1 << 20; // of an error
+    private static final int DEEPEST = 500;
+    private static final long SECONDS_TO_LEAVE = 5;
+    private static final Object RULE = new Object();
+    private static final SimEnv WIRE = connect();
+
+    private final InputStream input;
+    private final OutputStream output;
+    private final Writer frame = new Writer();
+    private final Arguments arguments = new Arguments(frame);
+    private byte[] read = new byte[1 << 13];
+    private int from;
+    private int to;
+    private LongConsumer reseed;
+    private long calls;
+    private boolean running; // an episode goes on
+    private boolean stopped; // and is being unwound: nothing is said any more
+    private boolean busy; // a frame is being made or answered
+    private boolean waiting; // and its answer is still to come
+    private boolean gone; // there is no environment any more
+    private boolean broken; // what it says is not understood any more
+    private Throwable fault; // what went wrong in the episode, to be told when it is unwound
+
+    private SimEnv(String descriptors) throws IOException {
+        String[] numbers = descriptors.split(",");
+        if (numbers.length != 2) {
+            throw new IOException("SIMENV_MARL_FDS has to be two numbers, and is " + descriptors);
+        }
+        input = new FileInputStream("/dev/fd/" + numbers[0].trim());
+        output = new FileOutputStream("/dev/fd/" + numbers[1].trim());
+    }
+
+    private static SimEnv connect() {
+        String descriptors = System.getenv("SIMENV_MARL_FDS");
+        try {
+            return descriptors == null ? null : new SimEnv(descriptors);
+        } catch (IOException error) {
+            throw new IllegalStateException("the environment's pipes cannot be opened: " + error.getMessage(), error);
+        }
+    }
+
+    // -- episodes --------------------------------------------------------------------------------------------------
+
+    /** One episode of the model: its own main loop. */
+    @FunctionalInterface
+    public interface Episode {
+        /**
+         * Runs it to its end.
+         *
+         * @param seed of its generators
+         * @param options that the environment's reset was given, as maps, lists, strings, booleans, longs and doubles
+         * @return what came out: anything that {@link Arguments#put(String, Object)} takes, or an {@link End}
+         * @throws Exception any: it becomes an error in the environment
+         */
+        Object run(long seed, Map<String, Object> options) throws Exception;
+    }
+
+    /**
+     * What came out of an episode, and whether it ended at a limit of time and not at an end of the task.
+     *
+     * @param result what came out
+     * @param truncated whether it was a limit of time
+     */
+    public record End(Object result, boolean truncated) {}
+
+    /** Thrown by decisions to unwind an episode that is not gone on with. Let it pass; {@code finally} blocks run. */
+    @SuppressWarnings("serial")
+    public static final class Stop extends Error {
+        private Stop() {
+            super("the environment has stopped this episode", null, false, false);
+        }
+    }
+
+    /** Whether an environment has started this JVM. */
+    public static boolean inside() {
+        return WIRE != null;
+    }
+
+    /** As {@link #run(List, Episode, LongConsumer)}, for a model that cannot be seeded anew in mid-episode. */
+    public static boolean run(List<String> points, Episode episode) {
+        return run(points, episode, null);
+    }
+
+    /**
+     * Runs the episodes that the environment asks for, until it is gone, and then ends the JVM.
+     *
+     * @param points the names of all decision points
+     * @param episode one episode of the model
+     * @param reseed seeds the generators of the running episode anew, for another future from here on; null: it cannot
+     * @return false, at once, where there is no environment
+     */
+    public static boolean run(List<String> points, Episode episode, LongConsumer reseed) {
+        if (WIRE != null) {
+            WIRE.serve(points, episode, reseed);
+        }
+        return false;
+    }
+
+    private void serve(List<String> points, Episode episode, LongConsumer callback) {
+        reseed = callback;
+        try {
+            frame.begin().key("hello").number(VERSION).key("points").value(points);
+            send(frame.key("can").value(callback == null ? List.of() : List.of("reseed")).close());
+            while (!gone && !broken) {
+                Map<?, ?> start = start();
+                if (start != null) {
+                    play(episode, start);
+                }
+                if (fault != null) {
+                    tell(fault);
+                }
+            }
+        } catch (IOException error) {
+            leave();
+        }
+        System.exit(broken ? 1 : 0);
+    }
+
+    private Map<?, ?> start() throws IOException {
+        fault = null;
+        try {
+            Map<?, ?> told = receive();
+            if (told.get("start") instanceof Map<?, ?> start) {
+                return start;
+            }
+            if (!told.containsKey("stop")) { // of an episode that has ended meanwhile
+                throw new WireError("a start was expected, and this came: " + json(told));
+            }
+        } catch (WireError error) {
+            broken = true;
+            fault = error;
+        }
+        return null;
+    }
+
+    private void play(Episode episode, Map<?, ?> start) {
+        admit();
+        Object result = null;
+        Throwable error = null;
+        try {
+            result = episode.run(seed(start.get("seed")), options(start.get("options")));
+        } catch (Throwable thrown) {
+            error = thrown;
+        }
+        finish(result, error);
+    }
+
+    private synchronized void admit() {
+        calls = 0;
+        running = true;
+    }
+
+    private synchronized void finish(Object result, Throwable error) {
+        if (!stopped) { // else the error is the Stop, or what has become of it
+            fault = error;
+            try {
+                if (error == null) {
+                    Object end = result instanceof End ? result : new End(result, false);
+                    send(frame.begin().key("end").value(end).close());
+                }
+            } catch (Throwable thrown) {
+                fault = thrown;
+            }
+        }
+        running = false;
+        stopped = gone;
+    }
+
+    private static long seed(Object value) {
+        if (value instanceof Long seed) {
+            return seed;
+        }
+        throw new IllegalArgumentException("a seed has to be an integer of 64 bits, and is " + json(value));
+    }
+
+    @SuppressWarnings("unchecked")
+    private static Map<String, Object> options(Object value) {
+        return value == null ? Map.of() : (Map<String, Object>) value;
+    }
+
+    // -- decisions -------------------------------------------------------------------------------------------------
+
+    /**
+     * Asks for a decision, or runs the rule: where there is no environment, and where that leaves it to the rule.
+     *
+     * @param point the name of the decision point
+     * @param entity who decides; null where there is but one
+     * @param arguments puts down what there is to know
+     * @param rule what the model decides by itself
+     * @param taken makes a decision of what was answered: a string, boolean, long, double, list, map or null
+     * @return the decision
+     */
+    public static <T> T decide(
+            String point, String entity, Consumer<Arguments> arguments, Supplier<T> rule, Function<Object, T> taken) {
+        Object answer = ask(point, entity, arguments, Objects.requireNonNull(taken));
+        @SuppressWarnings("unchecked")
+        T decided = answer == RULE ? rule.get() : (T) answer;
+        return decided;
+    }
+
+    /** As {@link #decide}, of a double; integers become doubles. */
+    public static double decideDouble(String point, String entity, Consumer<Arguments> arguments, DoubleSupplier rule) {
+        Object answer = ask(point, entity, arguments, value -> ((Number) value).doubleValue());
+        return answer == RULE ? rule.getAsDouble() : (Double) answer;
+    }
+
+    /** As {@link #decide}, of a long. */
+    public static long decideLong(String point, String entity, Consumer<Arguments> arguments, LongSupplier rule) {
+        Object answer = ask(point, entity, arguments, value -> (Long) value);
+        return answer == RULE ? rule.getAsLong() : (Long) answer;
+    }
+
+    /** As {@link #decide}, of an int. */
+    public static int decideInt(String point, String entity, Consumer<Arguments> arguments, IntSupplier rule) {
+        Object answer = ask(point, entity, arguments, value -> Math.toIntExact((Long) value));
+        return answer == RULE ? rule.getAsInt() : (Integer) answer;
+    }
+
+    /** As {@link #decide}, of true or false. */
+    public static boolean decideBoolean(
+            String point, String entity, Consumer<Arguments> arguments, BooleanSupplier rule) {
+        Object answer = ask(point, entity, arguments, value -> (Boolean) value);
+        return answer == RULE ? rule.getAsBoolean() : (Boolean) answer;
+    }
+
+    /**
+     * Tells what there is to know of an entity by now: before it is removed, and before the episode ends, so that its
+     * last reward and observation are of this and not of its last decision.
+     *
+     * @param point at which it decides
+     * @param entity who decides; null where there is but one
+     * @param arguments puts down what there is to know, as in a decision
+     */
+    public static void update(String point, String entity, Consumer<Arguments> arguments) {
+        if (WIRE != null) {
+            WIRE.call("update", point, entity, arguments, null);
+        }
+    }
+
+    /**
+     * Says that an entity is gone and decides no more.
+     *
+     * @param point at which it decided
+     * @param entity who is gone
+     */
+    public static void remove(String point, String entity) {
+        if (WIRE != null) {
+            WIRE.call("remove", point, entity, null, null);
+        }
+    }
+
+    private static Object ask(String point, String entity, Consumer<Arguments> arguments, Function<Object, ?> taken) {
+        return WIRE == null ? RULE : WIRE.call("decide", point, entity, arguments, taken);
+    }
+
+    /** Sends a decision, and waits for its answer; or says something of an entity, where no answer is taken. */
+    private synchronized Object call(
+            String what, String point, String entity, Consumer<Arguments> arguing, Function<Object, ?> taken) {
+        boolean asks = taken != null;
+        if (!running || busy || stopped && !asks) {
+            return RULE;
+        }
+        if (stopped) {
+            throw new Stop();
+        }
+        busy = true;
+        try {
+            frame.begin().key(what);
+            if (!asks) {
+                frame.value(entity);
+            } else if (entity == null) {
+                frame.number(++calls);
+            } else {
+                frame.number(++calls).key("entity").value(entity);
+            }
+            frame.key("point").value(point);
+            if (arguing != null) {
+                argue(arguing);
+            }
+            send(frame.close());
+            waiting = asks;
+            Object answer = asks ? answer() : RULE;
+            if (fault == null) {
+                return answer == RULE ? RULE : take(point, answer, taken);
+            }
+        } catch (Stop stop) {
+            throw stop;
+        } catch (IOException error) {
+            throw leave();
+        } catch (Throwable error) {
+            fault = error;
+            broken = waiting;
+        } finally {
+            busy = false;
+            waiting = false;
+        }
+        stopped = true;
+        throw new Stop();
+    }
+
+    private Object answer() throws IOException {
+        while (true) {
+            Map<?, ?> told = receive();
+            if (told.containsKey("stop")) {
+                stopped = true;
+                throw new Stop();
+            }
+            if (told.containsKey("reseed") && reseed != null) {
+                try {
+                    reseed.accept(seed(told.get("reseed")));
+                } catch (RuntimeException error) {
+                    fault = error; // the answer comes all the same
+                }
+                continue;
+            }
+            boolean rule = Boolean.TRUE.equals(told.get("rule"));
+            if (!told.containsKey("act") || !rule && !told.containsKey("value")) {
+                throw new WireError("an answer to call " + calls + " was expected, and this came: " + json(told));
+            }
+            if (!Long.valueOf(calls).equals(told.get("act"))) {
+                throw new WireError("call " + calls + " waits for its answer, and this came: " + json(told));
+            }
+            waiting = false;
+            return rule ? RULE : told.get("value");
+        }
+    }
+
+    private static Object take(String point, Object value, Function<Object, ?> taken) {
+        try {
+            return taken.apply(value);
+        } catch (RuntimeException error) {
+            throw new IllegalArgumentException(point + " cannot take the decision " + json(value), error);
+        }
+    }
+
+    private void argue(Consumer<Arguments> arguing) {
+        arguments.time = Double.NaN;
+        frame.key("args").open();
+        arguing.accept(arguments);
+        frame.close();
+        if (!Double.isNaN(arguments.time)) {
+            frame.key("time").number(arguments.time);
+        }
+    }
+
+    // -- faults ----------------------------------------------------------------------------------------------------
+
+    /** What the environment said is not understood, and nothing after it would be. */
+    @SuppressWarnings("serial")
+    private static final class WireError extends RuntimeException {
+        WireError(String text) {
+            super(text);
+        }
+    }
+
+    private void tell(Throwable error) throws IOException {
+        StringWriter trace = new StringWriter();
+        error.printStackTrace(new PrintWriter(trace, true));
+        frame.begin().key("error").open().key("type").value(error.getClass().getName());
+        frame.key("text").value(cut(Objects.requireNonNullElse(error.getMessage(), "")));
+        send(frame.key("trace").value(cut(trace.toString())).close().close());
+    }
+
+    private static String cut(String text) {
+        return text.length() > LONGEST_TEXT ? text.substring(0, LONGEST_TEXT) : text;
+    }
+
+    /** The environment is gone: the episode is unwound, and a model that does not let itself be unwound is left. */
+    private Stop leave() {
+        if (!gone) {
+            Thread end = new Thread(SimEnv::halt, "simenv-leave");
+            end.setDaemon(true);
+            end.start();
+        }
+        gone = true;
+        stopped = true;
+        return new Stop();
+    }
+
+    private static void halt() {
+        try {
+            Thread.sleep(1000 * SECONDS_TO_LEAVE);
+        } catch (InterruptedException hurried) {
+            Thread.currentThread().interrupt();
+        }
+        Runtime.getRuntime().halt(1);
+    }
+
+    // -- lines -----------------------------------------------------------------------------------------------------
+
+    private void send(Writer line) throws IOException {
+        if (line.length >= LONGEST_LINE) {
+            throw new IllegalArgumentException(line.length + " bytes are to be sent, and 16 MiB is the most");
+        }
+        line.put('\n');
+        output.write(line.bytes, 0, line.length);
+    }
+
+    private Map<?, ?> receive() throws IOException {
+        int end = from;
+        while (true) {
+            for (; end < to; end++) {
+                if (read[end] == '\n') {
+                    int begin = from;
+                    from = end + 1;
+                    return new Reader(read, begin, end).frame();
+                }
+            }
+            if (end - from >= LONGEST_LINE) {
+                throw new WireError("a line has more than 16 MiB");
+            }
+            System.arraycopy(read, from, read, 0, to - from);
+            end -= from;
+            to -= from;
+            from = 0;
+            if (to == read.length) {
+                read = Arrays.copyOf(read, 2 * to);
+            }
+            int count = input.read(read, to, read.length - to);
+            if (count < 0) {
+                throw new EOFException();
+            }
+            to += count;
+        }
+    }
+
+    // -- JSON ------------------------------------------------------------------------------------------------------
+
+    /** What there is to know at a decision. */
+    public static final class Arguments {
+        private final Writer writer;
+        private double time;
+
+        private Arguments(Writer writer) {
+            this.writer = writer;
+        }
+
+        /** Says what time it is in the model. */
+        public Arguments time(double now) {
+            time = now;
+            return this;
+        }
+
+        public Arguments put(String name, double value) {
+            writer.key(name).number(value);
+            return this;
+        }
+
+        public Arguments put(String name, long value) {
+            writer.key(name).number(value);
+            return this;
+        }
+
+        public Arguments put(String name, boolean value) {
+            writer.key(name).value(value);
+            return this;
+        }
+
+        public Arguments put(String name, char value) {
+            return put(name, (Object) value);
+        }
+
+        /** Puts down a string, number, boolean, enum (its name), array, iterable or map of such, or null. */
+        public Arguments put(String name, Object value) {
+            writer.key(name).value(value);
+            return this;
+        }
+    }
+
+    /**
+     * Writes a value as the environment gets it, in one line of JSON: for plain runs that are to be compared.
+     *
+     * @param value a string, number, boolean, enum, array, iterable or map of such, null, or an {@link End}
+     */
+    public static String json(Object value) {
+        Writer writer = new Writer();
+        writer.value(value);
+        return new String(writer.bytes, 0, writer.length, StandardCharsets.UTF_8);
+    }
+
+    private static final class Writer {
+        private static final Set<Class<?>> WHOLE =
+                Set.of(Long.class, Integer.class, Short.class, Byte.class, AtomicInteger.class, AtomicLong.class);
+        private byte[] bytes = new byte[1 << 10];
+        private int length;
+        private boolean first;
+
+        /** Begins a frame, whatever has become of the one before. */
+        Writer begin() {
+            length = 0;
+            return open();
+        }
+
+        Writer open() {
+            first = true;
+            return put('{');
+        }
+
+        Writer close() {
+            first = false;
+            return put('}');
+        }
+
+        Writer key(String name) {
+            if (!first) {
+                put(',');
+            }
+            first = false;
+            return string(name).put(':');
+        }
+
+        Writer number(long value) {
+            return ascii(Long.toString(value));
+        }
+
+        Writer number(double value) {
+            if (Double.isFinite(value)) {
+                return ascii(Double.toString(value));
+            }
+            return ascii("{\"float\":\"").ascii(Double.isNaN(value) ? "nan" : value > 0 ? "inf" : "-inf").ascii("\"}");
+        }
+
+        Writer value(Object value) {
+            if (value == null || value instanceof Boolean || value instanceof BigInteger) {
+                return ascii(String.valueOf(value));
+            } else if (WHOLE.contains(value.getClass())) {
+                return number(((Number) value).longValue());
+            } else if (value instanceof Number number) {
+                return number(number.doubleValue());
+            } else if (value instanceof Enum<?> constant) {
+                return string(constant.name());
+            } else if (value instanceof CharSequence || value instanceof Character) {
+                return string(value.toString());
+            } else if (value instanceof Map<?, ?> map) {
+                return map(map);
+            } else if (value instanceof End end) {
+                return open().key("truncated").value(end.truncated).key("result").value(end.result).close();
+            } else if (value instanceof Iterable<?> values) {
+                put('[');
+                String comma = "";
+                for (Object each : values) {
+                    ascii(comma).value(each);
+                    comma = ",";
+                }
+                return put(']');
+            } else if (value.getClass().isArray()) {
+                put('[');
+                for (int i = 0; i < Array.getLength(value); i++) {
+                    ascii(i == 0 ? "" : ",").value(Array.get(value, i));
+                }
+                return put(']');
+            }
+            throw new IllegalArgumentException("a " + value.getClass().getName() + " cannot be sent");
+        }
+
+        private Writer map(Map<?, ?> map) {
+            put('{');
+            String comma = "";
+            for (Map.Entry<?, ?> entry : map.entrySet()) {
+                ascii(comma).string(String.valueOf(entry.getKey())).put(':').value(entry.getValue());
+                comma = ",";
+            }
+            return put('}');
+        }
+
+        private Writer string(String text) {
+            put('"');
+            for (int i = 0; i < text.length(); i++) {
+                char c = text.charAt(i);
+                if (c == '"' || c == '\\') {
+                    put('\\').put(c);
+                } else if (c >= 0x20 && c < 0x80) {
+                    put(c);
+                } else if (c < 0x20 || Character.isSurrogate(c) && !paired(text, i)) {
+                    ascii(String.format("\\u%04x", (int) c));
+                } else {
+                    int point = text.codePointAt(i);
+                    i += Character.charCount(point) - 1;
+                    for (byte part : Character.toString(point).getBytes(StandardCharsets.UTF_8)) {
+                        put(part);
+                    }
+                }
+            }
+            return put('"');
+        }
+
+        private static boolean paired(String text, int at) {
+            return Character.isSupplementaryCodePoint(text.codePointAt(at));
+        }
+
+        @SuppressWarnings("deprecation") // of all ways to get at the bytes of ASCII, the fastest
+        private Writer ascii(String text) {
+            int size = text.length();
+            room(size);
+            text.getBytes(0, size, bytes, length);
+            length += size;
+            return this;
+        }
+
+        private Writer put(int value) {
+            room(1);
+            bytes[length++] = (byte) value;
+            return this;
+        }
+
+        private void room(int size) {
+            if (length + size > bytes.length) {
+                bytes = Arrays.copyOf(bytes, Math.max(2 * bytes.length, length + size));
+            }
+        }
+    }
+
+    private static final class Reader {
+        private final byte[] line;
+        private final int end;
+        private int at;
+        private int depth;
+
+        Reader(byte[] line, int begin, int end) {
+            this.line = line;
+            this.at = begin;
+            this.end = end;
+        }
+
+        Map<?, ?> frame() {
+            Object value;
+            try {
+                value = value();
+            } catch (CharacterCodingException | NumberFormatException error) {
+                throw wrong(error.toString());
+            }
+            if (blank() < end || !(value instanceof Map<?, ?> frame)) {
+                throw wrong("one object was expected");
+            }
+            return frame;
+        }
+
+        private Object value() throws CharacterCodingException {
+            int c = next();
+            switch (c) {
+                case '{':
+                    return object();
+                case '[':
+                    return array();
+                case '"':
+                    return string();
+                case 't':
+                    return word("true", Boolean.TRUE);
+                case 'f':
+                    return word("false", Boolean.FALSE);
+                case 'n':
+                    return word("null", null);
+                default:
+                    return number();
+            }
+        }
+
+        private Object object() throws CharacterCodingException {
+            Map<String, Object> found = new LinkedHashMap<>();
+            deeper();
+            if (next() == '}') {
+                at++;
+            } else {
+                do {
+                    expect('"');
+                    at--;
+                    String key = string();
+                    expect(':');
+                    found.put(key, value());
+                } while (more('}'));
+            }
+            depth--;
+            if (found.size() == 1 && found.get("float") instanceof String name) {
+                switch (name) {
+                    case "nan":
+                        return Double.NaN;
+                    case "inf":
+                        return Double.POSITIVE_INFINITY;
+                    case "-inf":
+                        return Double.NEGATIVE_INFINITY;
+                    default:
+                        break;
+                }
+            }
+            return Collections.unmodifiableMap(found);
+        }
+
+        private Object array() throws CharacterCodingException {
+            List<Object> found = new ArrayList<>();
+            deeper();
+            if (next() == ']') {
+                at++;
+            } else {
+                do {
+                    found.add(value());
+                } while (more(']'));
+            }
+            depth--;
+            return Collections.unmodifiableList(found);
+        }
+
+        private boolean more(char closing) {
+            int c = next();
+            at++;
+            if (c != ',' && c != closing) {
+                throw wrong("a comma or " + closing + " was expected");
+            }
+            return c == ',';
+        }
+
+        private Object number() {
+            int begin = at;
+            boolean whole = true;
+            while (at < end && "+-.0123456789eE".indexOf(line[at]) >= 0) {
+                whole &= line[at] == '-' || line[at] >= '0' && line[at] <= '9';
+                at++;
+            }
+            if (begin == at) {
+                throw wrong("a value was expected");
+            }
+            String text = new String(line, begin, at - begin, StandardCharsets.ISO_8859_1);
+            if (!whole) {
+                return Double.valueOf(text);
+            }
+            if (text.length() < 19) {
+                return Long.valueOf(text);
+            }
+            BigInteger value = new BigInteger(text);
+            return value.bitLength() < 64 ? (Object) value.longValue() : value;
+        }
+
+        private String string() throws CharacterCodingException {
+            int begin = ++at;
+            StringBuilder text = null; // what stands before the last escape
+            boolean ascii = true;
+            for (; at < end; at++) {
+                if (line[at] == '"') {
+                    String rest = decoded(begin, ascii);
+                    at++;
+                    return text == null ? rest : text.append(rest).toString();
+                }
+                if (line[at] == '\\') {
+                    text = (text == null ? new StringBuilder() : text).append(decoded(begin, ascii)).append(escaped());
+                    begin = at + 1;
+                    ascii = true;
+                } else {
+                    ascii &= line[at] >= 0;
+                }
+            }
+            throw wrong("a string does not end");
+        }
+
+        /** What the escape at hand stands for; goes on to its last byte. */
+        private char escaped() {
+            if (++at >= end) {
+                throw wrong("a string does not end");
+            }
+            if (line[at] == 'u' && at + 4 < end) {
+                String digits = new String(line, at + 1, 4, StandardCharsets.ISO_8859_1);
+                at += 4;
+                return (char) Integer.parseInt(digits, 16);
+            }
+            int which = "\"\\/bfnrt".indexOf(line[at]);
+            if (which < 0) {
+                throw wrong("there is no such escape");
+            }
+            return "\"\\/\b\f\n\r\t".charAt(which);
+        }
+
+        private String decoded(int begin, boolean ascii) throws CharacterCodingException {
+            if (ascii) {
+                return new String(line, begin, at - begin, StandardCharsets.ISO_8859_1);
+            }
+            return StandardCharsets.UTF_8.newDecoder().decode(ByteBuffer.wrap(line, begin, at - begin)).toString();
+        }
+
+        private Object word(String word, Object value) {
+            for (int i = 0; i < word.length(); i++, at++) {
+                if (at >= end || line[at] != word.charAt(i)) {
+                    throw wrong(word + " was expected");
+                }
+            }
+            return value;
+        }
+
+        private void expect(char wanted) {
+            if (next() != wanted) {
+                throw wrong(wanted + " was expected");
+            }
+            at++;
+        }
+
+        private void deeper() {
+            at++;
+            if (++depth > DEEPEST) {
+                throw wrong("it is nested too deeply");
+            }
+        }
+
+        /** The next byte that is not blank. */
+        private int next() {
+            if (blank() == end) {
+                throw wrong("more was expected");
+            }
+            return line[at];
+        }
+
+        private int blank() {
+            while (at < end && (line[at] == ' ' || line[at] == '\t' || line[at] == '\r')) {
+                at++;
+            }
+            return at;
+        }
+
+        private WireError wrong(String what) {
+            int first = Math.max(0, Math.min(at, end) - 80);
+            String near = new String(line, first, Math.min(end - first, 160), StandardCharsets.ISO_8859_1);
+            return new WireError("a line is not understood: " + what + ", near " + near);
+        }
+    }
+}

@@ -21,6 +21,7 @@ import java.util.List;
 import java.util.Map;
 import java.util.Objects;
 import java.util.Set;
+import java.util.SplittableRandom;
 import java.util.concurrent.atomic.AtomicInteger;
 import java.util.concurrent.atomic.AtomicLong;
 import java.util.function.BooleanSupplier;
@@ -106,7 +107,7 @@ public final class SimEnv {
         /**
          * Runs it to its end.
          *
-         * @param seed of its generators
+         * @param seed of its generators; where the environment names none, it is drawn
          * @param options that the environment's reset was given, as maps, lists, strings, booleans, longs and doubles
          * @return what came out: anything that {@link Arguments#put(String, Object)} takes, or an {@link End}
          * @throws Exception any: it becomes an error in the environment
@@ -197,7 +198,9 @@ public final class SimEnv {
         Object result = null;
         Throwable error = null;
         try {
-            result = episode.run(seed(start.get("seed")), options(start.get("options")));
+            Object seed = start.get("seed");
+            long seeded = seed == null ? new SplittableRandom().nextLong() : seed(seed);
+            result = episode.run(seeded, options(start.get("options")));
         } catch (Throwable thrown) {
             error = thrown;
         }

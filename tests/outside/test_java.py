@@ -200,7 +200,12 @@ def test_a_model_without_a_callback_cannot_be_seeded_anew(probe):
         assert child.ended()[0] == 1
 
 
-@pytest.mark.parametrize("seed", [2**63, 0.5, None])
+def test_where_no_seed_is_named_one_is_drawn(child):
+    seeds = {child.play(rule, do="count", seed=None)[1]["end"]["result"]["seed"] for _ in range(5)}
+    assert len(seeds) == 5
+
+
+@pytest.mark.parametrize("seed", [2**63, 0.5, "7"])
 def test_seeds_are_integers_of_64_bits(child, seed):
     assert f"and is {json.dumps(seed)}" in error(child.play(rule, do="count", seed=seed)[1])["text"]
     assert child.play(rule, do="count")[1]["end"]["truncated"]

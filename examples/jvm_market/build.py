@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import fcntl
 import shutil
 import subprocess
 import tempfile
@@ -62,19 +62,25 @@ def build(out: Path = OUT, sources: Iterable[Path] = SOURCES) -> Path:
         RuntimeError: There is no JDK, or the sources do not compile; with the words of the compiler.
     """
     sources = list(sources)
-    done = out / "done"
-    if done.exists() and done.stat().st_mtime >= max(source.stat().st_mtime for source in sources):
-        return out
+    with sources[0].open() as locked:  # for those that want to build it at the same time
+        fcntl.flock(locked, fcntl.LOCK_EX)
+        done = out / "done"
+        if not done.exists() or done.stat().st_mtime < max(source.stat().st_mtime for source in sources):
+            _compile(sources, out)
+    return out
+
+
+def _compile(sources: list[Path], out: Path) -> None:
+    """Compile, and take the classes into use when they are whole."""
     _, javac = java()
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".java-") as folder:
-        classes = Path(folder) / "classes"  # taken into use when it is whole: others may build or run at the same time
+        classes = Path(folder) / "classes"
         command = [javac, "-Xlint:all", "-Werror", "-encoding", "UTF-8", "-d", str(classes), *map(str, sources)]
         said = subprocess.run(command, capture_output=True, text=True, timeout=300)
         if said.returncode:
             raise RuntimeError(f"{' '.join(command)} has failed:\n{said.stdout}{said.stderr}")
         (classes / "done").touch()
         if out.exists():
-            os.rename(out, Path(folder) / "old")
-        os.rename(classes, out)
-    return out
+            out.rename(Path(folder) / "old")
+        classes.rename(out)

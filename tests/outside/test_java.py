@@ -370,3 +370,17 @@ def test_pipes_that_are_none_are_an_error(probe, numbers, text):
     plain = subprocess.run(probe, env=environment, capture_output=True, text=True, timeout=PATIENCE)
     assert plain.returncode == 1
     assert text in plain.stderr
+
+
+# -- what is missing ------------------------------------------------------------------------------
+
+
+def test_what_is_missing_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(RuntimeError, match=r"java is not found on the PATH; install a JDK of version 17"):
+        build(tmp_path / "out")
+    for name, said in {"java": "", "javac": "echo javac 11.0.2"}.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{said}\n")
+        (tmp_path / name).chmod(0o755)
+    with pytest.raises(RuntimeError, match=r"javac is of version 11\.0\.2; install a JDK"):
+        build(tmp_path / "out")

@@ -167,6 +167,15 @@ def test_threads_of_the_model_decide_one_at_a_time(child):
     assert last["end"]["result"] == [50, 100, 150, 200]
 
 
+def test_a_stop_reaches_all_threads(child):
+    child.start(do="threads")
+    child.hear()
+    child.say({"stop": True})
+    calls, last = child.play(rule, do="count")
+    assert [call["decide"] for call in calls] == [1, 2, 3, 4, 5]
+    assert "end" in last
+
+
 # -- seeds ----------------------------------------------------------------------------------------
 
 

@@ -268,7 +268,7 @@ public final class SimEnv {
 
     /** As {@link #decide}, of a long. */
     public static long decideLong(String point, String entity, Consumer<Arguments> arguments, LongSupplier rule) {
-        Object answer = ask(point, entity, arguments, value -> (Long) value);
+        Object answer = ask(point, entity, arguments, value -> ((Long) value).longValue());
         return answer == RULE ? rule.getAsLong() : (Long) answer;
     }
 
@@ -281,7 +281,7 @@ public final class SimEnv {
     /** As {@link #decide}, of true or false. */
     public static boolean decideBoolean(
             String point, String entity, Consumer<Arguments> arguments, BooleanSupplier rule) {
-        Object answer = ask(point, entity, arguments, value -> (Boolean) value);
+        Object answer = ask(point, entity, arguments, value -> ((Boolean) value).booleanValue());
         return answer == RULE ? rule.getAsBoolean() : (Boolean) answer;
     }
 
@@ -673,6 +673,8 @@ public final class SimEnv {
     }
 
     private static final class Reader {
+        private static final Map<String, Double> NOT_FINITE =
+                Map.of("nan", Double.NaN, "inf", Double.POSITIVE_INFINITY, "-inf", Double.NEGATIVE_INFINITY);
         private final byte[] line;
         private final int end;
         private int at;
@@ -698,23 +700,15 @@ public final class SimEnv {
         }
 
         private Object value() throws CharacterCodingException {
-            int c = next();
-            switch (c) {
-                case '{':
-                    return object();
-                case '[':
-                    return array();
-                case '"':
-                    return string();
-                case 't':
-                    return word("true", Boolean.TRUE);
-                case 'f':
-                    return word("false", Boolean.FALSE);
-                case 'n':
-                    return word("null", null);
-                default:
-                    return number();
-            }
+            return switch (next()) {
+                case '{' -> object();
+                case '[' -> array();
+                case '"' -> string();
+                case 't' -> word("true", Boolean.TRUE);
+                case 'f' -> word("false", Boolean.FALSE);
+                case 'n' -> word("null", null);
+                default -> number();
+            };
         }
 
         private Object object() throws CharacterCodingException {
@@ -732,19 +726,8 @@ public final class SimEnv {
                 } while (more('}'));
             }
             depth--;
-            if (found.size() == 1 && found.get("float") instanceof String name) {
-                switch (name) {
-                    case "nan":
-                        return Double.NaN;
-                    case "inf":
-                        return Double.POSITIVE_INFINITY;
-                    case "-inf":
-                        return Double.NEGATIVE_INFINITY;
-                    default:
-                        break;
-                }
-            }
-            return Collections.unmodifiableMap(found);
+            Object named = found.size() == 1 && found.get("float") instanceof String name ? NOT_FINITE.get(name) : null;
+            return named == null ? Collections.unmodifiableMap(found) : named;
         }
 
         private Object array() throws CharacterCodingException {

@@ -114,7 +114,7 @@ public final class Probe {
                 return new Object();
             case "bad decision":
                 try {
-                    return SimEnv.decideInt("a", "x", a -> {}, () -> 1);
+                    return typed((String) options.get("type"));
                 } catch (Exception error) {
                     return "swallowed";
                 }
@@ -135,6 +135,16 @@ public final class Probe {
             default:
                 throw new IllegalArgumentException("do what?");
         }
+    }
+
+    static Object typed(String type) {
+        return switch (type) {
+            case "double" -> SimEnv.decideDouble("a", "x", a -> {}, () -> 1);
+            case "long" -> SimEnv.decideLong("a", "x", a -> {}, () -> 1);
+            case "int" -> SimEnv.decideInt("a", "x", a -> {}, () -> 1);
+            case "boolean" -> SimEnv.decideBoolean("a", "x", a -> {}, () -> true);
+            default -> SimEnv.decide("a", "x", a -> {}, () -> Mood.GLAD, value -> Mood.valueOf((String) value));
+        };
     }
 
     static Object guarded(Object value) {

@@ -127,9 +127,19 @@ def test_decisions_have_types(child):
     assert exactly(last["end"]["result"]) == exactly([0.25, 3, 2, False, "GLAD"])
 
 
-@pytest.mark.parametrize("value", [0.5, 2**31, "2", None, True, [2]])
-def test_a_decision_of_another_type_is_an_error_that_the_model_cannot_swallow(child, value):
-    calls, last = child.play(lambda call: {"value": value}, do="bad decision")
+WRONG_TYPES = {
+    "double": [None, "2", True, [0.5]],
+    "long": [None, "2", True, 0.5, 2**63],
+    "int": [None, "2", True, 0.5, 2**31],
+    "boolean": [None, "true", 1],
+    "enum": [None, "SAD", 1],
+}
+
+
+@pytest.mark.parametrize(("kind", "value"), [(kind, value) for kind, values in WRONG_TYPES.items() for value in values])
+def test_a_decision_of_another_type_is_an_error_that_the_model_cannot_swallow(probe_echo, kind, value):
+    child = probe_echo
+    calls, last = child.play(lambda call: {"value": value}, do="bad decision", type=kind)
     assert len(calls) == 1
     assert error(last)["type"] == "java.lang.IllegalArgumentException"
     assert error(last)["text"] == f"a cannot take the decision {json.dumps(value)}"

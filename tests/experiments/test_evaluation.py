@@ -3,6 +3,7 @@
 import builtins
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -12,14 +13,19 @@ from simenv_marl import (
     RULE,
     AgentError,
     MissingExtraError,
+    Mixture,
     OptionValueError,
+    RolloutPolicy,
+    TreeSearchPolicy,
     UnknownPointError,
+    Variant,
     aec_env,
     evaluate,
     make_step,
     simulate,
 )
-from tests.worlds.shops import OBSERVED, POINTS, Shop, level, much, much_of_many, some, some_of_many
+from tests.worlds.models import notes
+from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
@@ -61,6 +67,26 @@ def test_the_same_comes_of_all_ways_to_run_it(arguments):
     alone = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, metric=level)
     assert evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, metric=level, **arguments).frame.equals(alone.frame)
     assert "metric" in alone.frame.columns
+
+
+@pytest.mark.parametrize(
+    "planner", [RolloutPolicy([0, 1, 2], futures=2, horizon=1), TreeSearchPolicy([0, 1, 2], budget=8)]
+)
+@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True}], ids=str)
+def test_planners_decide_as_they_do_in_simulate(planner, arguments):
+    contenders = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
+    found = evaluate(Shop, contenders, seeds=range(2), points=NEAR, metric=level, **arguments).values("metric")
+    for name, policies in contenders.items():
+        assert found[name].tolist() == [simulate(Shop, policies, points=NEAR, seed=seed).level for seed in range(2)]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_mixtures_decide_as_policies_of_many(workers):
+    contenders = {"mixed": {"keeper": Mixture({RULE: 0.5, much_of_many: 0.5})}, "much": {"keeper": much_of_many}}
+    values = evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, batched=True, workers=workers).values()
+    assert (values["mixed"] <= values["much"]).all()
+    assert values["mixed"].mean() < values["much"].mean() - 2
+    refused("of 'keeper' in 'mixed', <Mixture.*batched=True", contenders=contenders)
 
 
 def test_batched_policies_answer_many():
@@ -113,7 +139,8 @@ def test_how_many_seeds_would_tell_a_difference():
     apart = (found.values()["some"] - found.values()["rule"]).std()
     assert found.seeds_needed(apart / 2)["some"] == pytest.approx(34, abs=1)
     assert found.seeds_needed(apart / 2, power=0.99)["some"] > found.seeds_needed(apart / 2)["some"]
-    for arguments in ({"difference": 0}, {"difference": "a"}, {"difference": 1, "power": 1}):
+    wrong = ({"difference": 0}, {"difference": "a"}, {"difference": 1, "power": 1}, {"difference": 1, "power": "a"})
+    for arguments in wrong:
         with pytest.raises(OptionValueError):
             found.seeds_needed(**arguments)
     with pytest.raises(OptionValueError, match="no baseline"):
@@ -149,6 +176,50 @@ def test_the_team_is_what_its_user_makes_of_the_returns(team):
     assert rows["team"] == rows["keeper"] > rows["helper"]
 
 
+def test_the_team_is_asked_for_those_alone_that_have_decided():
+    def team(returns):
+        assert "keeper" in returns
+        assert "stranger" not in returns
+        assert returns["keeper"] in returns
+        return returns.get("stranger", 0.5)
+
+    frame = evaluate(Shop, {"rule": {}}, seeds=[1], points=POINTS, team=team).frame
+    assert frame["return"].tolist()[-1] == 0.5
+
+
+@pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True, "batch_size": 1}], ids=str)
+def test_a_team_that_fails_does_so_at_once(arguments):
+    with pytest.raises(KeyError, match="'stranger' has not decided in this episode; keeper, helper has") as caught:
+        evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, team=lambda returns: returns["stranger"], **arguments)
+    assert "seed 0" in notes(caught.value)
+    assert "of the contender 'rule'" in notes(caught.value)
+
+
+def test_what_is_no_number_has_no_mean():
+    given = {"day": lambda shop: "monday", "some": lambda shop: shop.level if shop.seed else None}
+    found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=given, baseline="rule")
+    assert set(found.values("day")["rule"]) == {"monday"}
+    for look in (found.summary, found.improvement, found.plot, lambda of: found.seeds_needed(1, of=of)):
+        with pytest.raises(OptionValueError, match="'day' is a column of other values"):
+            look(of="day")
+    assert np.isnan(found.summary("some")["mean"]).all()
+
+
+def test_columns_are_those_of_experiments():
+    given = {"some": lambda shop: "a" if shop.seed else None, "number": lambda shop: shop.seed or None}
+    frame = evaluate(Shop, {"rule": {}}, seeds=[0, 1], points=POINTS, metric=given).frame
+    assert frame["some"].tolist() == [None] * 3 + ["a"] * 3
+    assert frame["number"].dtype == np.float64
+
+
+def test_a_variant_brings_its_own_points_and_policies():
+    variant = Variant("v", Shop, points=POINTS, parameters={"days": 2}, policies={"keeper": much})
+    frame = evaluate(variant, {"rule": {}}, seeds=SEEDS, metric=level).frame
+    assert set(frame["agent"]) == {"helper", "team"}  # for the keeper a policy decides, which is no contender's
+    expected = [simulate(Shop(2), {"keeper": much}, points=POINTS, seed=seed).level for seed in SEEDS]
+    assert frame[frame.agent == "team"]["metric"].tolist() == expected
+
+
 def test_pairs_are_drawn():
     found = evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, baseline="rule", metric=level)
     values, differences = found.plot("metric").axes
@@ -179,6 +250,7 @@ def refused(match, error=OptionValueError, **arguments):
         ("must be a dict from agents", {"contenders": {"a": much}}),
         ("must be callable", {"contenders": {"a": {"keeper": 3}}}),
         ("baseline 'x' is none of the contenders: rule, much", {"baseline": "x"}),
+        ("is none of the contenders", {"baseline": ["rule"]}),
         ("there are none", {"seeds": []}),
         ("seed 3 is there twice", {"seeds": [3, 4, 3]}),
         ("iterable of integers", {"seeds": 3}),
@@ -219,8 +291,26 @@ def test_errors_tell_of_which_seed():
         raise ZeroDivisionError("here")
 
     with pytest.raises(ZeroDivisionError) as caught:
-        evaluate(Shop, {"a": {"keeper": failing}}, seeds=[7], points=POINTS)
-    assert any("seed 7" in note for note in caught.value.__notes__)
+        evaluate(Shop, {"rule": {}, "a": {"keeper": failing}}, seeds=[7], points=POINTS)
+    assert "seed 7" in notes(caught.value)
+    assert "of the contender 'a'" in notes(caught.value)
+
+
+def test_what_no_worker_can_be_given_is_found_out_before_anything_runs(tmp_path):
+    class Writing(Shop):
+        def reset(self, seed):
+            (tmp_path / str(seed)).touch()
+            super().reset(seed)
+
+    lock = threading.Lock()
+    with pytest.raises(TypeError, match="pickle"):
+        evaluate(Writing, {"rule": {}, "a": {"keeper": lambda o: lock}}, seeds=[1], points=POINTS, workers=1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_progress_is_shown(capsys):
+    evaluate(Shop, CONTENDERS, seeds=SEEDS, points=POINTS, progress=True)
+    assert "24/24" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_told_with_its_extra(monkeypatch):

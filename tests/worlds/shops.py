@@ -23,6 +23,9 @@ class Shop:
     def reset(self, seed):
         self.generator, self.level, self.seed = np.random.default_rng(seed), 0.0, seed
 
+    def reseed(self, seed):
+        self.generator = np.random.default_rng(seed)
+
     def run(self):
         for _ in range(self.days):
             self.level += self.order() * self.price
@@ -54,6 +57,18 @@ POINTS = {
         agent="helper",
     ),
 }
+
+
+NEAR = {
+    point: make_step(
+        **OBSERVED,
+        action_space_mapping=lambda action: action,
+        reward_mapping=lambda shop: -abs(shop.level),
+        agent=definition.agent,
+    )
+    for point, definition in POINTS.items()
+}
+"""Points at which both are to keep the level near to nothing, so that chance matters to those who plan."""
 
 
 def level(shop):

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from math import isfinite
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.plan import Plan
-from ..errors import OptionValueError, shown
+from ..core.processes import pack
+from ..errors import OptionValueError, annotate, shown
 from ..many.collect import check_numbers, checked_seeds
 from ..many.spread import progress_bar, spread
 from .extras import needed
@@ -32,7 +32,7 @@ from .playing import (
     points_of,
     team_value,
 )
-from .statistics import improvement, interval, seeds_needed
+from .statistics import check_confidence, check_number, improvement, interval, numbers, seeds_needed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -93,12 +93,12 @@ class Evaluation:
         Raises:
             OptionValueError: There is no such column.
         """
-        pandas, values, rows = needed("pandas", "summary"), self.values(of), {}
+        pandas, values, rows = needed("pandas", "summary"), numbers(self.values(of), of), {}
         for name in values.columns:
-            own = values[name].to_numpy(np.float64)
+            own = values[name].to_numpy()
             rows[name] = [own.mean(), *interval(own, self.confidence)]
             if self.baseline is not None:
-                apart = own - values[self.baseline].to_numpy(np.float64)
+                apart = own - values[self.baseline].to_numpy()
                 rows[name] += [apart.mean(), *interval(apart, self.confidence)]
         columns = ["mean", "low", "high"]
         if self.baseline is not None:
@@ -139,9 +139,12 @@ class Evaluation:
         Raises:
             OptionValueError: There is no baseline or no such column, or an argument cannot have its value.
         """
-        _check_number("difference", difference)
-        if difference == 0 or not 0 < power < 1:
-            raise OptionValueError(f"difference must not be 0, and power lie between 0 and 1, not {shown(power)}")
+        check_number("difference", difference)
+        check_number("power", power)
+        if difference == 0:
+            raise OptionValueError("difference must not be 0: no number of seeds tells none from none")
+        if not 0 < power < 1:
+            raise OptionValueError(f"power must lie between 0 and 1, such as 0.8, not {shown(power)}")
         apart = self._differences(of)
         found = {name: seeds_needed(own, difference, self.confidence, power) for name, own in apart.items()}
         counts: Series[float] = needed("pandas", "seeds_needed").Series(found, name="seeds", dtype=float)
@@ -150,9 +153,9 @@ class Evaluation:
     def _differences(self, of: str) -> dict[str, NDArray[np.float64]]:
         if self.baseline is None:
             raise OptionValueError("there is no baseline to compare with; give evaluate a baseline=")
-        values = self.values(of)
-        base = values[self.baseline].to_numpy(np.float64)
-        return {name: values[name].to_numpy(np.float64) - base for name in values.columns if name != self.baseline}
+        values = numbers(self.values(of), of)
+        base = values[self.baseline].to_numpy()
+        return {name: values[name].to_numpy() - base for name in values.columns if name != self.baseline}
 
     def plot(self, of: str = "return", *, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
         """Draw each seed as a line from contender to contender and, with a baseline, the differences seed by seed.
@@ -170,7 +173,9 @@ class Evaluation:
         """
         from .pictures import draw_pairs
 
-        drawn: Figure | SubFigure = draw_pairs(self.values(of), self.summary(of), self.baseline, of, figure)
+        drawn: Figure | SubFigure = draw_pairs(
+            numbers(self.values(of), of), self.summary(of), self.baseline, of, figure
+        )
         return drawn
 
 
@@ -203,7 +208,8 @@ def evaluate(
         metric: A callable of the simulation after its end, whose column is ``metric``, or a dict of them by column.
             Numbers, strings or None.
         team: What the returns of an episode make together; None: their sum. It gets the returns of the agents, which
-            are numbers (``max`` serves) and a mapping by agent (``lambda returns: returns["waterer_0"]``).
+            are numbers (``max`` serves) and a mapping by agent (``lambda returns: returns["waterer_0"]``); of those
+            alone that have decided (``returns.get("waterer_0", 0.0)``).
         confidence: Of the intervals.
         width: Stop as soon as the interval of every difference from the baseline (without one: of every mean) is at
             most this wide; ``seeds`` are then those that there may be. Looked at from 16 seeds on, now and then.
@@ -220,24 +226,33 @@ def evaluate(
         OptionValueError: An argument cannot have its value. Nothing has run.
         MissingExtraError: pandas, SciPy, joblib or tqdm is missing.
         SimEnvError: Something else cannot work; the leaf says what.
-        BaseException: Whatever a model, a mapping, a policy or a metric raises, with a note that says of which seed.
+        BaseException: Whatever a model, a mapping, a policy, a metric or ``team`` raises, with notes that say of which
+            contender and seed.
     """
     needed("pandas", "evaluate"), needed("scipy.stats", "evaluate")
-    found = checked_contenders(contenders)
+    found = checked_contenders(contenders, batched=bool(batched))
     _check(found, baseline, confidence, width, team)
     places = distinct_seeds(seeds)
     check_numbers(batch_size, workers)
     checked_options(options)
     metrics, size = checked_metrics(metric), int(batch_size) if batched else 0
-    common = (simulation, points, options, points_of(found), metrics, size)
+    common = (simulation, points, options, points_of(found), metrics, size, team)
     plans = _plans(found, *common[:4])  # made here also where the work is done elsewhere, so that errors come before
+    if workers:
+        pack((found, common))  # as here what cannot be sent there
     outcomes, done = {name: list[Outcome]() for name in found}, 0
     with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar:
         while done < len(places):
             lot = places[done : _next(done, len(places), width)]
             for name, known in outcomes.items():
-                arguments = ({name: found[name]}, *common)
-                known += _spread(arguments, lot, int(workers)) if workers else _play(plans[name], lot, metrics, size)
+                try:
+                    if workers:
+                        known += _spread(({name: found[name]}, *common), lot, int(workers), size)
+                    else:
+                        known += _play(plans[name], lot, metrics, size, team)
+                except BaseException as error:
+                    annotate(error, f"simenv_marl: of the contender {name!r}")
+                    raise
                 if bar is not None:
                     bar.update(len(lot))
             done += len(lot)
@@ -259,7 +274,7 @@ def _widest(outcomes: Mapping[str, Sequence[Outcome]], team: Any, baseline: str 
         base = values.pop(baseline)
         values = {name: own - base for name, own in values.items()}
     bounds = [interval(own, confidence) for own in values.values()]
-    return max((high - low for low, high in bounds), default=0.0)
+    return float(np.max([high - low for low, high in bounds], initial=0.0))  # nan where one of them is
 
 
 def _plans(
@@ -268,9 +283,9 @@ def _plans(
     return {name: contender_plan(simulation, policies, points, options, named) for name, policies in contenders.items()}
 
 
-def _spread(arguments: tuple[Any, ...], seeds: list[int], workers: int) -> list[Outcome]:
+def _spread(arguments: tuple[Any, ...], seeds: list[int], workers: int, size: int) -> list[Outcome]:
     """Have workers play the episodes of a contender."""
-    return [outcome for _, part in spread(_play_part, arguments, seeds, workers, arguments[-1]) for outcome in part]
+    return [outcome for _, part in spread(_play_part, arguments, seeds, workers, size) for outcome in part]
 
 
 def _play_part(
@@ -281,19 +296,20 @@ def _play_part(
     named: Sequence[Any],
     metrics: Metrics,
     size: int,
+    team: Any,
     seeds: list[int],
 ) -> list[Outcome]:
     """In a worker: play a part of a contender's episodes."""
     (plan,) = _plans(contender, simulation, points, options, named).values()
-    return _play(plan, seeds, metrics, size)
+    return _play(plan, seeds, metrics, size, team)
 
 
-def _play(plan: Plan, seeds: Sequence[int], metrics: Metrics, size: int) -> list[Outcome]:
+def _play(plan: Plan, seeds: Sequence[int], metrics: Metrics, size: int, team: Any) -> list[Outcome]:
     """Play episodes of a contender; ``size`` of them at once, or one by one where that is 0."""
     if not size:
-        return [play(plan, seed, metrics) for seed in seeds]
+        return [play(plan, seed, metrics, team) for seed in seeds]
     outcomes: dict[int, Outcome] = {}
-    play_many(plan, seeds, size, metrics, outcomes.__setitem__)
+    play_many(plan, seeds, size, metrics, outcomes.__setitem__, team)
     return [outcomes[place] for place in range(len(seeds))]
 
 
@@ -305,7 +321,28 @@ def _frame(seeds: Sequence[int], outcomes: Mapping[str, Sequence[Outcome]], metr
                 values = (contender, seed, *row, *outcome.metrics.values())
                 for column, value in zip(columns.values(), values, strict=True):
                     column.append(value)
-    return needed("pandas", "evaluate").DataFrame(columns)
+    return typed(columns)
+
+
+def typed(columns: Mapping[str, Sequence[Any]]) -> DataFrame:
+    """A table whose columns keep their values as they are; numbers of which some are missing are floats."""
+    pandas = needed("pandas", "a table")
+    table: DataFrame = pandas.DataFrame(
+        {name: pandas.Series(values, dtype=_dtype(values)) for name, values in columns.items()}
+    )
+    return table
+
+
+def _dtype(values: Sequence[Any]) -> Any:
+    kinds = {type(value) for value in values}
+    if kinds <= {int} and all(-(2**63) <= value < 2**63 for value in values):
+        return np.int64
+    if kinds == {bool}:
+        return np.bool_
+    if kinds <= {int, float, type(None)} and kinds & {int, float}:
+        exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
+        return np.float64 if exact else object
+    return object if kinds != {str} else "str"
 
 
 def rows_of(outcome: Outcome, team: Any) -> list[tuple[str, float, int]]:
@@ -335,18 +372,11 @@ def distinct_seeds(given: Iterable[int]) -> list[int]:
 def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: Any) -> None:
     if not contenders:
         raise OptionValueError("contenders must be some, such as {'rule': {}}: there are none")
-    if baseline is not None and baseline not in contenders:
+    if baseline is not None and baseline not in list(contenders):
         raise OptionValueError(f"the baseline {shown(baseline)} is none of the contenders: {', '.join(contenders)}")
-    _check_number("confidence", confidence)
-    if not 0 < confidence < 1:
-        raise OptionValueError(f"confidence must lie between 0 and 1, not {shown(confidence)}")
+    check_confidence(confidence)
     if width is not None:
-        _check_number("width", width)
+        check_number("width", width)
         if width <= 0:
             raise OptionValueError(f"width must be positive, not {shown(width)}")
     checked_team(team)
-
-
-def _check_number(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not isfinite(value):
-        raise OptionValueError(f"{name} must be a finite number, not {shown(value)}")

@@ -15,7 +15,7 @@ from ..core.session import Session
 from ..decision import decision_points
 from ..errors import AgentError, OptionValueError, UnknownPointError, annotate, close_after, shown, warn_user
 from ..hooks.stacks import outside_simulation
-from ..many.batch import Group, run
+from ..many.batch import Group, run, takes_identities
 from ..many.collect import learners_plan
 from ..simulation import RULE
 
@@ -47,7 +47,7 @@ class Returns(tuple[float, ...]):
     """The returns of the agents of an episode: their numbers, as ``sum`` and ``max`` want them, and a mapping by agent.
 
     Example:
-        ``returns["waterer_0"]``, ``min(returns)``, ``returns.items()``
+        ``returns["waterer_0"]``, ``returns.get("waterer_0", 0.0)``, ``min(returns)``, ``returns.items()``
     """
 
     _names: tuple[str, ...]
@@ -59,7 +59,18 @@ class Returns(tuple[float, ...]):
         return made
 
     def __getitem__(self, key: Any) -> Any:
-        return super().__getitem__(self._names.index(key) if isinstance(key, str) else key)
+        if not isinstance(key, str):
+            return super().__getitem__(key)
+        if key not in self._names:
+            raise KeyError(f"{key!r} has not decided in this episode; {', '.join(self._names) or 'no agent'} has")
+        return super().__getitem__(self._names.index(key))
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._names if isinstance(key, str) else super().__contains__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """The return of an agent, or the default where it has not decided."""
+        return self[key] if key in self else default
 
     def keys(self) -> tuple[str, ...]:
         """The names of the agents."""
@@ -102,8 +113,13 @@ def team_value(team: Callable[[Returns], Any] | None, returns: Mapping[str, floa
 # -- what is checked before anything runs ---------------------------------------------------------
 
 
-def checked_contenders(contenders: Any, what: str = "contenders") -> dict[str, Policies]:
+def checked_contenders(contenders: Any, what: str = "contenders", *, batched: bool) -> dict[str, Policies]:
     """Contenders by name.
+
+    Args:
+        contenders: As users give them.
+        what: The argument in which they stand.
+        batched: Whether their policies answer many decisions at once.
 
     Raises:
         OptionValueError: They are none.
@@ -121,6 +137,11 @@ def checked_contenders(contenders: Any, what: str = "contenders") -> dict[str, P
         for key, policy in policies.items():
             if policy is not RULE and not callable(policy):
                 raise OptionValueError(f"the policy of {shown(key)} in {name!r} must be callable, not {shown(policy)}")
+            if not batched and policy is not RULE and takes_identities(policy):
+                raise OptionValueError(
+                    f"the policy of {shown(key)} in {name!r}, {shown(policy)}, answers many decisions at once, as"
+                    " mixtures do; give batched=True, with which all policies are those of simulate_many"
+                )
     return dict(contenders)
 
 
@@ -199,7 +220,8 @@ def contender_plan(
 class Tally:
     """The returns of agents, while episodes run: a watcher of ``run``, and of one episode alone."""
 
-    def __init__(self) -> None:
+    def __init__(self, team: Callable[[Returns], Any] | None) -> None:
+        self._team = team
         self._books: dict[int, dict[str, list[Any]]] = {}  # by place of the episode and agent: return, and length
 
     def count(self, place: int, agent: Agent) -> None:
@@ -239,13 +261,14 @@ class Tally:
 
         Raises:
             AgentError: An agent is called as the row of all agents is.
-            BaseException: What a metric raises.
+            BaseException: What a metric raises, or what makes one value of the returns.
         """
         accounts = self._books.pop(place, {})
         if TEAM in accounts:
             raise AgentError(f"an agent is called {TEAM!r}, which is what the row of all agents is called; rename it")
         returns = {name: float(account[0]) for name, account in accounts.items()}
         lengths = {name: account[1] for name, account in accounts.items()}
+        team_value(self._team, returns)  # now, and not when all have been played: it may fail
         return Outcome(returns, lengths, {name: _plain(name, metric(simulation)) for name, metric in metrics.items()})
 
 
@@ -258,13 +281,13 @@ def _plain(name: str, value: Any) -> Any:
     return value
 
 
-def play(plan: Plan, seed: int, metrics: Metrics) -> Outcome:
+def play(plan: Plan, seed: int, metrics: Metrics, team: Callable[[Returns], Any] | None = None) -> Outcome:
     """Play one episode, with policies of one decision at a time.
 
     Raises:
-        BaseException: Whatever the model, a mapping, a policy or a metric raises.
+        BaseException: Whatever the model, a mapping, a policy, a metric or ``team`` raises.
     """
-    tally = Tally()
+    tally = Tally(team)
     try:
         session = Session(plan)
     except BaseException as error:
@@ -277,6 +300,8 @@ def play(plan: Plan, seed: int, metrics: Metrics) -> Outcome:
             tally.moved(episode)
             while (agent := episode.pending) is not None:
                 tally.count(0, agent)
+                if agent.looks:
+                    agent.consultations += 1
                 try:
                     with episode.at_work() if own_random else nullcontext():
                         action = agent.policy(agent.observation, agent.info)
@@ -299,7 +324,12 @@ def play(plan: Plan, seed: int, metrics: Metrics) -> Outcome:
 
 
 def play_many(
-    plan: Plan, seeds: Sequence[int], batch_size: int, metrics: Metrics, told: Callable[[int, Outcome], None]
+    plan: Plan,
+    seeds: Sequence[int],
+    batch_size: int,
+    metrics: Metrics,
+    told: Callable[[int, Outcome], None],
+    team: Callable[[Returns], Any] | None = None,
 ) -> None:
     """Play many episodes, with policies of many decisions at once.
 
@@ -309,11 +339,13 @@ def play_many(
         batch_size: How many may be suspended together.
         metrics: What is measured.
         told: Called with the place of a seed and what has come of it, as soon as that is known.
+        team: What the returns of an episode make together; None: their sum.
 
     Raises:
-        BaseException: Whatever a model, a mapping, a policy or a metric raises. What others came to was told before.
+        BaseException: Whatever a model, a mapping, a policy, a metric or ``team`` raises. What others came to was told
+            before.
     """
-    tally = Tally()
+    tally = Tally(team)
 
     def finish(place: int, simulation: Any) -> None:
         told(place, tally.outcome(place, simulation, metrics))

@@ -18,7 +18,7 @@ from ..core.processes import pack
 from ..errors import OptionValueError, SimEnvError, StoreError, shown, told, warn_user
 from ..many.collect import check_numbers
 from ..many.spread import progress_bar, spread
-from .evaluation import distinct_seeds, rows_of
+from .evaluation import distinct_seeds, rows_of, typed
 from .extras import needed
 from .playing import (
     COLUMNS,
@@ -123,7 +123,7 @@ def run_experiment(
         SimEnvError: Something else cannot work; the leaf says what.
     """
     needed("pandas", "run_experiment")
-    contenders = _contenders(policies)
+    contenders = _contenders(policies, batched=bool(batched))
     table, rows = checked_design(design)
     metrics, size = checked_metrics(metric, list(table.columns)), int(batch_size) if batched else 0
     places = distinct_seeds(seeds)
@@ -162,8 +162,8 @@ def _check(make: Any, rows: Any, batch_size: Any, workers: Any, options: Mapping
         checked_make(make, row)
 
 
-def _contenders(policies: Any) -> dict[str, Policies]:
-    found = checked_contenders(policies or {}, "policies")
+def _contenders(policies: Any, *, batched: bool) -> dict[str, Policies]:
+    found = checked_contenders(policies or {}, "policies", batched=batched)
     if found.pop(BY_RULE, {}):
         raise OptionValueError(
             f"the contender {BY_RULE!r} is the model as it is, and always there; rename the other one"
@@ -405,8 +405,7 @@ def _frame(
                     for column, value in zip(columns.values(), values, strict=True):
                         column.append(value)
     factors = table.iloc[places].reset_index(drop=True)
-    others = {name: pandas.Series(values, dtype=_dtype(values)) for name, values in columns.items()}
-    return pandas.concat([factors, pandas.DataFrame(others)], axis=1)
+    return pandas.concat([factors, typed(columns)], axis=1)
 
 
 LOST: Final = Known(None, "it has not come to an end: the process that was to run it has ended")
@@ -420,16 +419,3 @@ def _rows(known: Known, contender: str, seed: int, metrics: Sequence[str], team:
     measured = [known.outcome.metrics.get(name) for name in metrics]
     for agent, value, length in rows_of(known.outcome, team):
         yield contender, seed, agent, value, length, *measured, "ok", None
-
-
-def _dtype(values: Sequence[Any]) -> Any:
-    """In which type a column keeps its values; numbers of which some are missing are floats."""
-    kinds = {type(value) for value in values}
-    if kinds <= {int} and all(-(2**63) <= value < 2**63 for value in values):
-        return np.int64
-    if kinds == {bool}:
-        return np.bool_
-    if kinds <= {int, float, type(None)} and kinds & {int, float}:
-        exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
-        return np.float64 if exact else object
-    return object if kinds != {str} else "str"

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import OptionValueError, shown
 from .extras import needed
 
 RESAMPLES: Final = 5_000
@@ -16,6 +17,43 @@ RESAMPLES: Final = 5_000
 
 MOST_SEEDS: Final = 10_000_000
 """A difference that needs more seeds than these is as good as none."""
+
+
+def check_number(name: str, value: Any) -> None:
+    """Make sure that something is a finite number.
+
+    Raises:
+        OptionValueError: It is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not isfinite(value):
+        raise OptionValueError(f"{name} must be a finite number, not {shown(value)}")
+
+
+def check_confidence(confidence: Any) -> None:
+    """Make sure that an interval can be so sure.
+
+    Raises:
+        OptionValueError: It cannot.
+    """
+    check_number("confidence", confidence)
+    if not 0 < confidence < 1:
+        raise OptionValueError(f"confidence must lie between 0 and 1, such as 0.95, not {shown(confidence)}")
+
+
+def numbers(values: Any, of: str) -> Any:
+    """Values of a table as floats; nan where there is none.
+
+    Args:
+        values: A ``DataFrame`` or a ``Series``.
+        of: What they are.
+
+    Raises:
+        OptionValueError: They are no numbers.
+    """
+    try:
+        return values.astype(np.float64)
+    except (TypeError, ValueError):
+        raise OptionValueError(f"of={shown(of)} is a column of other values than numbers") from None
 
 
 def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:

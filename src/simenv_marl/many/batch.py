@@ -49,7 +49,7 @@ class BatchPolicy:
         self.keys: list[Any] = []
         self.policy: Callable[..., Any] = two_arguments(policy)
         self.informed = self.policy is policy
-        self.identifying = self.informed and _takes_three(policy)
+        self.identifying = self.informed and takes_identities(policy)
         self.asking = isinstance(self.policy, AskingPolicy)
         self.groups: list[Group] = []
 
@@ -71,8 +71,8 @@ class BatchPolicy:
         return group
 
 
-def _takes_three(policy: Callable[..., Any]) -> bool:
-    """Whether a policy has to be given a third argument."""
+def takes_identities(policy: Callable[..., Any]) -> bool:
+    """Whether a policy has to be given a third argument, what identifies each decision."""
     return sum(p.default is p.empty for p in positional(policy)) > 2
 
 

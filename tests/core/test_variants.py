@@ -213,11 +213,16 @@ def test_versions_are_those_of_the_packages_that_the_model_comes_from():
 
 def test_what_json_does_not_know_is_named():
     ant = decision(agent="ant_0")
-    variant = Variant(
-        "odd", lambda **parameters: Farm(), parameters={"a": np.arange(2), "b": {1.5}, "c": Farm}, points=ant
-    )
+    parameters = {
+        "a": np.arange(2), "b": {1.5}, "c": Farm, "d": {1: {Farm: 2, (3, None): 4}},
+        "e": [np.datetime64("2020-01-01"), np.complex64(1), np.longdouble(1)], "f": np.array([1, 2j], object),
+    }  # fmt: skip
+    variant = Variant("odd", lambda **parameters: Farm(), parameters=parameters, points=ant)
     said = json.loads(json.dumps(provenance(variant)))
-    assert said["parameters"] == {"a": [0, 1], "b": ["1.5"], "c": f"{__name__}.Farm"}
+    assert said["parameters"] == {
+        "a": [0, 1], "b": ["1.5"], "c": f"{__name__}.Farm", "d": {"1": {f"{__name__}.Farm": 2, "[3, None]": 4}},
+        "e": ["datetime.date(2020, 1, 1)", "(1+0j)", "np.longdouble('1.0')"], "f": [1, "2j"],
+    }  # fmt: skip
     assert "<lambda>" in said["simulation"]
 
 

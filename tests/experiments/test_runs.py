@@ -12,16 +12,27 @@ import textwrap
 import time
 from pathlib import Path
 
+import joblib
 import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simenv_marl import OptionValueError, StoreError, UnknownPointError, Variant, evaluate, run_experiment
+from simenv_marl import (
+    Mixture,
+    OptionValueError,
+    RolloutPolicy,
+    StoreError,
+    UnknownPointError,
+    Variant,
+    evaluate,
+    run_experiment,
+    simulate,
+)
 from simenv_marl.experiments import store as stores
 from simenv_marl.experiments.playing import Outcome
-from tests.worlds.shops import POINTS, Shop, level, much, much_of_many, some, some_of_many
+from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 DESIGN = pd.DataFrame({"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]})
 ROOT = Path(__file__).parents[2]
@@ -139,6 +150,40 @@ def test_what_is_known_is_not_run_again(tmp_path):
         assert again([1, 2]).equals(first)
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_planners_are_contenders(workers, tmp_path):
+    planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1)
+    policies = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
+    frame = run(tmp_path, DESIGN[::2], policies=policies, points=NEAR, seeds=range(2), workers=workers)
+    runs = frame[(frame["agent"] == "team") & (frame["contender"] != "rule")]
+    expected = [
+        simulate(Shop(days, price), own, points=NEAR, seed=seed).level
+        for days, price in ((1, 0.5), (2, 2.0))
+        for own in policies.values()
+        for seed in range(2)
+    ]
+    assert runs["level"].tolist() == expected
+
+
+def test_a_team_that_fails_is_an_error_until_it_is_mended(tmp_path):
+    frame = run(tmp_path, DESIGN[:1], team=lambda returns: returns["stranger"])
+    assert set(frame["agent"]) == {"team"}
+    assert set(frame["status"]) == {"error"}
+    assert "'stranger' has not decided in this episode; keeper, helper has" in frame["error"][0]
+    known = len(lines(tmp_path))
+    assert set(run(tmp_path, DESIGN[:1], team=max)["status"]) == {"ok"}
+    assert len(lines(tmp_path)) == known  # nothing was run again
+
+
+def test_variants_may_have_any_parameters(tmp_path):
+    def make(days):
+        return Variant("v", lambda table: Shop(table[1]), parameters={"table": {1: days, (2, 3): np.float32(1)}})
+
+    frame = run(tmp_path, {"days": [1, 2]}, make=make, policies={"same": {}})
+    assert set(frame["status"]) == {"ok"}
+    assert lines(tmp_path)[0]["provenance"]["parameters"] == {"table": {"1": 1, "[2, 3]": 1.0}}
+
+
 def test_a_torn_last_line_is_a_run_that_is_not_known(tmp_path):
     first = run(tmp_path)
     (path,) = tmp_path.glob("*.jsonl")
@@ -151,6 +196,25 @@ def test_a_torn_last_line_is_a_run_that_is_not_known(tmp_path):
     path.write_bytes(whole.replace(b'"status":"ok"', b'"status:"ok"', 1))
     with pytest.warns(UserWarning, match="line 1 of .* cannot be read"):
         assert run(tmp_path).equals(first)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "3", "null", "[]", "{}", "", "\0\0", '{"factors": {"days": 1}}',
+        '{"factors": {"days": 1}, "contender": "rule", "seed": 0, "status": "ok", "error": null, "returns": 3}',
+        '{"factors": {"days": 1}, "contender": "rule", "seed": 0, "status": "error", "error": "", "provenance": 3}',
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_run_is_told_and_all_others_can_be_read(line, tmp_path):
+    def again():
+        return run(tmp_path, {"days": [1]}, policies=None)
+
+    first = again()
+    (path,) = tmp_path.glob("*.jsonl")
+    path.write_bytes(path.read_bytes() + f"{line}\n".encode())
+    with pytest.warns(UserWarning, match="line 5 of .* cannot be read"):
+        assert again().equals(first)
 
 
 def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
@@ -174,6 +238,17 @@ def test_failed_runs_are_run_again_where_that_is_asked_for(tmp_path):
         assert again()["status"].tolist() == ["ok"] * 3
     finally:
         del Shop.change
+
+
+def test_the_latest_error_of_a_run_is_told(tmp_path):
+    def make(days):
+        raise OSError(f"attempt {len(attempts)}")
+
+    attempts = []
+    for number in range(1, 5):
+        attempts.append(number)
+        frame = run_experiment(make, {"days": [1]}, seeds=[1], points=POINTS, store=tmp_path, retry_errors=True)
+        assert frame["error"].tolist() == ["OSError: attempt " + str(number)]
 
 
 def test_the_same_row_twice_is_run_once_and_stands_there_twice(tmp_path):
@@ -259,6 +334,7 @@ def one_argument(days):
         ("stranger", {"policies": {"a": {"stranger": much}}}),
         ("unknown|no option", {"nonsense": 3}),
         ("team", {"team": 3}),
+        ("'a', .* batched=True", {"policies": {"a": {"keeper": Mixture({much_of_many: 1})}}}),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, tmp_path):
@@ -278,11 +354,59 @@ def test_a_store_of_another_experiment_is_refused(tmp_path):
     with pytest.warns(UserWarning, match="1 rows that this design does not have"):
         run(tmp_path, DESIGN[1:])
     assert len(run(tmp_path)) > 0
+    with pytest.raises(OptionValueError, match=r'"days":1,.*its first is {"days":1.0,'):
+        run(tmp_path, DESIGN.astype({"days": float}))
     other = tmp_path / "other"
     other.mkdir()
+    (other / ".hidden").write_text("")
     (other / "thesis.tex").write_text("")
     with pytest.raises(OptionValueError, match="store of no experiment"):
         run(other)
+    (other / "thesis.tex").unlink()
+    assert len(run(other)) > 0
+    (other / "experiment.json").write_text('{"simenv_marl": 1}')
+    with pytest.raises(OptionValueError, match="its factors are None"):
+        run(other)
+
+
+def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch):
+    real = Path.iterdir
+
+    def iterdir(path):
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "iterdir", real)
+            run(tmp_path)
+        return real(path)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    assert run(tmp_path).equals(run(tmp_path))
+    assert len(lines(tmp_path)) == 36
+
+
+@pytest.mark.parametrize(
+    ("told", "arguments"),
+    [
+        (r'options {} then, {"max_steps":2} now', {"max_steps": 2}),
+        (r"'much' .*policies .*shops.much.* then, .*shops.some", {"policies": {"much": {"keeper": some}}}),
+        (r"make .*Shop.* then, .*Other.* now", {"make": type("Other", (Shop,), {})}),
+        (r"plugins \[\] then", {"plugins": [(lambda shop: None, "tests.worlds.shops.Shop.sell", "before")]}),
+        (r"points .*helper.* then", {"points": {Shop.order: POINTS[Shop.order]}}),
+    ],
+)
+def test_what_was_made_otherwise_is_warned_of(told, arguments, tmp_path):
+    first = run(tmp_path, policies={"much": {"keeper": much}})
+    with pytest.warns(UserWarning, match=told):
+        assert run(tmp_path, **{"policies": {"much": {"keeper": much}}} | arguments).equals(first)
+
+
+def test_what_was_made_alike_is_not_warned_of(tmp_path):
+    class Policy:
+        def __call__(self, observation):
+            return 1
+
+    first = run(tmp_path, policies={"a": {"keeper": Policy()}}, driver="thread")
+    kept = [Policy() for _ in range(3)]
+    assert run(tmp_path, policies={"a": {"keeper": kept[-1]}}, driver="greenlet").equals(first)
 
 
 def test_another_version_of_a_package_is_warned_of(tmp_path):
@@ -317,6 +441,15 @@ def test_a_store_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError):
         run(tmp_path / "file")
+    with pytest.raises(OptionValueError, match="store must be the path of a folder, not None"):
+        run(None)
+
+
+def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
+    with joblib.parallel_config(backend="threading"):
+        frame = run(tmp_path / "shared", workers=2, make=lambda **row: Shop(**row | {"kind": "slow"}))
+    assert frame["status"].tolist() == ["ok"] * len(frame)
+    assert len(list((tmp_path / "shared").glob("*.jsonl"))) == 2
 
 
 def test_progress_is_shown(tmp_path, capsys):

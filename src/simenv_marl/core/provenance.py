@@ -83,7 +83,7 @@ def _dotted_name(thing: Any) -> str:
 
 
 def _key(key: Any) -> str:
-    return key if isinstance(key, str) else _dotted_name(key)
+    return key if isinstance(key, str) else str(written_plainly(key))
 
 
 def written_plainly(value: Any) -> Any:
@@ -91,7 +91,8 @@ def written_plainly(value: Any) -> Any:
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
     if isinstance(value, np.generic):
-        return value.item()
+        plain = value.item()
+        return repr(plain) if isinstance(plain, np.generic) else written_plainly(plain)
     if isinstance(value, Mapping):
         return {_key(key): written_plainly(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
@@ -99,7 +100,7 @@ def written_plainly(value: Any) -> Any:
     if isinstance(value, (set, frozenset)):
         return sorted(map(repr, value))
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return written_plainly(value.tolist())
     if isinstance(value, partial):
         return {
             "partial": written_plainly(value.func),

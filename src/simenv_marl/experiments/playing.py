@@ -70,7 +70,7 @@ class Returns(tuple[float, ...]):
 
     def get(self, key: str, default: Any = None) -> Any:
         """The return of an agent, or the default where it has not decided."""
-        return self[key] if key in self else default
+        return self[key] if key in self._names else default
 
     def keys(self) -> tuple[str, ...]:
         """The names of the agents."""

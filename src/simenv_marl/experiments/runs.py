@@ -10,12 +10,11 @@ from contextlib import nullcontext
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-from uuid import uuid4
 
 import numpy as np
 
 from ..core.processes import pack
-from ..errors import OptionValueError, SimEnvError, StoreError, shown, told, warn_user
+from ..errors import OptionValueError, SimEnvError, StoreError, shown, told
 from ..many.collect import check_numbers
 from ..many.spread import progress_bar, spread
 from .evaluation import distinct_seeds, rows_of, typed
@@ -35,7 +34,7 @@ from .playing import (
     play_many,
     points_of,
 )
-from .store import Known, Stored, Writer, line_of, prepare, read, versions_in, written
+from .store import Known, Stored, Writer, compare, line_of, new_session, prepare, read, warn_of_changes, written
 from .workshop import Row, Workshop, checked_make
 
 if TYPE_CHECKING:
@@ -129,14 +128,15 @@ def run_experiment(
     places = distinct_seeds(seeds)
     _check(make, rows, batch_size, workers, options, team)
     workshop = (make, contenders, points, options, points_of(contenders))
-    made_with = _try(Workshop(*workshop), rows, contenders)
-    folder, keys, factors = Path(store), [written(row) for row in rows], list(table.columns)
-    arguments = (*workshop, metrics, size, folder, uuid4().hex[:12])
+    folder, keys, factors = _folder(store), [written(row) for row in rows], list(table.columns)
+    tried, made_of = _try(Workshop(*workshop), rows, contenders)
+    arguments = (*workshop, metrics, size, folder, new_session())
     if workers:
         pack(arguments)  # what cannot be sent to other processes is found out before
     prepare(folder, factors, list(metrics))
-    stored = read(folder, factors)
-    _compare(folder, stored, keys, made_with)
+    stored = read(folder, factors, tried)
+    compare(folder, stored, keys)
+    warn_of_changes(folder, stored, made_of)
     missing = list(_missing(rows, keys, contenders, places, stored, retry=retry_errors))
     total = len(set(keys)) * len(contenders) * len(places) if progress else None
     _run_missing(arguments, missing, int(workers), len(places) if batched else 1, total)
@@ -207,52 +207,31 @@ def _plain(name: str, value: Any) -> Any:
     return value
 
 
-def _try(workshop: Workshop, rows: Sequence[Row], contenders: Iterable[str]) -> dict[str, Any]:
+def _folder(store: Any) -> Path:
+    try:
+        return Path(store)
+    except TypeError as error:
+        raise OptionValueError(f"store must be the path of a folder, not {shown(store)}") from error
+
+
+def _try(workshop: Workshop, rows: Sequence[Row], contenders: Iterable[str]) -> tuple[str, dict[str, dict[str, Any]]]:
     """Find out whether all contenders can be.
 
     Returns:
-        The versions of what runs are made of, as far as they are known before.
+        A row, as JSON, and what its runs are made of, by contender; nothing where no row can be.
 
     Raises:
         SimEnvError: One of them cannot be.
     """
     for row in rows[:TRIED]:
         try:
-            for contender in contenders:
-                _, provenance = workshop.plan(row, contender)
+            made = {contender: json.loads(workshop.plan(row, contender)[1](0)) for contender in contenders}
         except SimEnvError:
             raise
         except Exception:  # this row is going to fail, maybe another does not
             continue
-        return versions_in(json.loads(provenance(0)))
-    return {}
-
-
-def _compare(folder: Path, stored: Stored, keys: Iterable[str], made_with: Mapping[str, Any]) -> None:
-    """See what has changed since the experiment was last run.
-
-    Raises:
-        OptionValueError: It is another experiment.
-    """
-    strange = stored.rows - set(keys)
-    if strange and len(strange) == len(stored.rows):
-        raise OptionValueError(
-            f"the store {folder} holds runs of {len(strange)} rows, such as {min(strange)}, of which this design has"
-            " none; give another folder, or a design that has them too"
-        )
-    if strange:
-        warn_user(
-            f"the store {folder} holds runs of {len(strange)} rows that this design does not have, such as"
-            f" {min(strange)}; they stay there, and are not in the table"
-        )
-    changed = {
-        name: sorted(map(str, found - {made_with[name]}))
-        for name, found in stored.versions.items()
-        if name in made_with and found - {made_with[name]}
-    }
-    if changed:
-        listed = "; ".join(f"{name} {', '.join(old)} then, {made_with[name]} now" for name, old in changed.items())
-        warn_user(f"the store {folder} holds runs that were made with other versions: {listed}")
+        return written(row), made
+    return "", {}
 
 
 # -- runs -----------------------------------------------------------------------------------------
@@ -416,6 +395,11 @@ def _rows(known: Known, contender: str, seed: int, metrics: Sequence[str], team:
         nothing = [None] * len(metrics)
         yield contender, seed, TEAM, float("nan"), 0, *nothing, "error", known.error
         return
+    try:
+        rows = rows_of(known.outcome, team)
+    except Exception as error:  # of team=, which is asked for what is stored, too
+        yield from _rows(Known(None, told(error)), contender, seed, metrics, team)
+        return
     measured = [known.outcome.metrics.get(name) for name in metrics]
-    for agent, value, length in rows_of(known.outcome, team):
+    for agent, value, length in rows:
         yield contender, seed, agent, value, length, *measured, "ok", None

@@ -215,13 +215,14 @@ def test_what_json_does_not_know_is_named():
     ant = decision(agent="ant_0")
     parameters = {
         "a": np.arange(2), "b": {1.5}, "c": Farm, "d": {1: {Farm: 2, (3, None): 4}},
-        "e": [np.datetime64("2020-01-01"), np.complex64(1), np.longdouble(1)], "f": np.array([1, 2j], object),
+        "e": [np.datetime64("2020-01-01"), np.complex64(1)], "f": np.array([1, 2j], object), "g": np.longdouble(1),
     }  # fmt: skip
     variant = Variant("odd", lambda **parameters: Farm(), parameters=parameters, points=ant)
     said = json.loads(json.dumps(provenance(variant)))
+    assert isinstance(said["parameters"].pop("g"), (str, float))  # it has no counterpart everywhere
     assert said["parameters"] == {
         "a": [0, 1], "b": ["1.5"], "c": f"{__name__}.Farm", "d": {"1": {f"{__name__}.Farm": 2, "[3, None]": 4}},
-        "e": ["datetime.date(2020, 1, 1)", "(1+0j)", "np.longdouble('1.0')"], "f": [1, "2j"],
+        "e": ["datetime.date(2020, 1, 1)", "(1+0j)"], "f": [1, "2j"],
     }  # fmt: skip
     assert "<lambda>" in said["simulation"]
 

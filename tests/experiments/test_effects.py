@@ -1,6 +1,9 @@
 """What factors do."""
 
+import math
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from simenv_marl import OptionValueError, design, effects, run_experiment, sobol_indices
@@ -19,12 +22,15 @@ class Sum:
         self.y = self.a + 2 * self.b * (1 if self.c == "x" else 3) + self.noise * self.generator.normal()
 
 
-def results(table, store, **arguments):
+def points():
     from tests.worlds.shops import POINTS
 
-    return run_experiment(
-        Sum, table, points=POINTS, metric={"y": lambda s: s.y}, store=store, seeds=[1, 2], **arguments
-    )
+    return POINTS
+
+
+def results(table, store, **arguments):
+    given = {"metric": {"y": lambda s: s.y}, **arguments}
+    return run_experiment(Sum, table, points=points(), store=store, seeds=[1, 2], **given)
 
 
 def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
@@ -52,6 +58,40 @@ def test_many_numbers_are_grouped(tmp_path):
     found.plot()
 
 
+def test_all_that_is_missing_is_one_level(tmp_path):
+    table = pd.DataFrame({"a": [0, 1, 0, 1], "b": 0.0, "c": [1.0, 1.0, math.nan, math.nan]})
+    found = effects(results(table, tmp_path), "y")
+    assert found.main.loc["c"]["count"].tolist() == [4, 4]
+    assert found.main.loc["c"]["mean"].tolist() == [0.5, 0.5]
+    assert found.cells("a", "c").to_numpy().tolist() == [[0, 0], [1, 1]]
+    drawn = found.plot().axes
+    assert [label.get_text() for label in drawn[1].get_xticklabels()] == ["1", "nan"]
+
+
+def test_levels_of_one_factor_are_not_taken_for_those_of_another(tmp_path):
+    table = pd.DataFrame({"flag": [True, False] * 3, "a": [0, 1, 2] * 2, "c": [None, "x", "y"] * 2}, dtype=object)
+    frame = run_experiment(
+        lambda flag, a, c: Sum(a, float(flag)),
+        table,
+        points=points(),
+        metric={"y": lambda s: s.y},
+        seeds=[1],
+        store=tmp_path,
+    )
+    found = effects(frame, "y")
+    assert [[type(level) for level in own] for own in found.levels.values()] == [
+        [bool, bool], [int, int, int], [type(None), str, str]
+    ]  # fmt: skip
+    below = [[label.get_text() for label in axes.get_xticklabels()] for axes in found.plot().axes[:3]]
+    assert below == [["True", "False"], ["0", "1", "2"], ["None", "x", "y"]]
+
+
+def test_names_that_are_long_do_not_run_into_each_other(tmp_path):
+    figure = effects(results(design({"a": (0.0, 1.0), "b": [0.0, 1.0]}, "sobol", 16), tmp_path), "y").plot()
+    slants = [[label.get_rotation() for label in axes.get_xticklabels()] for axes in figure.axes[:2]]
+    assert slants == [[30] * 4, [0] * 2]
+
+
 def test_sobol_indices_are_those_of_the_model(tmp_path):
     frame = results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 512), tmp_path)
     found = sobol_indices(frame, "y")
@@ -70,5 +110,21 @@ def test_what_cannot_be_is_refused(tmp_path):
         effects(frame, "y", contender="x")
     with pytest.raises(OptionValueError, match="what run_experiment has returned"):
         effects(frame[["a"]])
+    for wrong in (None, frame["y"]):
+        with pytest.raises(OptionValueError, match="what run_experiment has returned"):
+            effects(wrong)
+        with pytest.raises(OptionValueError, match="what run_experiment has returned"):
+            sobol_indices(wrong)
+    for look in (effects, sobol_indices):
+        with pytest.raises(OptionValueError, match="confidence must lie between 0 and 1"):
+            look(frame, "y", confidence=95)
+    whole = design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 2)
+    odd = {"text": lambda s: "x", "some": lambda s: s.y if s.a > 0.5 else None}
+    frame = results(whole, tmp_path / "odd", metric=odd)
+    for look in (effects, sobol_indices):
+        with pytest.raises(OptionValueError, match="'text' is a column of other values"):
+            look(frame, "text")
+    with pytest.raises(OptionValueError, match="'some' is missing or not finite"):
+        sobol_indices(frame, "some")
     with pytest.raises(OptionValueError, match="no variance"):
         sobol_indices(results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 2), tmp_path / "b"), "return")

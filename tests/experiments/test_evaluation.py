@@ -187,6 +187,8 @@ def test_the_team_is_asked_for_those_alone_that_have_decided():
     assert frame["return"].tolist()[-1] == 0.5
 
 
+# As joblib closes, loky's thread may find that tasks which it has cancelled are gone.
+@pytest.mark.filterwarnings("ignore:Exception in thread ExecutorManager:pytest.PytestUnhandledThreadExceptionWarning")
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batched": True, "batch_size": 1}], ids=str)
 def test_a_team_that_fails_does_so_at_once(arguments):
     with pytest.raises(KeyError, match="'stranger' has not decided in this episode; keeper, helper has") as caught:
@@ -226,6 +228,18 @@ def test_pairs_are_drawn():
     assert sum(len(line.get_xdata()) == 2 for line in values.lines) == len(SEEDS)
     assert len(differences.collections[0].get_offsets()) == len(SEEDS)
     assert len(evaluate(Shop, CONTENDERS, seeds=[1], points=POINTS).plot().axes) == 1
+
+
+def test_pictures_of_many_contenders_can_be_read():
+    names = [f"the contender of number {number}" for number in range(20)]
+    figure = evaluate(Shop, {name: {} for name in names}, seeds=[1], points=POINTS).plot()
+    (axes,) = figure.axes
+    assert figure.get_figwidth() <= 14
+    assert {label.get_rotation() for label in axes.get_xticklabels()} == {30}
+    assert axes.get_title(loc="left") == "1 seed"
+    (axes,) = evaluate(Shop, {"rule": {}}, seeds=SEEDS, points=POINTS).plot().axes
+    assert axes.get_title(loc="left") == "12 seeds, each a dot"
+    assert {label.get_rotation() for label in axes.get_xticklabels()} == {0}
 
 
 def refused(match, error=OptionValueError, **arguments):

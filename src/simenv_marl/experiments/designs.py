@@ -110,7 +110,7 @@ def design(
     """
     pandas = needed("pandas", "design")
     found = _checked(factors)
-    if method not in METHODS:
+    if method not in list(METHODS):
         raise OptionValueError(f"method must be one of {', '.join(METHODS)}, not {shown(method)}")
     if n is not None and (isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1):
         raise OptionValueError(f"n must be a positive integer, not {shown(n)}")
@@ -145,6 +145,8 @@ def _factor(name: Any, given: Any) -> Factor:
             raise OptionValueError(f"the range of {name!r} is empty: {shown(given)} goes from low to high")
         whole = type(low) is type(high) is int
         return Factor(name, low=low if whole else float(low), high=high if whole else float(high), whole=whole)
+    if isinstance(given, (set, frozenset)):
+        raise OptionValueError(f"the levels of {name!r} must have an order, as in a list: {shown(given)} has none")
     if isinstance(given, (str, bytes, Mapping)) or not isinstance(given, Iterable):
         raise OptionValueError(
             f"the factor {name!r} must be a range (low, high) or a list of levels, not {shown(given)}"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import OptionValueError, shown
 from .extras import needed
 from .playing import TEAM
-from .statistics import interval
+from .statistics import check_confidence, interval, numbers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -37,11 +37,13 @@ class Effects:
         interactions: A row for each pair of factors: ``strength``, the standard deviation of what the means of their
             combinations are apart from the sum of both main effects; the strongest first.
         of: What the value is.
+        levels: Those of each factor, as they are: in an index, 1 and True and 1.0 are the same.
     """
 
     main: DataFrame
     interactions: DataFrame
     of: str
+    levels: dict[str, list[Any]]
     _cells: dict[tuple[str, str], DataFrame]
 
     def cells(self, one: str, other: str) -> DataFrame:
@@ -55,8 +57,7 @@ class Effects:
                 return table
             if pair == (other, one):
                 return table.T
-        names = list(dict.fromkeys(self.main.index.get_level_values("factor")))
-        raise OptionValueError(f"{shown(one)} and {shown(other)} are no two factors of {names}")
+        raise OptionValueError(f"{shown(one)} and {shown(other)} are no two factors of {list(self.levels)}")
 
     def plot(self, *, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
         """Draw the main effects of all factors and, below them, the strongest interactions.
@@ -99,28 +100,30 @@ def effects(
         The effects.
 
     Raises:
-        OptionValueError: There is no such column, contender or agent, or nothing varies.
+        OptionValueError: There is no such column, contender or agent, the values are no numbers, or nothing varies.
     """
     pandas = needed("pandas", "effects")
+    check_confidence(confidence)
     table, factors = _taken(frame, of, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
         factors = [*factors, "contender"]
     levels = {name: _levels(table[name]) for name in factors}
-    levels = {name: own for name, own in levels.items() if own.nunique(dropna=False) > 1}
-    if not levels:
+    found = {name: _in_order(own) for name, own in levels.items()}
+    found = {name: own for name, own in found.items() if len(own) > 1}
+    if not found:
         raise OptionValueError("no factor has more than one level")
-    values = table[of].to_numpy(np.float64)
-    main = {}
-    for name, own in levels.items():
-        for level in _in_order(own):
-            there = values[_at(own, level)]
-            main[name, level] = [there.mean(), *interval(there, confidence), there.mean() - values.mean(), len(there)]
-    index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
-    rows = pandas.DataFrame(list(main.values()), index, columns=["mean", "low", "high", "effect", "count"])
-    cells = {pair: _cells(levels[pair[0]], levels[pair[1]], values) for pair in combinations(levels, 2)}
+    values = numbers(table[of], of).to_numpy()
+    at = {name: [_at(levels[name], level) for level in own] for name, own in found.items()}
+    main = []
+    for there in (values[mask] for masks in at.values() for mask in masks):
+        main.append([there.mean(), *interval(there, confidence), there.mean() - values.mean(), len(there)])
+    pairs = [(name, level) for name, own in found.items() for level in own]
+    index = pandas.MultiIndex.from_tuples(pairs, names=["factor", "level"])
+    rows = pandas.DataFrame(main, index, columns=["mean", "low", "high", "effect", "count"])
+    cells = {pair: _cells(pair, found, at, values) for pair in combinations(found, 2)}
     strengths = [(*pair, _strength(own.to_numpy(np.float64))) for pair, own in cells.items()]
     apart = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(["factor", "other"])
-    return Effects(rows.astype({"count": int}), apart.sort_values("strength", ascending=False), of, cells)
+    return Effects(rows.astype({"count": int}), apart.sort_values("strength", ascending=False), of, found, cells)
 
 
 def _taken(frame: DataFrame, of: str, contender: str | None, agent: str) -> tuple[DataFrame, list[str]]:
@@ -129,7 +132,7 @@ def _taken(frame: DataFrame, of: str, contender: str | None, agent: str) -> tupl
     Raises:
         OptionValueError: There are none.
     """
-    columns = list(frame.columns)
+    columns = list(getattr(frame, "columns", ()))
     if not {"contender", "seed", "agent", "return", "length", "status"} <= set(columns):
         raise OptionValueError("frame must be what run_experiment has returned")
     factors = columns[: columns.index("contender")]
@@ -147,7 +150,7 @@ def _taken(frame: DataFrame, of: str, contender: str | None, agent: str) -> tupl
 
 
 def _levels(column: Any) -> Any:
-    """The levels of a factor; those of many numbers as quarters of them."""
+    """Which level each row has; those of many numbers are quarters of them."""
     pandas = needed("pandas", "effects")
     if column.nunique() > MANY and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
         return pandas.qcut(column, GROUPS, duplicates="drop")
@@ -155,23 +158,28 @@ def _levels(column: Any) -> Any:
 
 
 def _in_order(levels: Any) -> list[Any]:
-    """The levels of a factor: numbers and groups in their order, others as they come."""
-    found = list(levels.cat.categories) if hasattr(levels, "cat") else list(dict.fromkeys(levels.tolist()))
-    return sorted(found) if all(type(level) in (int, float) for level in found) else found
+    """The levels of a factor: numbers and groups in their order, others as they come; one for all that are missing."""
+    found: list[Any] = list(levels.cat.categories) if hasattr(levels, "cat") else list(dict.fromkeys(levels.tolist()))
+    found = [level for level in found if not _is_nan(level)]
+    ordered = sorted(found) if all(type(level) in (int, float) for level in found) else found
+    return [*ordered, *([float("nan")] if any(map(_is_nan, levels.tolist())) else [])]
+
+
+def _is_nan(level: Any) -> bool:
+    return isinstance(level, float) and level != level
 
 
 def _at(levels: Any, level: Any) -> NDArray[np.bool_]:
     """Where a factor has a level."""
-    return np.array([own is level or own == level for own in levels.tolist()], np.bool_)
+    return np.array([own == level or (_is_nan(own) and _is_nan(level)) for own in levels.tolist()], np.bool_)
 
 
-def _cells(one: Any, other: Any, values: NDArray[np.float64]) -> DataFrame:
-    pandas = needed("pandas", "effects")
-    rows, columns = _in_order(one), _in_order(other)
-    down, across = [_at(one, level) for level in rows], [_at(other, level) for level in columns]
-    means = [[values[a & b].mean() if (a & b).any() else np.nan for b in across] for a in down]
-    table: DataFrame = pandas.DataFrame(means, index=pandas.Index(rows, name=one.name))
-    table.columns = pandas.Index(columns, name=other.name)
+def _cells(pair: tuple[str, str], levels: Any, at: Any, values: NDArray[np.float64]) -> DataFrame:
+    """The means in all combinations of two factors."""
+    pandas, (one, other) = needed("pandas", "effects"), pair
+    means = [[values[a & b].mean() if (a & b).any() else np.nan for b in at[other]] for a in at[one]]
+    table: DataFrame = pandas.DataFrame(means, index=pandas.Index(levels[one], name=one))
+    table.columns = pandas.Index(levels[other], name=other)
     return table
 
 
@@ -207,15 +215,18 @@ def sobol_indices(
         part in; by how much they may be off, ``first_error`` and ``total_error``.
 
     Raises:
-        OptionValueError: The design is another one, runs have failed, or the value does not vary.
+        OptionValueError: The design is another one, runs have failed, or the value is no number or does not vary.
         MissingExtraError: SALib is missing.
     """
     pandas, analyze = needed("pandas", "sobol_indices"), needed("SALib.analyze.sobol", "sobol_indices").analyze
+    check_confidence(confidence)
+    table, names = _taken(frame, of, contender, agent)
     if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():
         raise OptionValueError("some runs have failed, and shares of the variance need all rows of the design")
-    table, names = _taken(frame, of, contender, agent)
     seeds = table["seed"].nunique()
-    values, rows = table[of].to_numpy(np.float64), table[names].to_numpy(object)
+    values, rows = numbers(table[of], of).to_numpy(), table[names].to_numpy(object)
+    if not np.isfinite(values).all():
+        raise OptionValueError(f"{of!r} is missing or not finite in some rows, and shares of the variance need all")
     if len(values) % seeds or not _is_saltelli(rows[::seeds]):
         raise OptionValueError("shares of the variance need all rows of design(..., method='saltelli'), in their order")
     means = values.reshape(-1, seeds).mean(axis=1)

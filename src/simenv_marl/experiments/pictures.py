@@ -14,11 +14,27 @@ if TYPE_CHECKING:
 LINES: Final = 200
 """So many seeds at most are drawn as lines."""
 
+WIDEST: Final = 14.0
+"""So many inches at most a figure is wide."""
+
 
 def _bare(axes: Any, *, grid: str) -> None:
     axes.tick_params(labelsize=8, colors=INK, color=PALE)
     axes.grid(axis=grid, color=ABSENT, linewidth=0.7)
     axes.set_axisbelow(True)
+
+
+def _name_below(axes: Any, names: list[str]) -> None:
+    """Write names below; aslant where they would run into each other."""
+    axes.set_xticks(range(len(names)), names)
+    inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
+    if sum(len(name) + 2 for name in names) * LETTER > inches:
+        for label in axes.get_xticklabels():
+            label.set(rotation=30, ha="right", rotation_mode="anchor")
+
+
+LETTER: Final = 0.075
+"""How wide a letter is on average, in inches."""
 
 
 def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: str, figure: Any) -> Any:
@@ -36,7 +52,8 @@ def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: 
     panels = 2 if baseline is not None and others else 1
     with style("plot") as new_figure:
         if figure is None:
-            figure = new_figure(2.2 + 1.1 * len(names) + (1.2 + 1.1 * len(others)) * (panels - 1), 4.2)
+            width = 2.2 + 1.1 * len(names) + (1.2 + 1.1 * len(others)) * (panels - 1)
+            figure = new_figure(min(width, WIDEST), 4.2)
         ratios = [len(names), len(others)][:panels]
         drawn = figure.subplots(1, panels, squeeze=False, width_ratios=ratios)[0]
         _draw_values(drawn[0], values, summary, f"{of} of the team")
@@ -57,11 +74,12 @@ def _draw_values(axes: Any, values: DataFrame, summary: DataFrame, what: str) ->
             np.full(len(numbers), place), numbers[:, place], 14, color=colour, alpha=0.5, linewidths=0, zorder=2
         )
         _mark(axes, place, *summary.loc[name, ["mean", "low", "high"]])
-    axes.set_xticks(places, names)
     axes.set_xlim(-0.5, len(names) - 0.5)
     axes.set_ylabel(what)
-    axes.set_title(f"{len(values)} seeds, each a line")
+    seeds = f"{len(values)} seeds" if len(values) > 1 else "1 seed"
+    axes.set_title(f"{seeds}, each a {'line' if len(names) > 1 else 'dot'}" if len(values) > 1 else seeds)
     _bare(axes, grid="y")
+    _name_below(axes, names)
 
 
 def _draw_differences(axes: Any, values: DataFrame, summary: DataFrame, baseline: str, others: list[str]) -> None:
@@ -74,11 +92,11 @@ def _draw_differences(axes: Any, values: DataFrame, summary: DataFrame, baseline
         colour = COLOURS[names.index(name) % len(COLOURS)]
         axes.scatter(across, apart, 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
         _mark(axes, place, *summary.loc[name, ["difference", "difference_low", "difference_high"]])
-    axes.set_xticks(range(len(others)), others)
     axes.set_xlim(-0.5, len(others) - 0.5)
     axes.set_ylabel(f"more than {baseline}, on the same seed")
     axes.set_title("differences")
     _bare(axes, grid="y")
+    _name_below(axes, others)
 
 
 def _mark(axes: Any, place: float, mean: float, low: float, high: float) -> None:
@@ -100,7 +118,7 @@ def draw_effects(effects: Any, figure: Any) -> Any:
         effects: The effects.
         figure: Where to draw; None: a new figure.
     """
-    factors = list(dict.fromkeys(effects.main.index.get_level_values("factor")))
+    factors = list(effects.levels)
     pairs = [pair for pair, strength in effects.interactions["strength"].items() if strength > 0][:DRAWN]
     columns = max(len(factors), len(pairs))
     with style("plot") as new_figure:
@@ -115,16 +133,16 @@ def draw_effects(effects: Any, figure: Any) -> Any:
             axes.errorbar(
                 range(len(own)), own["mean"], yerr=bars, fmt="o-", color=COLOURS[0], linewidth=1, markersize=4
             )
-            _levels_below(axes, list(own.index), factor)
+            _levels_below(axes, effects.levels[factor], factor)
         rows[0][0].set_ylabel(f"{effects.of}, mean")
         for axes, (one, other) in zip(rows[-1], pairs, strict=False):
             table = effects.cells(one, other)
-            for place, level in enumerate(table.columns):
+            for place, level in enumerate(effects.levels[other]):
                 colour = COLOURS[place % len(COLOURS)]
                 axes.plot(
-                    range(len(table)), table[level].to_numpy(), "o-", color=colour, markersize=4, label=_short(level)
+                    range(len(table)), table.iloc[:, place], "o-", color=colour, markersize=4, label=_short(level)
                 )
-            _levels_below(axes, list(table.index), one)
+            _levels_below(axes, effects.levels[one], one)
             axes.legend(title=other, fontsize=7, title_fontsize=8)
         for axes in [*rows[0][len(factors) :], *(rows[-1][len(pairs) :] if pairs else ())]:
             axes.set_visible(False)
@@ -132,10 +150,10 @@ def draw_effects(effects: Any, figure: Any) -> Any:
 
 
 def _levels_below(axes: Any, levels: list[Any], factor: str) -> None:
-    axes.set_xticks(range(len(levels)), [_short(level) for level in levels])
     axes.set_xlim(-0.4, len(levels) - 0.6)
     axes.set_xlabel(factor)
     _bare(axes, grid="y")
+    _name_below(axes, [_short(level) for level in levels])
 
 
 def _short(level: Any) -> str:

@@ -12,6 +12,7 @@ from scipy import stats
 from simenv_marl import (
     RULE,
     AgentError,
+    ChangedResult,
     MissingExtraError,
     Mixture,
     OptionValueError,
@@ -87,6 +88,16 @@ def test_mixtures_decide_as_policies_of_many(workers):
     assert (values["mixed"] <= values["much"]).all()
     assert values["mixed"].mean() < values["much"].mean() - 2
     refused("of 'keeper' in 'mixed', <Mixture.*batched=True", contenders=contenders)
+
+
+def test_points_and_options_that_can_be_asked_for_once_serve_all_contenders():
+    def twice(shop, _result):
+        return ChangedResult(2 * _result)
+
+    plugins = [(twice, "tests.worlds.shops.Shop.sell", "after")]
+    expected = evaluate(Shop, {"a": {}, "b": {}}, seeds=SEEDS, points=POINTS, plugins=plugins)
+    found = evaluate(Shop, {"a": {}, "b": {}}, seeds=SEEDS, points=POINTS, plugins=iter(plugins))
+    assert found.frame.equals(expected.frame)
 
 
 def test_batched_policies_answer_many():

@@ -20,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simenv_marl import (
+    ChangedResult,
     Mixture,
     OptionValueError,
     RolloutPolicy,
@@ -100,6 +101,32 @@ def test_batched_policies_bring_the_same(arguments, tmp_path):
 )
 def test_whatever_makes_simulations(make, tmp_path):
     assert run(tmp_path / "a", make=make).equals(run(tmp_path / "b"))
+
+
+@pytest.mark.parametrize("arguments", [{}, {"batched": True}, {"batched": True, "batch_size": 2}], ids=str)
+def test_a_run_that_cannot_be_closed_has_failed(arguments, tmp_path):
+    class Stuck(Shop):
+        def close(self):
+            if self.seed % 2:
+                raise OSError("stuck")
+
+    frame = run(tmp_path, {"days": [1]}, make=Stuck, policies=None, **arguments)
+    assert [frame[frame.seed == seed]["status"].tolist() for seed in range(4)] == [["ok"] * 3, ["error"]] * 2
+    assert len(lines(tmp_path)) == 4
+
+
+def test_points_and_options_that_can_be_asked_for_once_serve_all(tmp_path):
+    def twice(shop, _result):
+        return ChangedResult(2 * _result)
+
+    plugins, policies = [(twice, "tests.worlds.shops.Shop.sell", "after")], {"much": {"keeper": much}}
+
+    class Own(Shop):
+        points = POINTS
+
+    expected = run(tmp_path / "a", make=Own, policies=policies, points=[Shop.order], plugins=plugins)
+    again = run(tmp_path / "b", make=Own, policies=policies, points=iter([Shop.order]), plugins=iter(plugins))
+    assert again.equals(expected)
 
 
 def test_points_may_differ_from_row_to_row(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -234,8 +234,9 @@ def evaluate(
     _check(found, baseline, confidence, width, team)
     places = distinct_seeds(seeds)
     check_numbers(batch_size, workers)
-    checked_options(options)
+    options = checked_options(options)
     metrics, size = checked_metrics(metric), int(batch_size) if batched else 0
+    points = list(points) if isinstance(points, Iterator) else points
     common = (simulation, points, options, points_of(found), metrics, size, team)
     plans = _plans(found, *common[:4])  # made here also where the work is done elsewhere, so that errors come before
     if workers:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -168,14 +169,15 @@ def checked_metrics(metric: Any, taken: Sequence[str] = ()) -> dict[str, Callabl
     return metrics
 
 
-def checked_options(options: Mapping[str, Any]) -> None:
-    """Make sure that options do not say who decides, which is for contenders to say.
+def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options that can be used again for each contender.
 
     Raises:
-        OptionValueError: They do.
+        OptionValueError: They say who decides, which is for contenders to say.
     """
     if "policies" in options:
         raise OptionValueError("who decides is said by contenders: there is no option policies here")
+    return {name: list(value) if isinstance(value, Iterator) else value for name, value in options.items()}
 
 
 def points_of(contenders: Mapping[str, Policies]) -> list[Any]:
@@ -347,7 +349,7 @@ def play_many(
     """
     tally = Tally(team)
 
-    def finish(place: int, simulation: Any) -> None:
-        told(place, tally.outcome(place, simulation, metrics))
+    def finish(place: int, simulation: Any) -> Callable[[], None]:
+        return partial(told, place, tally.outcome(place, simulation, metrics))
 
     run(plan, seeds, batch_size, finish, tally)

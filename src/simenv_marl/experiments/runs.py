@@ -126,7 +126,9 @@ def run_experiment(
     table, rows = checked_design(design)
     metrics, size = checked_metrics(metric, list(table.columns)), int(batch_size) if batched else 0
     places = distinct_seeds(seeds)
-    _check(make, rows, batch_size, workers, options, team)
+    _check(make, rows, batch_size, workers, team)
+    options = checked_options(options)
+    points = list(points) if isinstance(points, Iterator) else points
     workshop = (make, contenders, points, options, points_of(contenders))
     folder, keys, factors = _folder(store), [written(row) for row in rows], list(table.columns)
     tried, made_of = _try(Workshop(*workshop), rows, contenders)
@@ -154,9 +156,8 @@ def _run_missing(arguments: Any, missing: list[Run], workers: int, at_once: int,
 # -- what is checked before anything runs ---------------------------------------------------------
 
 
-def _check(make: Any, rows: Any, batch_size: Any, workers: Any, options: Mapping[str, Any], team: Any) -> None:
+def _check(make: Any, rows: Any, batch_size: Any, workers: Any, team: Any) -> None:
     check_numbers(batch_size, workers)
-    checked_options(options)
     checked_team(team)
     for row in rows[:1]:
         checked_make(make, row)

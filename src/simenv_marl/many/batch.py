@@ -257,7 +257,7 @@ def run(
     plan: Plan,
     seeds: Sequence[int],
     size: int,
-    finish: Callable[[int, Any], None],
+    finish: Callable[[int, Any], Callable[[], None] | None],
     watcher: Watcher | None = None,
 ) -> None:
     """Run one simulation per seed, and have their policies answer.
@@ -266,7 +266,8 @@ def run(
         plan: What they are made of, with a ``PolicyKey`` for each policy.
         seeds: What they are reset with.
         size: How many there may be at a time.
-        finish: Called with the place of a seed and its simulation, as soon as that has ended.
+        finish: Called with the place of a seed and its simulation, as soon as that has ended. What it returns is called
+            as soon as that is closed.
         watcher: What is told of rewards and ends; None: agents are not rewarded.
 
     Raises:
@@ -299,7 +300,12 @@ class _Batches:
     """The simulations that are under way."""
 
     def __init__(
-        self, plan: Plan, seeds: Sequence[int], size: int, finish: Callable[[int, Any], None], watcher: Watcher | None
+        self,
+        plan: Plan,
+        seeds: Sequence[int],
+        size: int,
+        finish: Callable[[int, Any], Callable[[], None] | None],
+        watcher: Watcher | None,
     ) -> None:
         self._plan, self._seeds, self._size = plan, seeds, size
         self._finish, self._watcher = finish, watcher
@@ -395,8 +401,10 @@ class _Batches:
         session = self._sessions[place]
         session.end()  # it may have been truncated
         try:
-            self._finish(place, session.simulation)
+            closed = self._finish(place, session.simulation)
             session.close()
+            if closed is not None:
+                closed()
         except BaseException as error:
             annotate(error, f"simenv_marl: after the simulation's end; seed {self._seeds[place]}")
             raise

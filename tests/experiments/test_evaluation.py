@@ -261,9 +261,10 @@ def refused(match, error=OptionValueError, **arguments):
         return Shop()
 
     given = {"contenders": CONTENDERS, "seeds": SEEDS, "points": POINTS, **arguments}
-    with pytest.raises(error, match=match):
+    with pytest.raises(error, match=match) as caught:
         evaluate(factory, given.pop("contenders"), **given)
     assert len(made) <= len(given["points"])  # looked at, and not run
+    return caught.value
 
 
 @pytest.mark.parametrize(
@@ -294,7 +295,8 @@ def test_what_cannot_be_is_refused_before_anything_runs(match, arguments):
 
 
 def test_a_policy_of_an_unknown_agent_is_refused():
-    refused("stranger", UnknownPointError, contenders={"rule": {}, "a": {"stranger": much}})
+    caught = refused("stranger", UnknownPointError, contenders={"rule": {}, "a": {"stranger": much}})
+    assert "of the contender 'a'" in notes(caught)
 
 
 def test_an_agent_must_not_be_called_team():

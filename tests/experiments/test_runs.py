@@ -1,5 +1,6 @@
 """Every row of a design, every contender, every seed: stored as it is run, and resumed."""
 
+import asyncio
 import errno
 import json
 import math
@@ -33,6 +34,7 @@ from simenv_marl import (
 )
 from simenv_marl.experiments import store as stores
 from simenv_marl.experiments.playing import Outcome
+from tests.worlds.models import notes
 from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
 DESIGN = pd.DataFrame({"days": [1, 3, 2], "price": [0.5, 1.0, 2.0], "kind": ["plain", "faulty", "plain"]})
@@ -113,6 +115,33 @@ def test_a_run_that_cannot_be_closed_has_failed(arguments, tmp_path):
     frame = run(tmp_path, {"days": [1]}, make=Stuck, policies=None, **arguments)
     assert [frame[frame.seed == seed]["status"].tolist() for seed in range(4)] == [["ok"] * 3, ["error"]] * 2
     assert len(lines(tmp_path)) == 4
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError, MemoryError])
+def test_whatever_ends_a_run_is_an_error_of_that_run(error, batched, tmp_path):
+    class Ending(Shop):
+        def run(self):
+            super().run()
+            if self.seed == 1:
+                raise error("enough")
+
+    frame = run(tmp_path, {"days": [1]}, make=Ending, policies=None, batched=batched)
+    assert frame["status"].tolist() == ["ok"] * 3 + ["error"] + ["ok"] * 6
+    assert frame["error"][3] == f"{error.__name__}: enough"
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_an_interrupt_ends_the_experiment(batched, tmp_path):
+    class Interrupted(Shop):
+        def run(self):
+            if self.seed == 2:
+                raise KeyboardInterrupt
+            super().run()
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, {"days": [1]}, make=Interrupted, policies=None, batched=batched, batch_size=1)
+    assert [line["seed"] for line in lines(tmp_path)] == [0, 1]
 
 
 def test_points_and_options_that_can_be_asked_for_once_serve_all(tmp_path):
@@ -370,6 +399,12 @@ def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, t
     assert not (tmp_path / "store").exists()
 
 
+def test_a_policy_that_cannot_be_is_told_with_its_contender(tmp_path):
+    with pytest.raises(UnknownPointError, match="stranger") as caught:
+        run(tmp_path, policies={"good": {"keeper": much}, "bad": {"stranger": much}})
+    assert "of the contender 'bad'" in notes(caught.value)
+
+
 def test_a_store_of_another_experiment_is_refused(tmp_path):
     run(tmp_path)
     with pytest.raises(OptionValueError, match="its factors are"):
@@ -466,8 +501,9 @@ def test_a_full_disk_is_told_and_what_is_stored_stays(tmp_path, monkeypatch):
 
 def test_a_store_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError):
-        run(tmp_path / "file")
+    for store in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(StoreError, match="cannot be made or read as the folder of an experiment"):
+            run(store)
     with pytest.raises(OptionValueError, match="store must be the path of a folder, not None"):
         run(None)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.plan import Plan
 from ..core.processes import pack
-from ..errors import OptionValueError, annotate, shown
+from ..errors import OptionValueError, shown
 from ..many.collect import check_numbers, checked_seeds
 from ..many.spread import progress_bar, spread
 from .extras import needed
@@ -31,6 +31,7 @@ from .playing import (
     play_many,
     points_of,
     team_value,
+    telling,
 )
 from .statistics import check_confidence, check_number, improvement, interval, numbers, seeds_needed
 
@@ -246,14 +247,11 @@ def evaluate(
         while done < len(places):
             lot = places[done : _next(done, len(places), width)]
             for name, known in outcomes.items():
-                try:
+                with telling(name):
                     if workers:
                         known += _spread(({name: found[name]}, *common), lot, int(workers), size)
                     else:
                         known += _play(plans[name], lot, metrics, size, team)
-                except BaseException as error:
-                    annotate(error, f"simenv_marl: of the contender {name!r}")
-                    raise
                 if bar is not None:
                     bar.update(len(lot))
             done += len(lot)
@@ -281,7 +279,11 @@ def _widest(outcomes: Mapping[str, Sequence[Outcome]], team: Any, baseline: str 
 def _plans(
     contenders: Mapping[str, Policies], simulation: Any, points: Any, options: Mapping[str, Any], named: Sequence[Any]
 ) -> dict[str, Plan]:
-    return {name: contender_plan(simulation, policies, points, options, named) for name, policies in contenders.items()}
+    plans = {}
+    for name, policies in contenders.items():
+        with telling(name):
+            plans[name] = contender_plan(simulation, policies, points, options, named)
+    return plans
 
 
 def _spread(arguments: tuple[Any, ...], seeds: list[int], workers: int, size: int) -> list[Outcome]:

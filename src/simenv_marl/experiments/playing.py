@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -184,6 +184,16 @@ def points_of(contenders: Mapping[str, Policies]) -> list[Any]:
     """The decision points that contenders name."""
     keys = [key for policies in contenders.values() for key in policies]
     return list(dict.fromkeys(key for key in keys if not isinstance(key, str) or "." in key))
+
+
+@contextmanager
+def telling(contender: str) -> Iterator[None]:
+    """Have errors say of which contender they are."""
+    try:
+        yield
+    except BaseException as error:
+        annotate(error, f"simenv_marl: of the contender {contender!r}")
+        raise
 
 
 def contender_plan(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -328,10 +329,18 @@ def _do_one(workshop: Workshop, run: Run, metrics: Metrics, size: int, writer: W
             play_many(plan, [run.seed], 1, metrics, keep)
         else:
             keep(0, play(plan, run.seed, metrics))
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
+        if not _is_failure(error):
+            raise
         known, trace = Known(None, told(error)), "".join(traceback.format_exception(error))[-LONGEST_TRACE:]
         workshop.forget()
     writer.write(line_of(run.row, run.contender, run.seed, known, provenance(run.seed), trace))
+
+
+def _is_failure(error: BaseException) -> bool:
+    """Whether an error is one of the run, and not what stops this process."""
+    cancelled = getattr(sys.modules.get("asyncio"), "CancelledError", SystemExit)  # of a task of the model's own
+    return isinstance(error, (Exception, SystemExit, cancelled))
 
 
 def _unknown(seed: int) -> str:
@@ -355,8 +364,10 @@ def _do_many(
         play_many(plan, [run.seed for run in runs], size, metrics, keep)
     except StoreError:
         raise
-    except (Exception, SystemExit):  # whose it is will be seen when they are run one by one
-        workshop.forget()
+    except BaseException as error:
+        if not _is_failure(error):
+            raise
+        workshop.forget()  # whose it is will be seen when they are run one by one
     return list(left.values())
 
 

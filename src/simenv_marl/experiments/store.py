@@ -142,7 +142,8 @@ def prepare(store: Path, factors: Sequence[str], metrics: Sequence[str]) -> None
                 fresh.unlink(missing_ok=True)
         found = json.loads(header.read_text(encoding="ascii"))
     except OSError as error:
-        raise _unwritable(store, error) from error
+        reason = error.strerror or str(error)
+        raise StoreError(f"{store} cannot be made or read as the folder of an experiment: {reason}") from error
     except ValueError as error:
         if isinstance(error, OptionValueError):
             raise

@@ -14,7 +14,7 @@ from ..core.plan import Plan
 from ..core.provenance import describe, written_plainly
 from ..core.variant import Variant
 from ..errors import OptionValueError, shown
-from .playing import Policies, contender_plan
+from .playing import Policies, contender_plan, telling
 from .store import written
 
 Row = Mapping[str, Any]
@@ -131,7 +131,8 @@ class Workshop:
 
     def _draw(self, drawn: list[_Drawn], source: Any, variant: Variant | None, contender: str) -> tuple[Plan, str]:
         policies = self._contenders[contender]
-        plan = contender_plan(source, policies, self._points, self._options, self._named)
+        with telling(contender):
+            plan = contender_plan(source, policies, self._points, self._options, self._named)
         own = {} if variant is None else variant.policies
         described = describe(plan, None) | {
             "make": _name_of(self._make),

@@ -4,6 +4,7 @@ import builtins
 import subprocess
 import sys
 import threading
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from simenv_marl import (
     make_step,
     simulate,
 )
+from simenv_marl.experiments.statistics import interval, seeds_needed
 from tests.worlds.models import notes
 from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
@@ -139,6 +141,25 @@ def test_wider_intervals_are_surer():
     assert widths[0] < widths[1]
 
 
+def test_intervals_are_those_of_scipy():
+    values = np.random.default_rng(3).exponential(size=40)
+    expected = stats.bootstrap((values,), np.mean, n_resamples=5000, rng=np.random.default_rng(0)).confidence_interval
+    assert interval(values, 0.95) == interval(values, 0.95) == tuple(expected)
+    assert interval(np.array([1.0, 1.0]), 0.95) == (1, 1)
+    assert np.isnan(interval(np.array([1.0, np.nan]), 0.95)).all()
+
+
+def test_intervals_of_very_many_seeds_take_little_memory():
+    values = np.random.default_rng(3).normal(size=40_000)
+    tracemalloc.start()
+    try:
+        low, high = interval(values, 0.95)
+        assert tracemalloc.get_traced_memory()[1] < 200e6
+    finally:
+        tracemalloc.stop()
+    assert [low, high] == pytest.approx(values.mean() + np.array([-1.96, 1.96]) / 200, abs=3e-4)
+
+
 def test_the_probability_of_improvement_counts_ties_half():
     found = evaluate(Shop, {"a": {}, "same": {}, "much": {"keeper": much}}, seeds=SEEDS, points=POINTS, baseline="a")
     assert found.improvement()["probability"].to_dict() == {"same": 0.5, "much": 1.0}
@@ -159,8 +180,6 @@ def test_how_many_seeds_would_tell_a_difference():
 
 
 def test_the_number_of_seeds_is_that_of_the_t_test():
-    from simenv_marl.experiments.statistics import seeds_needed
-
     apart = np.random.default_rng(0).normal(size=200)
     number = seeds_needed(apart / apart.std(ddof=1), 0.5, 0.95, 0.8)
     assert number == pytest.approx(34, abs=1)  # as tables of power have it

@@ -508,6 +508,14 @@ def test_a_store_that_cannot_be_written_is_told(tmp_path):
         run(None)
 
 
+def test_a_store_is_where_its_user_is(tmp_path, monkeypatch):
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)  # where workers that were started before are not
+        run("store", DESIGN[:1], workers=2)
+        assert len(lines(tmp_path / name / "store")) == 12
+
+
 def test_threads_that_work_for_an_experiment_have_files_of_their_own(tmp_path):
     with joblib.parallel_config(backend="threading"):
         frame = run(tmp_path / "shared", workers=2, make=lambda **row: Shop(**row | {"kind": "slow"}))

@@ -211,7 +211,7 @@ def _plain(name: str, value: Any) -> Any:
 
 def _folder(store: Any) -> Path:
     try:
-        return Path(store)
+        return Path(store).absolute()  # other processes may be in other folders
     except TypeError as error:
         raise OptionValueError(f"store must be the path of a folder, not {shown(store)}") from error
 

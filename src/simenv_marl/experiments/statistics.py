@@ -15,6 +15,12 @@ from .extras import needed
 RESAMPLES: Final = 5_000
 """How often values are drawn anew for an interval; always the same ones, so that it is always the same interval."""
 
+CORRECTED: Final = 10_000
+"""Of up to so many values: the correction takes as many means as there are values, and of more it corrects nothing."""
+
+AT_ONCE: Final = 4_000_000
+"""So many values are drawn at once."""
+
 MOST_SEEDS: Final = 10_000_000
 """A difference that needs more seeds than these is as good as none."""
 
@@ -57,7 +63,7 @@ def numbers(values: Any, of: str) -> Any:
 
 
 def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:
-    """A confidence interval of the mean, by SciPy's bootstrap (bias-corrected and accelerated).
+    """A confidence interval of the mean, by SciPy's bootstrap (bias-corrected and accelerated, unless of very many).
 
     Args:
         values: ``(n,)``, one for each seed.
@@ -72,11 +78,12 @@ def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, flo
         return nan, nan
     if (values == values[0]).all():
         return float(values[0]), float(values[0])
-    for method in ("BCa", "percentile"):
+    batch = max(1, min(500, AT_ONCE // len(values)))
+    for method in ("BCa", "percentile")[len(values) > CORRECTED :]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of degenerate samples, for which there is the other method
             found = stats.bootstrap(
-                (values,), np.mean, confidence_level=confidence, n_resamples=RESAMPLES, batch=500, method=method,
+                (values,), np.mean, confidence_level=confidence, n_resamples=RESAMPLES, batch=batch, method=method,
                 vectorized=True, rng=np.random.default_rng(0),
             ).confidence_interval  # fmt: skip
         low, high = float(found.low), float(found.high)

@@ -586,6 +586,51 @@ def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_pa
         assert len(keys) == len(set(keys))
 
 
+NAMED = """
+    import sys, numpy as np
+    from gymnasium import spaces
+    from simenv_marl import evaluate, make_step, run_experiment
+
+    class Sum:
+        def __init__(self, a=1):
+            self.a = a
+        def reset(self, seed):
+            self.y = seed
+        def run(self):
+            self.y += self.a * self.decide()
+        def decide(self):
+            return 1
+
+    decided = make_step(
+        observation_space=spaces.Box(0, 99, (1,)), observation_space_mapping=lambda model: [model.y], agent="a",
+        action_space=spaces.Discrete(9), action_space_mapping=int, reward_mapping=lambda model: model.y,
+    )
+
+    class Own(Sum):
+        points = {"__main__.Sum.decide": decided}
+
+    if __name__ == "__main__":
+        given = {"seeds": [5, 6], "workers": int(sys.argv[2])}
+        for make, points in ((Sum, {"__main__.Sum.decide": decided}), (Own, None)):
+            for key in ("a", "__main__.Sum.decide"):
+                contenders = {"four": {key: lambda observation: 4}}
+                print(evaluate(make, contenders, points=points, **given).values()["four"].tolist())
+                frame = run_experiment(make, {"a": [1, 2]}, policies=contenders, points=points,
+                                       store=f"{sys.argv[1]}/{make.__name__}-{key}", **given)
+                print(frame[frame["agent"] == "team"]["return"].tolist())
+"""
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_what_a_script_names_is_found_in_its_workers(workers, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(textwrap.dedent(NAMED), encoding="utf-8")
+    command = [sys.executable, script, tmp_path, str(workers)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    expected = ["[9.0, 10.0]", "[6.0, 7.0, 9.0, 10.0, 7.0, 8.0, 13.0, 14.0]"] * 4
+    assert done.stdout.splitlines() == expected, done.stderr
+
+
 PURE = """
     import sys, pandas as pd
     from simenv_marl import run_experiment
@@ -606,6 +651,8 @@ PURE = """
 def test_models_that_decide_nothing_have_metrics(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(textwrap.dedent(PURE), encoding="utf-8")
-    done = subprocess.run([sys.executable, script, tmp_path / "s"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, script, tmp_path / "s"], capture_output=True, text=True, check=True, timeout=120
+    )
     expected = [[a, seed, "team", 0.0, a + seed] for a in (1, 2) for seed in (5, 6)]
     assert done.stdout.strip() == str(expected)

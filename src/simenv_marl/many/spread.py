@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from math import ceil
-from typing import Any
+from types import FunctionType
+from typing import Any, Final
 
 from ..core.processes import pack, pack_error, unpack, unpack_error
 from .extras import needed
@@ -56,7 +59,7 @@ def spread(
     processes = max(1, joblib.effective_n_jobs(workers))
     size = max(1, ceil(len(seeds) / (share * processes)), min(least, ceil(len(seeds) / processes)))
     parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]
-    parcel = pack((work, arguments))
+    parcel = packed_with_names((work, arguments))
     try:
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
     except ValueError:  # this backend tells nothing before everything is done
@@ -69,6 +72,35 @@ def spread(
             if failed:
                 raise unpack_error(result)
             yield len(part), unpack(result)
+
+
+def packed_with_names(thing: Any) -> bytes:
+    """Pack something for workers, with what is told of in it by a dotted name that only this process's script has.
+
+    Raises:
+        Exception: What pickling it raises.
+    """
+    parcel, main = pack((thing, {})), sys.modules["__main__"]
+    named = {name.decode(): getattr(main, name.decode(), None) for name in set(_IN_SCRIPT.findall(parcel))}
+    named = {name: found for name, found in named.items() if isinstance(found, (type, FunctionType))}
+    return pack((thing, named)) if named else parcel
+
+
+_IN_SCRIPT: Final = re.compile(rb"__main__\.([A-Za-z_]\w*)")
+
+_lent: Final[set[str]] = set()
+"""What stands in this process's main module, and was put there for names that come from another one."""
+
+
+def _unpacked(parcel: bytes) -> Any:
+    """In a worker: what was packed. What it names stands in the main module from now on."""
+    thing, named = unpack(parcel)
+    main = sys.modules["__main__"]
+    for name, found in named.items():
+        if name in _lent or not hasattr(main, name):
+            setattr(main, name, found)
+            _lent.add(name)
+    return thing
 
 
 @contextmanager
@@ -92,7 +124,7 @@ def _work(parcel: bytes, seeds: list[Any]) -> tuple[bool, bytes]:
         on each in its own guise.
     """
     try:
-        work, arguments = unpack(parcel)
+        work, arguments = _unpacked(parcel)
         return False, pack(work(*arguments, seeds))
     except KeyboardInterrupt:
         raise

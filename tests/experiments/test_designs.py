@@ -41,8 +41,8 @@ def test_values_are_of_the_factors_and_designs_are_repeatable(factors, method, n
         table = design(factors, method, chosen, seed=seed)
     except OptionValueError:
         few = any(isinstance(given, list) and len(given) != 2 for given in factors.values())
-        ranges = all(isinstance(given, tuple) for given in factors.values())
-        assert (method in TWO_LEVELS and few) or (method == "central_composite" and not (ranges and len(factors) > 1))
+        ranges = sum(isinstance(given, tuple) for given in factors.values())
+        assert (method in TWO_LEVELS and few) or (method == "central_composite" and ranges < 2)
         return
     assert list(table.columns) == list(factors)
     for name, given_ in factors.items():
@@ -115,6 +115,26 @@ def test_a_central_composite_design_stays_within_its_ranges():
     assert not table.duplicated().any()
 
 
+def test_a_central_composite_design_is_there_for_each_combination_of_levels():
+    alone = design({"a": (0.0, 2.0), "b": (-4.0, 4.0)}, "central_composite")
+    table = design(
+        {"k": ["x", "y", "z"], "a": (0.0, 2.0), "c": [1, 2], "b": (-4.0, 4.0), "d": ["w"]}, "central_composite"
+    )
+    assert len(table) == 9 * 6
+    groups = table.groupby(["k", "c", "d"], sort=False)
+    assert list(groups.groups) == [(k, c, "w") for k in "xyz" for c in (1, 2)]
+    for _, group in groups:
+        assert group[["a", "b"]].reset_index(drop=True).equals(alone)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_methods_take_factors_of_all_kinds(method):
+    factors = {"f": (0.0, 1.0), "i": (1, 9), "s": ["a", "b"], "b": [True, False]}
+    table = design(factors, method, 4 if method in (*SIZED, "saltelli") else None)
+    assert [dtype.kind for dtype in table.dtypes[["f", "i", "b"]]] == ["f", "i", "b"]
+    assert all(allowed(value, given_) for name, given_ in factors.items() for value in values(table, name))
+
+
 @pytest.mark.parametrize(
     ("match", "arguments"),
     [
@@ -141,8 +161,11 @@ def test_a_central_composite_design_stays_within_its_ranges():
         ("two levels", ({"a": [1, 2, 3], "b": (0, 1)}, "fractional_factorial")),
         ("two levels", ({"a": [1, 2, 3], "b": (0, 1)}, "plackett_burman")),
         ("has 4 runs", ({"a": (0, 1)}, "plackett_burman", 8)),
-        ("one of ranges", ({"a": [1, 2], "b": (0, 1)}, "central_composite")),
-        ("two factors", ({"a": (0, 1)}, "central_composite")),
+        ("two ranges", ({"a": [1, 2], "b": (0, 1)}, "central_composite")),
+        ("two ranges", ({"a": (0, 1)}, "central_composite")),
+        ("has 18 runs, not 9", ({"a": (0, 1), "b": (0, 1), "c": ["x", "y"]}, "central_composite", 9)),
+        ("more than 10,000,000", ({f"x{i}": (0, 1) for i in range(30)}, "central_composite")),
+        ("more than 10,000,000", ({"a": (0, 1), "b": (0, 1)}, "saltelli", 2**22)),
         ("power of two", ({"a": (0, 1)}, "saltelli", 3)),
         ("more than 10,000,000", ({f"x{i}": list(range(100)) for i in range(4)},)),
     ],

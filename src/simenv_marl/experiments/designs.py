@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil, floor, isfinite
+from math import ceil, floor, isfinite, prod
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Final
 
@@ -92,7 +92,8 @@ def design(
             - ``"fractional_factorial"``: of two levels each, a fraction in ``n`` runs, a power of two (as many as main
               effects need), with as little mixed as can be;
             - ``"plackett_burman"``: of two levels each, main effects in a multiple of four runs;
-            - ``"central_composite"``: ranges, for a quadratic surface: corners, a star and the middle, all within;
+            - ``"central_composite"``: two ranges or more, for a quadratic surface: corners, a star and the middle, all
+              within; once for each combination of levels;
             - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space;
             - ``"one_at_a_time"``: the middle of ranges and the first of levels, and then each factor by itself at its
               other values, of a range ``n`` (2) from bound to bound;
@@ -187,13 +188,7 @@ def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Colu
     if n == 1:
         raise OptionValueError("a full factorial design has n values of each range, at least 2")
     steps = [factor.steps(n or 2) for factor in factors]
-    rows = 1
-    for own in steps:
-        rows *= len(own)
-    if rows > MOST_ROWS:
-        raise OptionValueError(
-            f"all combinations are {rows:,} rows, more than {MOST_ROWS:,}; another method needs fewer"
-        )
+    _checked_rows(prod(map(len, steps)))
     places = needed("pydoe", "design").fullfact([len(own) for own in reversed(steps)])[:, ::-1].astype(int)
     return [[own[place] for place in column] for own, column in zip(steps, places.T.tolist(), strict=True)]
 
@@ -273,18 +268,26 @@ def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Col
 
 def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     pydoe = needed("pydoe", "design")
-    for factor in factors:
-        if factor.levels is not None:
-            raise OptionValueError(
-                f"a central composite design is one of ranges (low, high); {factor.name!r} has levels"
-            )
-    if len(factors) < 2:
-        raise OptionValueError("a central composite design is one of two factors at least")
+    ranges = [factor for factor in factors if factor.levels is None]
+    if len(ranges) < 2:
+        raise OptionValueError(
+            f"a central composite design is one of two ranges (low, high) at least, not {len(ranges)}"
+        )
+    number = 2 ** len(ranges) + 2 * len(ranges) + 1
+    sizes = [len(factor.levels or "-") for factor in factors]  # it is there once for each combination of levels
+    rows = _checked_rows(number * prod(sizes))
+    if n is not None and n != rows:
+        raise OptionValueError(f"a central composite design of these {len(factors)} factors has {rows} runs, not {n}")
     # The middle is there once: a simulation with the same seed would bring the same.
-    matrix = pydoe.ccdesign(len(factors), center=(0, 1), alpha="rotatable", face="inscribed")
-    if n is not None and n != len(matrix):
-        raise OptionValueError(f"a central composite design of {len(factors)} factors has {len(matrix)} runs, not {n}")
-    return [factor.placed((column + 1) / 2) for factor, column in zip(factors, matrix.T, strict=True)]
+    matrix = iter(pydoe.ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T)
+    columns: Columns = []
+    for place, factor in enumerate(factors):
+        if factor.levels is None:
+            columns.append(factor.placed((next(matrix) + 1) / 2) * (rows // number))
+        else:
+            each = [level for level in factor.levels for _ in range(number * prod(sizes[place + 1 :]))]
+            columns.append(each * prod(sizes[:place]))
+    return columns
 
 
 def _latin_hypercube(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
@@ -306,6 +309,7 @@ def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     rows, names = _rows(n), [factor.name for factor in factors]
     if rows & (rows - 1):
         raise OptionValueError(f"a Saltelli design has a power of two of samples, not {rows}")
+    _checked_rows(rows * (2 * len(names) + 2))
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     return _spread(factors, needed("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
 
@@ -325,9 +329,15 @@ def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Colum
 def _rows(n: int | None) -> int:
     if n is None:
         raise OptionValueError("this method needs n, the number of rows")
-    if n > MOST_ROWS:
-        raise OptionValueError(f"n={n:,} is more than {MOST_ROWS:,}")
-    return n
+    return _checked_rows(n)
+
+
+def _checked_rows(rows: int) -> int:
+    if rows > MOST_ROWS:
+        raise OptionValueError(
+            f"the design would have {rows:,} rows, more than {MOST_ROWS:,}; another method or n needs fewer"
+        )
+    return rows
 
 
 def _spread(factors: Sequence[Factor], points: Any) -> Columns:

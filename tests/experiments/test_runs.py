@@ -448,7 +448,7 @@ def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch)
 @pytest.mark.parametrize(
     ("told", "arguments"),
     [
-        (r'options {} then, {"max_steps":2} now', {"max_steps": 2}),
+        (r'options {} then, {"max_steps": 2} now', {"max_steps": 2}),
         (r"'much' .*policies .*shops.much.* then, .*shops.some", {"policies": {"much": {"keeper": some}}}),
         (r"make .*Shop.* then, .*Other.* now", {"make": type("Other", (Shop,), {})}),
         (r"plugins \[\] then", {"plugins": [(lambda shop: None, "tests.worlds.shops.Shop.sell", "before")]}),
@@ -459,6 +459,10 @@ def test_what_was_made_otherwise_is_warned_of(told, arguments, tmp_path):
     first = run(tmp_path, policies={"much": {"keeper": much}})
     with pytest.warns(UserWarning, match=told):
         assert run(tmp_path, **{"policies": {"much": {"keeper": much}}} | arguments).equals(first)
+    more = pd.concat([DESIGN[:1].assign(days=7), DESIGN])  # of whose first row nothing is stored
+    with pytest.warns(UserWarning, match=told):
+        frame = run(tmp_path, more, **{"policies": {"much": {"keeper": much}}} | arguments)
+    assert frame[frame["days"] != 7].reset_index(drop=True).equals(first)
 
 
 def test_what_was_made_alike_is_not_warned_of(tmp_path):
@@ -468,7 +472,8 @@ def test_what_was_made_alike_is_not_warned_of(tmp_path):
 
     first = run(tmp_path, policies={"a": {"keeper": Policy()}}, driver="thread")
     kept = [Policy() for _ in range(3)]
-    assert run(tmp_path, policies={"a": {"keeper": kept[-1]}}, driver="greenlet").equals(first)
+    turned = dict(reversed(POINTS.items()))
+    assert run(tmp_path, policies={"a": {"keeper": kept[-1]}}, points=turned, driver="greenlet").equals(first)
 
 
 def test_another_version_of_a_package_is_warned_of(tmp_path):

@@ -132,14 +132,18 @@ def run_experiment(
     points = list(points) if isinstance(points, Iterator) else points
     workshop = (make, contenders, points, options, points_of(contenders))
     folder, keys, factors = _folder(store), [written(row) for row in rows], list(table.columns)
-    tried, made_of = _try(Workshop(*workshop), rows, contenders)
+    tried = _try(Workshop(*workshop), rows, contenders)
     arguments = (*workshop, metrics, size, folder, new_session())
     if workers:
         pack(arguments)  # what cannot be sent to other processes is found out before
     prepare(folder, factors, list(metrics))
-    stored = read(folder, factors, tried)
+    stored = read(folder, factors, tried[0])
     compare(folder, stored, keys)
-    warn_of_changes(folder, stored, made_of)
+    if tried[0] not in stored.rows:  # so that what is there is compared with what it would be now
+        known = [row for row, key in zip(rows, keys, strict=True) if key in stored.rows]
+        tried = _try(Workshop(*workshop), known, contenders)
+        stored = read(folder, factors, tried[0]) if known else stored
+    warn_of_changes(folder, stored, tried[1])
     missing = list(_missing(rows, keys, contenders, places, stored, retry=retry_errors))
     total = len(set(keys)) * len(contenders) * len(places) if progress else None
     _run_missing(arguments, missing, int(workers), len(places) if batched else 1, total)

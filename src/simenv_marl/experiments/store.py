@@ -333,4 +333,4 @@ def _parts_of(made: Mapping[str, Any]) -> dict[str, str]:
     """What a run is made of that changes what comes of it, as text; without addresses in memory."""
     options = {name: value for name, value in (made.get("options") or {}).items() if name != "driver"}
     known = {**made, "options": options}
-    return {part: ADDRESS.sub("", written(known[part])) for part in MADE_OF if part in known}
+    return {part: ADDRESS.sub("", json.dumps(known[part], sort_keys=True)) for part in MADE_OF if part in known}

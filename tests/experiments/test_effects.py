@@ -92,6 +92,19 @@ def test_names_that_are_long_do_not_run_into_each_other(tmp_path):
     assert slants == [[30] * 4, [0] * 2]
 
 
+def test_many_factors_are_drawn_in_rows(tmp_path):
+    class Total(Sum):
+        def __init__(self, **factors):
+            super().__init__(sum(factors.values()), 0)
+
+    table = design({f"x{place}": [0, 1] for place in range(7)}, "plackett_burman")
+    frame = run_experiment(Total, table, points=points(), metric={"y": lambda s: s.y}, seeds=[1], store=tmp_path)
+    figure = effects(frame, "y").plot()
+    drawn = [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
+    assert drawn[:7] == list(table.columns)
+    assert figure.get_figwidth() < 14
+
+
 def test_sobol_indices_are_those_of_the_model(tmp_path):
     frame = results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 512), tmp_path)
     found = sobol_indices(frame, "y")

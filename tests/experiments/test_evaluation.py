@@ -269,6 +269,8 @@ def test_pictures_of_many_contenders_can_be_read():
     assert axes.get_title(loc="left") == "1 seed"
     (axes,) = evaluate(Shop, {"rule": {}}, seeds=SEEDS, points=POINTS).plot().axes
     assert axes.get_title(loc="left") == "12 seeds, each a dot"
+    axes = evaluate(Shop, CONTENDERS, seeds=range(201), points=POINTS, metric=level).plot("metric").axes[0]
+    assert (axes.get_title(loc="left"), axes.get_ylabel()) == ("201 seeds, 200 of them as lines", "metric")
     assert {label.get_rotation() for label in axes.get_xticklabels()} == {0}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -56,7 +57,7 @@ def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: 
             figure = new_figure(min(width, WIDEST), 4.2)
         ratios = [len(names), len(others)][:panels]
         drawn = figure.subplots(1, panels, squeeze=False, width_ratios=ratios)[0]
-        _draw_values(drawn[0], values, summary, f"{of} of the team")
+        _draw_values(drawn[0], values, summary, f"{of} of the team" if of in ("return", "length") else of)
         if panels == 2:
             _draw_differences(drawn[1], values, summary, str(baseline), others)
     return figure
@@ -76,8 +77,8 @@ def _draw_values(axes: Any, values: DataFrame, summary: DataFrame, what: str) ->
         _mark(axes, place, *summary.loc[name, ["mean", "low", "high"]])
     axes.set_xlim(-0.5, len(names) - 0.5)
     axes.set_ylabel(what)
-    seeds = f"{len(values)} seeds" if len(values) > 1 else "1 seed"
-    axes.set_title(f"{seeds}, each a {'line' if len(names) > 1 else 'dot'}" if len(values) > 1 else seeds)
+    each = "each a dot" if len(names) == 1 else "each a line" if len(values) <= LINES else f"{LINES} of them as lines"
+    axes.set_title(f"{len(values)} seeds, {each}" if len(values) > 1 else "1 seed")
     _bare(axes, grid="y")
     _name_below(axes, names)
 
@@ -110,9 +111,12 @@ def _mark(axes: Any, place: float, mean: float, low: float, high: float) -> None
 DRAWN: Final = 4
 """So many interactions at most are drawn."""
 
+ABREAST: Final = 5
+"""So many factors at most are drawn side by side."""
+
 
 def draw_effects(effects: Any, figure: Any) -> Any:
-    """Draw main effects in a row and, below them, the strongest interactions.
+    """Draw main effects in rows and, below them, the strongest interactions.
 
     Args:
         effects: The effects.
@@ -120,21 +124,24 @@ def draw_effects(effects: Any, figure: Any) -> Any:
     """
     factors = list(effects.levels)
     pairs = [pair for pair, strength in effects.interactions["strength"].items() if strength > 0][:DRAWN]
-    columns = max(len(factors), len(pairs))
+    columns = min(max(len(factors), len(pairs)), ABREAST)
+    above = ceil(len(factors) / columns)
     with style("plot") as new_figure:
         if figure is None:
-            figure = new_figure(max(3.2, 2.3 * columns), 2.8 * (2 if pairs else 1))
-        rows = figure.subplots(2 if pairs else 1, columns, squeeze=False)
-        for axes in rows[0][1 : len(factors)]:
-            axes.sharey(rows[0][0])
-        for axes, factor in zip(rows[0], factors, strict=False):
+            figure = new_figure(max(3.2, 2.3 * columns), 2.8 * (above + bool(pairs)))
+        rows = figure.subplots(above + bool(pairs), columns, squeeze=False)
+        main = rows[:above].ravel()
+        for axes, factor in zip(main, factors, strict=False):
+            if axes is not main[0]:
+                axes.sharey(main[0])
             own = effects.main.loc[factor]
             bars = [(own["mean"] - own["low"]).clip(lower=0), (own["high"] - own["mean"]).clip(lower=0)]
             axes.errorbar(
                 range(len(own)), own["mean"], yerr=bars, fmt="o-", color=COLOURS[0], linewidth=1, markersize=4
             )
             _levels_below(axes, effects.levels[factor], factor)
-        rows[0][0].set_ylabel(f"{effects.of}, mean")
+        for axes in rows[:above, 0]:
+            axes.set_ylabel(f"{effects.of}, mean")
         for axes, (one, other) in zip(rows[-1], pairs, strict=False):
             table = effects.cells(one, other)
             for place, level in enumerate(effects.levels[other]):
@@ -143,8 +150,8 @@ def draw_effects(effects: Any, figure: Any) -> Any:
                     range(len(table)), table.iloc[:, place], "o-", color=colour, markersize=4, label=_short(level)
                 )
             _levels_below(axes, effects.levels[one], one)
-            axes.legend(title=other, fontsize=7, title_fontsize=8)
-        for axes in [*rows[0][len(factors) :], *(rows[-1][len(pairs) :] if pairs else ())]:
+            axes.legend(title=other, fontsize=7, title_fontsize=8, frameon=True, framealpha=0.8, edgecolor="none")
+        for axes in [*main[len(factors) :], *(rows[-1][len(pairs) :] if pairs else ())]:
             axes.set_visible(False)
     return figure
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
@@ -27,6 +28,8 @@ from simenv_marl import (
     simulate,
 )
 from simenv_marl.experiments.statistics import interval, seeds_needed
+from tests.conftest import DRIVERS
+from tests.worlds.many_worlds import Colony, Design, colony_points
 from tests.worlds.models import notes
 from tests.worlds.shops import NEAR, OBSERVED, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
@@ -34,9 +37,9 @@ SEEDS = range(12)
 CONTENDERS = {"rule": {}, "much": {"keeper": much}}
 
 
-def returns_by_hand(policies, seed, **options):
+def returns_by_hand(policies, seed, make=Shop, points=POINTS, **options):
     """The returns of an AEC environment that is played with the same policies."""
-    env = aec_env(Shop, POINTS, **options)
+    env = aec_env(make, points, **options)
     env.reset(seed=seed)
     found = {}
     while env.agents:
@@ -62,6 +65,43 @@ def test_the_frame_has_a_row_for_each_agent_and_one_for_the_team():
             assert rows.loc["team", "return"] == sum(expected.values())
             assert rows["length"].to_dict() == {"keeper": 3, "helper": 3, "team": 6}
             assert set(rows["level"]) == {simulate(Shop, policies, points=POINTS, seed=seed).level}
+
+
+COLONY = Design(initial=3, most=8, ticks=4, overseen="before", truncates=True)
+
+
+def by_number(observation):
+    return int(abs(observation.sum())) % 6
+
+
+def by_number_of_many(observations):
+    return [by_number(observation) for observation in observations]
+
+
+@pytest.mark.parametrize("_driver", DRIVERS, indirect=True)
+@pytest.mark.parametrize("options", [{}, {"max_steps": 5}], ids=str)
+@pytest.mark.parametrize("batched", [False, True])
+def test_agents_that_are_born_and_die_have_the_returns_of_an_environment(batched, options):
+    def make():
+        return Colony(COLONY)
+
+    points, seeds = colony_points(overseen=True), range(8)
+    policies = {"creature_0": by_number, "creature_4": by_number, "overseer_0": by_number}
+    contenders = {"rule": {}, "some": dict.fromkeys(policies, by_number_of_many) if batched else policies}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # not all are born in each episode
+        found = evaluate(make, contenders, seeds=seeds, points=points, baseline="rule", batched=batched, **options)
+        for name, own in (("rule", {}), ("some", policies)):
+            for seed in seeds:
+                rows = found.frame[(found.frame["contender"] == name) & (found.frame["seed"] == seed)]
+                returns = dict(zip(rows["agent"], rows["return"], strict=True))
+                total = returns.pop("team")
+                expected = returns_by_hand(own, seed, make, points, **options)
+                assert returns == {agent: value for agent, value in expected.items() if agent in returns}
+                assert not any(value for agent, value in expected.items() if agent not in returns)
+                assert total == pytest.approx(sum(returns.values()))
+    assert len({len(rows) for _, rows in found.frame.groupby(["contender", "seed"])}) > 1
+    assert np.isfinite(found.summary().to_numpy()).all()
 
 
 @pytest.mark.parametrize("arguments", [{"workers": 2}, {"batched": True}, {"batched": True, "workers": 2}], ids=str)

@@ -34,6 +34,7 @@ from simenv_marl import (
 )
 from simenv_marl.experiments import store as stores
 from simenv_marl.experiments.playing import Outcome
+from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import notes
 from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some, some_of_many
 
@@ -83,6 +84,23 @@ def test_the_table_is_the_same_for_every_number_of_workers(workers, tmp_path):
     alone = run(tmp_path / "alone")
     assert run(tmp_path / "shared", workers=workers).equals(alone)
     assert len({path.name.split("-")[2] for path in (tmp_path / "shared").glob("*.jsonl")}) <= workers
+
+
+@pytest.mark.filterwarnings("ignore:policies= or possible_agents= name agents that did not appear")
+def test_the_table_is_the_same_whoever_is_born_and_dies(tmp_path):
+    def make(ticks):
+        return Colony(Design(initial=3, most=8, ticks=ticks))
+
+    policies = {"one": {"creature_4": lambda observation: 5}, "all": {Creature.act: lambda observation: 3}}
+    given = {"policies": policies, "seeds": range(5), "points": colony_points(overseen=False)}
+    frames = [
+        run_experiment(make, {"ticks": [1, 5]}, store=tmp_path / str(workers), workers=workers, **given)
+        for workers in (0, 1, 2)
+    ]
+    assert frames[1].equals(frames[0])
+    assert frames[2].equals(frames[0])
+    assert set(frames[0]["status"]) == {"ok"}
+    assert frames[0].groupby(["ticks", "contender", "seed"]).size().nunique() > 2
 
 
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batch_size": 2}], ids=str)

@@ -483,6 +483,17 @@ def test_what_was_made_otherwise_is_warned_of(told, arguments, tmp_path):
     assert frame[frame["days"] != 7].reset_index(drop=True).equals(first)
 
 
+def test_a_row_that_is_known_to_fail_does_not_keep_others_from_being_run(tmp_path):
+    def make(days):
+        return Variant("v", Shop, parameters={"days": days} if days != 2 else {"nights": days})
+
+    frame = run(tmp_path, {"days": [1, 2]}, make=make, policies=None)
+    assert set(frame[frame["days"] == 2]["status"]) == {"error"}
+    with pytest.warns(UserWarning, match="rows that this design does not have"):
+        frame = run(tmp_path, {"days": [3, 2]}, make=make, policies=None)
+    assert frame.groupby("days")["status"].first().to_dict() == {2: "error", 3: "ok"}
+
+
 def test_what_was_made_alike_is_not_warned_of(tmp_path):
     class Policy:
         def __call__(self, observation):

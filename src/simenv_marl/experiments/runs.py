@@ -7,7 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -141,8 +141,9 @@ def run_experiment(
     compare(folder, stored, keys)
     if tried[0] not in stored.rows:  # so that what is there is compared with what it would be now
         known = [row for row, key in zip(rows, keys, strict=True) if key in stored.rows]
-        tried = _try(Workshop(*workshop), known, contenders)
-        stored = read(folder, factors, tried[0]) if known else stored
+        with suppress(SimEnvError):  # of a row that has failed
+            tried = _try(Workshop(*workshop), known, contenders)
+        stored = read(folder, factors, tried[0])
     warn_of_changes(folder, stored, tried[1])
     missing = list(_missing(rows, keys, contenders, places, stored, retry=retry_errors))
     total = len(set(keys)) * len(contenders) * len(places) if progress else None

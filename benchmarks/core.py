@@ -25,6 +25,7 @@ SECTIONS = (
     "branches",
     "wolf_sheep",
     "experiments",
+    "batch_run",
     "greenhouse",
 )
 """In the order in which they run. The greenhouse comes last, and each is imported when it runs, because the

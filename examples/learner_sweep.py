@@ -1,0 +1,148 @@
+"""Settings of a learner as factors: a sweep that resumes, and Optuna as the search over the same settings.
+
+A training run is a simulation like any other: its factors are the learner's settings, its seed is that of the training,
+and what comes of it is measured after its end. So ``run_experiment`` does sweeps of learners as it is. Here PPO of
+Stable-Baselines3 learns to water the greenhouse.
+
+``python -m examples.learner_sweep`` needs the extra ``clients``. It does the sweep, then the search, and then trains
+anew with the settings that were found and with those that PPO comes with, on seeds that neither has met. What it has
+done is kept in a folder, and not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import optuna
+from gymnasium.wrappers import RescaleAction
+from optuna.trial import TrialState
+from stable_baselines3 import PPO
+
+from simenv_marl import design, effects, evaluate, run_experiment, simulate
+
+from .greenhouse_coop.env import WATERING, GreenhouseSim, watering_env
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+LEVELS: Final = {"learning_rate": [3e-4, 1e-3, 3e-3], "gamma": [0.8, 0.9, 0.99]}
+"""What is swept: PPO comes with the first rate and the last discount."""
+
+SEEDS: Final = range(3)
+"""Of trainings."""
+
+HELD_OUT: Final = 1000
+"""The first of the seeds on which what was learnt is judged."""
+
+
+class Training:
+    """A training run, as a simulation.
+
+    Attributes:
+        found: What the trained waterer is worth beside the model's rule: the row of ``Evaluation.summary``.
+    """
+
+    def __init__(self, days: int, held_out: int = HELD_OUT, **settings: Any) -> None:
+        """Take the factors.
+
+        Args:
+            days: For how long it trains.
+            held_out: The first of the 16 seeds on which it is judged.
+            **settings: Of PPO.
+        """
+        self.days, self.held_out, self.settings = days, held_out, settings
+
+    def reset(self, seed: int | None = None) -> None:
+        """Make a learner that knows nothing."""
+        env = RescaleAction(watering_env(), np.float32(-1), np.float32(1))
+        self.model = PPO("MlpPolicy", env, n_steps=250, batch_size=125, seed=seed, **self.settings)
+
+    def run(self) -> None:
+        """Train it, and judge it beside the rule, where both meet the same weather."""
+        self.model.learn(self.days)
+        contenders = {"rule": {}, "trained": {"waterer_0": self.decide}}
+        seeds = range(self.held_out, self.held_out + 16)
+        judged = evaluate(GreenhouseSim, contenders, seeds=seeds, points=WATERING, baseline="rule")
+        self.found = judged.summary().loc["trained"]
+
+    def decide(self, observation: Any) -> Any:
+        """What it has learnt."""
+        return (self.model.predict(observation, deterministic=True)[0] + 1) / 2
+
+
+GAIN: Final = {
+    "gain": lambda training: training.found["difference"],
+    "gain_low": lambda training: training.found["difference_low"],
+    "gain_high": lambda training: training.found["difference_high"],
+}
+"""By how much it does better than the rule, with the interval over the seeds on which it was judged."""
+
+# It seeds the process's generators, as learners do: with global_rng=True each training has generators of its own.
+experiment = partial(run_experiment, Training, metric=GAIN, global_rng=True)
+
+
+def sweep(folder: Path, days: int, seeds: Sequence[int] = SEEDS, workers: int = 0) -> DataFrame:
+    """Train with every combination of the settings, on every seed."""
+    rows = design({**LEVELS, "days": [days]})
+    return experiment(rows, seeds=seeds, store=folder / "sweep", workers=workers, progress=True)
+
+
+def search(folder: Path, days: int, trials: int, seeds: Sequence[int] = SEEDS) -> optuna.Study:
+    """Let Optuna look for better settings between those that were swept."""
+
+    def objective(trial: optuna.Trial) -> float:
+        rate = trial.suggest_float("learning_rate", 3e-4, 1e-2, log=True)
+        gamma = trial.suggest_float("gamma", 0.5, 0.99)
+        found = []
+        for step, seed in enumerate(seeds):  # one training may be luck
+            found.append(simulate(Training(days, learning_rate=rate, gamma=gamma), seed=seed, global_rng=True).found)
+            mean = float(np.mean([own["difference"] for own in found]))
+            trial.set_user_attr("intervals", [[own["difference_low"], own["difference_high"]] for own in found])
+            trial.report(mean, step)
+            if trial.should_prune():  # no need to train again with what has done worse than most
+                raise optuna.TrialPruned
+        return mean
+
+    storage = f"sqlite:///{folder / 'search.db'}"
+    name = f"{days} days, {len(seeds)} seeds"
+    study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True, direction="maximize")
+    study.sampler = optuna.samplers.TPESampler(seed=len(study.trials))  # resumed, it does not draw the same again
+    done = len(study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED)))
+    study.optimize(objective, n_trials=max(0, trials - done))
+    return study
+
+
+def confirm(folder: Path, days: int, settings: dict[str, float], seeds: Sequence[int], workers: int = 0) -> DataFrame:
+    """Train with other seeds and judge on others: who is best of many on some seeds, is so by luck, too."""
+    rows = [{"learning_rate": 3e-4, "gamma": 0.99}, settings]
+    fresh = [{**row, "days": days, "held_out": 2 * HELD_OUT} for row in rows]
+    return experiment(fresh, seeds=seeds, store=folder / "confirmed", workers=workers)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Sweep, search, and confirm."""
+    parser = argparse.ArgumentParser(description="Look for the settings of a learner.")
+    parser.add_argument("--out", type=Path, default=Path("examples/out/learner_sweep"), help="(default: %(default)s)")
+    parser.add_argument("--days", type=int, default=3000, help="for each training (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=3, help="trainings with each settings (default: %(default)s)")
+    parser.add_argument("--trials", type=int, default=12, help="of Optuna (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=0, help="processes of the sweep (default: none)")
+    options = parser.parse_args(arguments)
+    folder, days, seeds = options.out, options.days, range(options.seeds)
+    folder.mkdir(parents=True, exist_ok=True)
+    table = sweep(folder, days, seeds, options.workers)
+    found = effects(table, "gain")
+    print(found.main.round(1), found.cells("learning_rate", "gamma").round(1), sep="\n\n")
+    study = search(folder, days, options.trials, seeds)
+    print(f"\nfound by Optuna: {study.best_params}, worth {study.best_value:.1f}")
+    fresh = confirm(folder, days, study.best_params, range(100, 100 + options.seeds), options.workers)
+    print(fresh.groupby(list(LEVELS))["gain"].agg(["mean", "min", "max"]).round(1))
+
+
+if __name__ == "__main__":
+    main()

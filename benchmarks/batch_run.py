@@ -1,9 +1,9 @@
 """A sweep of Mesa's own model of wealth, by Mesa's ``batch_run`` and by ``run_experiment``: lines, and seconds.
 
 How unequal are people in the end, depending on how many they are and how much room they have: a mean with its interval
-for each combination. The same seeds bring the same numbers. What a user writes are the functions ``by_...``, and for
-``by_run_experiment`` the class ``Wealth``, where the model is no simulation yet: their lines are counted. Two processes
-are measured only where this is not pinned to one core: ``python -m benchmarks.core --only batch_run``.
+for each combination. The same seeds bring the same numbers. What a user writes are the functions ``by_...``: their
+lines are counted. Two processes are measured only where this is not pinned to one core: ``python -m benchmarks.core
+--only batch_run``.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from mesa.examples.basic.boltzmann_wealth_model.model import BoltzmannWealth
 from pandas import DataFrame
 
 from benchmarks.measure import Contender, Section, alone, now, ratio, side_by_side
-from simenv_marl import design, run_experiment
+from simenv_marl import SteppedSimulation, design, run_experiment
 
 FACTORS = {"n": [50, 100, 200], "width": [5, 10, 20]}
 SEEDS = range(8)
@@ -50,21 +51,9 @@ def by_batch_run(processes: int = 1) -> Any:
     return table.groupby(["n", "width"])["Gini"].agg(["mean", interval])
 
 
-class Wealth:  # noqa: D101
-    def __init__(self, **factors: int) -> None:
-        self.factors = factors
-
-    def reset(self, seed: int | None = None) -> None:
-        self.model = BoltzmannWealth(**self.factors, seed=seed)
-
-    def run(self) -> None:
-        while self.model.steps < STEPS:
-            self.model.step()
-
-
 def by_run_experiment(store: Path, workers: int = 0) -> Any:
-    gini = {"Gini": lambda wealth: wealth.model.compute_gini()}
-    table = run_experiment(Wealth, design(FACTORS), seeds=SEEDS, metric=gini, store=store, workers=workers)
+    make, gini = partial(SteppedSimulation, BoltzmannWealth, STEPS), lambda wealth: wealth.model.compute_gini()
+    table = run_experiment(make, design(FACTORS), seeds=SEEDS, metric={"Gini": gini}, store=store, workers=workers)
     return table.groupby(["n", "width"])["Gini"].agg(["mean", interval])
 
 
@@ -126,9 +115,8 @@ def measure(rounds: int, number: int) -> Section:
     """
     section, rounds = Section("A sweep of Mesa's model of wealth", "seconds"), min(rounds, ROUNDS)
     ours, theirs = lines(by_run_experiment), lines(by_batch_run)
-    section.ratio("lines: run_experiment / batch_run", (lines(Wealth) + ours) / theirs, 1.0)
-    section.ratio("lines, where the model is a simulation already", ours / theirs, 1.0)
-    section.ratio("lines, where a kill loses one run", (lines(Wealth) + ours) / lines(by_batch_run_resumed), 1.0)
+    section.ratio("lines: run_experiment / batch_run", ours / theirs, 1.0)
+    section.ratio("lines, where a kill loses one run", ours / lines(by_batch_run_resumed), 1.0)
     if not ABLE:
         section.remarks.append("A sweep: this version of Mesa's batch_run cannot run its model of wealth.")
         return section

@@ -12,6 +12,7 @@ The rooms of the package; each imports only from those below it::
     remote                              simulators outside Python: processes that call for decisions
     decision                            make_step: definitions and decision points
     hooks                               functions that stand in front of a model's own; handlers around their calls
+    stepped                             simulations of models that are made with a seed and stepped
     simulation                          what a simulation is; RULE and TRUNCATED
     errors                              the tree of errors
 
@@ -65,6 +66,7 @@ from .planning.values import ActionValues, action_values
 from .registration import register_simulation
 from .remote.process import ProcessSimulation
 from .simulation import RULE, TRUNCATED, SimulationInterface
+from .stepped import SteppedSimulation
 
 __version__ = "0.1.0"
 
@@ -88,6 +90,7 @@ __all__ = [
     "SimulationJointEnv",
     "SimulationParallelEnv",
     "SimulationVectorEnv",
+    "SteppedSimulation",
     "Trajectories",
     "TreeSearchPolicy",
     "Variant",

@@ -31,4 +31,4 @@ def test_the_same_seeds_bring_the_same(sweeps, tmp_path):
 
 def test_lines_are_those_that_are_written(sweeps):
     assert sweeps.lines(sweeps.interval) == 3
-    assert sweeps.lines(sweeps.interval, sweeps.Wealth) == 11
+    assert sweeps.lines(sweeps.interval, sweeps.by_run_experiment) == 7

@@ -1,0 +1,124 @@
+"""Models that are made with a seed and stepped, as simulations."""
+
+import copy
+import pickle
+import random
+from functools import partial
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from simenv_marl import (
+    RULE,
+    OptionValueError,
+    SimulationError,
+    SteppedSimulation,
+    aec_env,
+    design,
+    make_step,
+    run_experiment,
+    simulate,
+    single_env,
+)
+
+
+class Walk:
+    """A walk that ends where it gets too far."""
+
+    def __init__(self, drift=0.0, far=50.0, seed=None):
+        self.random = random.Random(seed)
+        self.drift, self.far, self.place, self.running = drift, far, 0.0, True
+
+    def step(self):
+        self.place += self.stride() + self.random.uniform(-1, 1)
+        self.running = abs(self.place) < self.far
+
+    def stride(self):
+        return self.drift
+
+
+class ByRng(Walk):
+    def __init__(self, *, rng=None):
+        super().__init__(seed=rng)
+
+
+class Unseeded(Walk):
+    def __init__(self, drift=0.0):
+        super().__init__(drift, seed=1)
+
+
+STRIDE = {
+    f"{__name__}.Walk.stride": make_step(
+        observation_space=spaces.Box(-100, 100, (1,), np.float64),
+        observation_space_mapping=lambda walk: [walk.place],
+        action_space=spaces.Discrete(3),
+        action_space_mapping=lambda action: action - 1.0,
+        reward_mapping=lambda walk: -abs(walk.place),
+    )
+}
+
+
+def walked(seed, steps, **parameters):
+    model = Walk(seed=seed, **parameters)
+    for _ in range(steps):
+        model.step()
+    return model.place
+
+
+def test_it_is_the_plain_model_by_its_rule():
+    assert simulate(SteppedSimulation(Walk, 20, drift=0.1), seed=3).model.place == walked(3, 20, drift=0.1)
+    env = single_env(SteppedSimulation(Walk, 20), STRIDE)
+    env.reset(seed=3)
+    ended = False
+    while not ended:
+        *_, terminated, truncated, info = env.step(RULE)
+        ended = terminated or truncated
+    assert env.unwrapped.simulation.model.place == walked(3, 20)
+    assert (terminated, truncated, info["time"]) == (False, True, 20.0)
+    first = env.unwrapped.simulation.model
+    env.reset(seed=3)
+    assert env.unwrapped.simulation.model is not first
+    env.close()
+
+
+@pytest.mark.parametrize("steps", [None, 1000])
+def test_the_model_ends_it(steps):
+    env = aec_env(SteppedSimulation(Walk, steps, far=3.0), STRIDE)
+    env.reset(seed=1)
+    while not env.terminations["stride_0"]:
+        env.step(2)
+    assert not env.truncations["stride_0"]
+    env.close()
+
+
+def test_the_seed_goes_where_the_model_takes_it():
+    assert simulate(SteppedSimulation(ByRng, 5), seed=2).model.place == walked(2, 5)
+    assert simulate(SteppedSimulation(Unseeded, 5), seed=2).model.place == walked(1, 5)
+    assert simulate(SteppedSimulation(Walk, 5, seed=9), seed=2).model.place == walked(9, 5)  # by the user's own seed
+
+
+def test_it_is_a_row_of_an_experiment(tmp_path):
+    table = run_experiment(
+        partial(SteppedSimulation, Walk, 10), design({"drift": [0.0, 1.0]}), seeds=range(2), store=tmp_path,
+        metric={"place": lambda simulation: simulation.model.place},
+    )  # fmt: skip
+    assert table.place.tolist() == [walked(seed, 10, drift=drift) for drift in (0.0, 1.0) for seed in range(2)]
+
+
+def test_copies_and_pickles():
+    simulation = SteppedSimulation(Walk, 5, drift=0.5)
+    for twin in (copy.deepcopy(simulation), pickle.loads(pickle.dumps(simulation))):
+        assert simulate(twin, seed=2).model.place == walked(2, 5, drift=0.5)
+
+
+def test_bad_input():
+    with pytest.raises(SimulationError, match="the class of a model, not 3"):
+        SteppedSimulation(3)
+    for steps in (0, -1, 1.5, True, "many"):
+        with pytest.raises(OptionValueError, match="steps"):
+            SteppedSimulation(Walk, steps)
+    with pytest.raises(SimulationError, match="no method step"):
+        simulate(SteppedSimulation(lambda: object(), 3))
+    with pytest.raises(TypeError, match="length"):
+        simulate(SteppedSimulation(Walk, 3, length=1))

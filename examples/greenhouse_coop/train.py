@@ -22,7 +22,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-import cma
 import numpy as np
 from gymnasium import Space
 from numpy.typing import NDArray
@@ -33,7 +32,6 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from simenv_marl import RULE, SimulationAECEnv
 
 from .env import DAYS, MOST_WATER, OBSERVED, raw_env
-from .picture import draw
 
 WATERER, VENTILATOR = "waterer_0", "ventilator_0"
 
@@ -266,15 +264,21 @@ def search(
     return teams[int(np.argmax(crew.rate(teams, seeds)))]
 
 
-def learn(crew: Crew, start: Mapping[str, Constant], generations: int, rng: np.random.Generator) -> dict[str, Linear]:
+Rate = Callable[[Sequence[Team], Iterable[int]], NDArray[np.float64]]
+"""Rates every team by its mean return over seeds."""
+
+
+def learn(rate: Rate, start: Mapping[str, Constant], generations: int, rng: np.random.Generator) -> dict[str, Linear]:
     """Train linear policies together, by evolution of their weights.
 
     Args:
-        crew: Plays.
+        rate: Rates the candidates of a generation, such as ``Crew.rate``.
         start: For each agent that is to learn, the constant decision that it begins with.
         generations: For how long.
         rng: Draws everything that is drawn.
     """
+    import cma  # here, and not where a policy is loaded: a process that has imported much is forked slowly
+
     size = len(OBSERVED) + 1
     first = np.zeros((len(start), size))
     for weights, constant in zip(first, start.values(), strict=True):
@@ -292,7 +296,7 @@ def learn(crew: Crew, start: Mapping[str, Constant], generations: int, rng: np.r
     for _ in range(generations):
         candidates = evolution.ask()
         # The same greenhouses for all of a generation: none is to be chosen for its good weather.
-        returns = crew.rate([team(weights) for weights in candidates], draw_seeds(rng, EPISODES_EACH))
+        returns = rate([team(weights) for weights in candidates], draw_seeds(rng, EPISODES_EACH))
         evolution.tell(candidates, (-returns).tolist())
         means.append(evolution.result.xfavorite)
     # The mean sways with the weather by which it was judged; that of the last quarter hardly does.
@@ -322,9 +326,9 @@ def compare(options: argparse.Namespace) -> dict[str, list[Outcome]]:
         crew.say("constant pairs")
         pair = search(crew, LITRES, EXCHANGES, draw_seeds(rng, schedule.pair_seeds))
         crew.say("training the waterer")
-        waterer = learn(crew, alone, schedule.alone_generations, rng)
+        waterer = learn(crew.rate, alone, schedule.alone_generations, rng)
         crew.say("training both")
-        both = learn(crew, pair, schedule.both_generations, rng)
+        both = learn(crew.rate, pair, schedule.both_generations, rng)
         poured, exchanged = alone[WATERER].value * MOST_WATER, 100 * pair[VENTILATOR].value
         teams: dict[str, Team] = {
             "rule": {},
@@ -376,6 +380,8 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Compare, and show the result as a table and as a picture."""
+    from .picture import draw
+
     options = parse(arguments)
     results = compare(options)
     console = Console()

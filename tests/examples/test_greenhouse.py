@@ -483,7 +483,7 @@ def test_training_is_worth_it():
     generations, seeds = 8, range(train.HELD_OUT, train.HELD_OUT + 8)
     pair = {"waterer_0": train.Constant(0.084), "ventilator_0": train.Constant(1.0)}  # what searching finds
     with train.Crew(1, train.tqdm(disable=True)) as crew:
-        trained = train.learn(crew, pair, generations, np.random.default_rng(0))
+        trained = train.learn(crew.rate, pair, generations, np.random.default_rng(0))
         rule, constant, learnt = crew.rate([{}, pair, trained], seeds)
     assert rule < 5 < 65 < constant < learnt - 3
 

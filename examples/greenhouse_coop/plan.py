@@ -60,7 +60,7 @@ BEST: Final = {WATERER: Constant(0.084), VENTILATOR: Constant(1.0)}
 def days_left(env: Any) -> float:
     """What is still to come, at most: each plant that is alive is worth as much as it brings if it stays so."""
     greenhouse: Greenhouse = env.unwrapped.simulation.greenhouse
-    return greenhouse.alive / PLANTS * (DAYS - greenhouse.day)
+    return greenhouse.alive / len(greenhouse.pots) * (DAYS - greenhouse.day)
 
 
 def share_alive(env: Any) -> float:
@@ -104,6 +104,32 @@ def water_planner(
     """
     litres = [amount / MOST_WATER for amount in LITRES]
     return CountingPlanner(litres, horizon, base=base, futures=futures, terminal_value=rest)
+
+
+PORTIONS: Final = tuple(tenths / 10 for tenths in range(7))
+"""Litres for each pot that ``PortionPlanner`` tries out."""
+
+
+@dataclass(frozen=True)
+class PortionPlanner:
+    """A waterer that plans for any number of pots: it tries out portions for a pot, for one day, in one future.
+
+    What comes after that day is ``days_left``, so that nothing but the portion itself is decided in a branch.
+
+    Attributes:
+        portions: What it tries out.
+        base: What is poured where it is the base of another planner.
+    """
+
+    portions: tuple[float, ...] = PORTIONS
+    base: Any = RULE
+
+    def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
+        """Decide."""
+        pots = len(_environment.simulation.greenhouse.pots)
+        actions = [np.array([portion * pots / MOST_WATER], np.float32) for portion in self.portions]
+        planner = RolloutPolicy(actions, base=self.base, futures=1, horizon=1, terminal_value=days_left)
+        return planner(observation, info, _environment=_environment)
 
 
 def air_planner(base: Any = RULE, horizon: int = 3, futures: int = 2) -> CountingPlanner:

@@ -3,13 +3,17 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan test test-clients test-rllib test-wrappers test-oldest test-clusters coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix test test-clients test-rllib test-wrappers test-oldest test-clusters coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
 
 plan: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.plan
+
+# What has been run is not run again. MATRIX="--quick --out /tmp/matrix"
+matrix: .venv/.matrix
+	$(BIN)/python -m examples.greenhouse_coop.matrix $(MATRIX)
 
 test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random

@@ -1,0 +1,151 @@
+"""Pictures and tables of the matrix: what pandas, seaborn, statsmodels and the library make of one tidy table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import seaborn
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from pandas import DataFrame
+from statsmodels.formula.api import ols
+from statsmodels.stats.anova import anova_lm
+
+from simenv_marl import Evaluation, effects
+
+from .matrix import FACTORS, HOME, SCHOOLS
+
+AT_HOME, ALL_OVER = SCHOOLS
+
+COLOURS: Final = {"rule": "#8c8c8c", AT_HOME: "#d1812c", ALL_OVER: "#7fb3d3", "planned": "#1b6f5f"}
+
+
+def averaged(table: Any) -> Any:
+    """The team's rows, with the learners of each school as one contender, whose values are their means."""
+    team = table[table.agent == "team"]
+    keys = [*FACTORS, "contender", "seed", "agent", "status"]
+    values = ["return", "length", "alive", "litres"]
+    schools = team.assign(contender=team.contender.str.rstrip(" 0123456789"))
+    return schools.groupby(keys, sort=False, as_index=False)[values].mean()
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def compared(means: Any) -> str:
+    """Who does how well with how many plants, and by how much better than those who have learned at home.
+
+    What is compared is the mean over all climates and exchanges, seed by seed: intervals are over seeds.
+    """
+    rows = []
+    for plants, own in means.groupby("plants"):
+        by_seed = own.groupby(["contender", "seed"], sort=False, as_index=False)[["return", "alive", "litres"]].mean()
+        evaluation = Evaluation(by_seed.assign(agent="team"), AT_HOME, 0.95)
+        others = by_seed.groupby("contender")[["alive", "litres"]].mean()
+        for name, found in evaluation.summary().iterrows():
+            apart = "" if name == AT_HOME else _between(found, "difference", "+.1f")
+            alive, litres = others.loc[name]
+            rows.append((plants, name, _between(found, "mean", ".1f"), apart, f"{alive:.0%}", f"{litres:.2f}"))
+    return _markdown(("plants", "who waters", "return", f"more than {AT_HOME}", "alive", "litres a pot and day"), rows)
+
+
+def _between(found: Any, name: str, form: str) -> str:
+    low, high = ("low", "high") if name == "mean" else (f"{name}_low", f"{name}_high")
+    return f"{found[name]:{form}} ({found[low]:{form}} to {found[high]:{form}})"
+
+
+def moved(means: Any) -> str:
+    """For each contender, how far its mean return lies apart between the best and the worst level of a factor."""
+    rows = []
+    for name in dict.fromkeys(means.contender):
+        levels = effects(means, contender=name).main["mean"].groupby("factor", sort=False)
+        rows.append((name, *(f"{value:.1f}" for value in levels.max() - levels.min())))
+    return _markdown(("who waters", *FACTORS), rows)
+
+
+def learners(table: Any) -> str:
+    """What each learner has come to: in the greenhouse of the paper, and with how many plants."""
+    team = table[(table.agent == "team") & table.contender.str.startswith(tuple(SCHOOLS))]
+    home = team[(team[list(HOME)] == list(HOME.values())).all(axis=1)].groupby("contender")["return"].mean()
+    by_plants = team.pivot_table(index="contender", columns="plants", values="return")
+    rows = [(name, *(f"{value:.1f}" for value in (home[name], *own))) for name, own in by_plants.iterrows()]
+    return _markdown(("who waters", "the paper's greenhouse", *(f"{plants} plants" for plants in by_plants)), rows)
+
+
+def shares(means: Any) -> str:
+    """Which share of the variance of returns is due to what, by an analysis of variance."""
+    varied = [name for name in (*FACTORS, "contender") if means[name].nunique() > 1]
+    formula = f'Q("return") ~ ({" + ".join(f"C({name})" for name in varied)}) ** 2 + C(seed)'
+    found = anova_lm(ols(formula, means).fit(), typ=2)
+    share = (found["sum_sq"] / found["sum_sq"].sum()).sort_values(ascending=False)
+    rows = [(name.replace("C(", "").replace(")", "").replace(":", " x "), f"{own:.1%}") for name, own in share.items()]
+    return _markdown(("due to", "share of the variance"), rows)
+
+
+def _markdown(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
+
+
+# -- pictures -------------------------------------------------------------------------------------
+
+
+def draw_returns(means: Any) -> Any:
+    """Draw the whole matrix: a panel for each climate and exchange."""
+    grid = seaborn.catplot(
+        means, x="plants", y="return", hue="contender", row="climate", col="exchange", kind="point", palette=COLOURS,
+        height=2.1, aspect=1.35, margin_titles=True, markersize=5, linewidth=1.6, err_kws={"linewidth": 1.2},
+    )  # fmt: skip
+    grid.set_titles(row_template="{row_name}", col_template="exchange: {col_name}")
+    grid.set_axis_labels("plants", "return")
+    for axes in grid.axes.flat:
+        axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
+    place = sorted(set(means.plants)).index(HOME["plants"])
+    grid.axes_dict[HOME["climate"], HOME["exchange"]].axvspan(place - 0.2, place + 0.2, color="#efe3d3", zorder=0)
+    seaborn.move_legend(grid, "upper center", bbox_to_anchor=(0.45, 1.05), ncols=len(COLOURS), title=None)
+    return grid.figure
+
+
+def draw_behind(means: Any) -> Any:
+    """Draw by how much learners are behind the planner on the same seeds, in each row, and how sure that is."""
+    rows = []
+    for levels, own in means.groupby(list(FACTORS), sort=False):
+        summary = Evaluation(own, "planned", 0.95).summary()
+        for name in SCHOOLS:
+            apart, low, high = summary.loc[name, ["difference", "difference_low", "difference_high"]]
+            rows.append((*levels, name, apart, f"{apart:+.0f} ({low:+.0f} to {high:+.0f})"))
+    behind = DataFrame(rows, columns=[*FACTORS, "contender", "apart", "said"])
+    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    for axes, name in zip(figure.subplots(1, len(SCHOOLS), sharey=True), SCHOOLS, strict=True):
+        cells = behind[behind.contender == name].pivot(index=["climate", "exchange"], columns="plants")
+        cells = cells.reindex(list(dict.fromkeys(zip(behind.climate, behind.exchange, strict=True))))
+        names = [", ".join(pair) for pair in cells.index]
+        seaborn.heatmap(
+            cells["apart"], annot=cells["said"], fmt="", vmin=-60, vmax=0, cmap="YlOrBr_r", linewidths=1.5, ax=axes,
+            annot_kws={"fontsize": 8}, yticklabels=names, cbar=False,
+        )  # fmt: skip
+        axes.set_title(f"{name}, less planned", fontsize=10)
+        axes.set_ylabel("")
+        axes.tick_params(left=False, bottom=False, labelrotation=0)
+    return figure
+
+
+def show(table: Any, folder: Path) -> None:
+    """Write all pictures and tables into a folder, and print the tables.
+
+    Args:
+        table: What ``matrix.run`` has returned.
+        folder: Is made if need be.
+    """
+    means = averaged(table)
+    folder.mkdir(parents=True, exist_ok=True)
+    texts = {"compared": compared(means), "moved": moved(means), "shares": shares(means), "learners": learners(table)}
+    for name, text in texts.items():
+        (folder / f"matrix-{name}.md").write_text(text, encoding="utf-8")
+        print(text)
+    at_home: Any = effects(means, contender=AT_HOME).plot()
+    for name, figure in {"returns": draw_returns(means), "behind": draw_behind(means), "effects": at_home}.items():
+        figure.savefig(folder / f"matrix-{name}.png", dpi=110, bbox_inches="tight")

@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> Any:
     """
     parser = argparse.ArgumentParser(description="Who waters best, and where?")
     parser.add_argument("--seeds", type=int, default=8, help="greenhouses in each row (default: %(default)s)")
-    parser.add_argument("--learners", type=int, default=3, help="of each school (default: %(default)s)")
+    parser.add_argument("--learners", type=int, default=5, help="of each school (default: %(default)s)")
     parser.add_argument("--generations", type=int, default=GENERATIONS, help="of learning (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=OUT / "matrix", help="folder for all of it (default: %(default)s)")

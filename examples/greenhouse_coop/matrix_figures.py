@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import seaborn
+from matplotlib import pyplot
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from pandas import DataFrame
 from statsmodels.formula.api import ols
 from statsmodels.stats.anova import anova_lm
@@ -19,6 +21,9 @@ from .matrix import FACTORS, HOME, SCHOOLS
 
 AT_HOME, ALL_OVER = SCHOOLS
 
+NUMBER: Final = " 0123456789"
+"""What the name of a learner ends with, after that of its school."""
+
 COLOURS: Final = {"rule": "#8c8c8c", AT_HOME: "#d1812c", ALL_OVER: "#7fb3d3", "planned": "#1b6f5f"}
 
 
@@ -27,7 +32,7 @@ def averaged(table: Any) -> Any:
     team = table[table.agent == "team"]
     keys = [*FACTORS, "contender", "seed", "agent", "status"]
     values = ["return", "length", "alive", "litres"]
-    schools = team.assign(contender=team.contender.str.rstrip(" 0123456789"))
+    schools = team.assign(contender=team.contender.str.rstrip(NUMBER))
     return schools.groupby(keys, sort=False, as_index=False)[values].mean()
 
 
@@ -57,7 +62,7 @@ def _between(found: Any, name: str, form: str) -> str:
 
 
 def moved(means: Any) -> str:
-    """For each contender, how far its mean return lies apart between the best and the worst level of a factor."""
+    """For each contender, by how much the means of its returns at the levels of a factor lie apart at most."""
     rows = []
     for name in dict.fromkeys(means.contender):
         levels = effects(means, contender=name).main["mean"].groupby("factor", sort=False)
@@ -66,10 +71,10 @@ def moved(means: Any) -> str:
 
 
 def learners(table: Any) -> str:
-    """What each learner has come to: in the greenhouse of the paper, and with how many plants."""
+    """What each learner has come to: in the greenhouse of the paper, and with each number of plants."""
     team = table[(table.agent == "team") & table.contender.str.startswith(tuple(SCHOOLS))]
     home = team[(team[list(HOME)] == list(HOME.values())).all(axis=1)].groupby("contender")["return"].mean()
-    by_plants = team.pivot_table(index="contender", columns="plants", values="return")
+    by_plants = team.pivot_table(index="contender", columns="plants", values="return", sort=False)
     rows = [(name, *(f"{value:.1f}" for value in (home[name], *own))) for name, own in by_plants.iterrows()]
     return _markdown(("who waters", "the paper's greenhouse", *(f"{plants} plants" for plants in by_plants)), rows)
 
@@ -92,19 +97,27 @@ def _markdown(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 # -- pictures -------------------------------------------------------------------------------------
 
 
-def draw_returns(means: Any) -> Any:
-    """Draw the whole matrix: a panel for each climate and exchange."""
+def draw_returns(means: Any, table: Any) -> Any:
+    """Draw the whole matrix: a panel for each climate and exchange, in it thin lines for each learner."""
     grid = seaborn.catplot(
         means, x="plants", y="return", hue="contender", row="climate", col="exchange", kind="point", palette=COLOURS,
         height=2.1, aspect=1.35, margin_titles=True, markersize=5, linewidth=1.6, err_kws={"linewidth": 1.2},
     )  # fmt: skip
     grid.set_titles(row_template="{row_name}", col_template="exchange: {col_name}")
     grid.set_axis_labels("plants", "return")
-    for axes in grid.axes.flat:
+    names = [name for name in dict.fromkeys(table.contender) if name.startswith(tuple(SCHOOLS))]
+    colours = {name: COLOURS[name.rstrip(NUMBER)] for name in names}
+    for (climate, exchange), axes in grid.axes_dict.items():
+        own = table[(table.climate == climate) & (table.exchange == exchange) & table.contender.isin(names)]
+        seaborn.pointplot(
+            own, x="plants", y="return", hue="contender", palette=colours, errorbar=None, markers="", linewidth=0.8,
+            alpha=0.6, legend=False, ax=axes,
+        )  # fmt: skip
         axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
     place = sorted(set(means.plants)).index(HOME["plants"])
     grid.axes_dict[HOME["climate"], HOME["exchange"]].axvspan(place - 0.2, place + 0.2, color="#efe3d3", zorder=0)
-    seaborn.move_legend(grid, "upper center", bbox_to_anchor=(0.45, 1.05), ncols=len(COLOURS), title=None)
+    seaborn.move_legend(grid, "upper center", bbox_to_anchor=(0.45, 1.03), ncols=len(COLOURS), title=None)
+    pyplot.close(grid.figure)  # it is saved, and not shown
     return grid.figure
 
 
@@ -117,8 +130,7 @@ def draw_behind(means: Any) -> Any:
             apart, low, high = summary.loc[name, ["difference", "difference_low", "difference_high"]]
             rows.append((*levels, name, apart, f"{apart:+.0f} ({low:+.0f} to {high:+.0f})"))
     behind = DataFrame(rows, columns=[*FACTORS, "contender", "apart", "said"])
-    figure = Figure(figsize=(9.5, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    figure = _figure(9.5, 4.2)
     for axes, name in zip(figure.subplots(1, len(SCHOOLS), sharey=True), SCHOOLS, strict=True):
         cells = behind[behind.contender == name].pivot(index=["climate", "exchange"], columns="plants")
         cells = cells.reindex(list(dict.fromkeys(zip(behind.climate, behind.exchange, strict=True))))
@@ -130,6 +142,30 @@ def draw_behind(means: Any) -> Any:
         axes.set_title(f"{name}, less planned", fontsize=10)
         axes.set_ylabel("")
         axes.tick_params(left=False, bottom=False, labelrotation=0)
+    return figure
+
+
+def draw_factors(means: Any) -> Any:
+    """Draw what each factor does to each contender: means over the other factors, seed by seed."""
+    figure = _figure(9.5, 3.2)
+    for axes, factor in zip(figure.subplots(1, len(FACTORS), sharey=True), FACTORS, strict=True):
+        by_seed = means.groupby([factor, "contender", "seed"], sort=False, as_index=False)["return"].mean()
+        seaborn.pointplot(
+            by_seed, x=factor, y="return", hue="contender", palette=COLOURS, markersize=5, linewidth=1.6,
+            err_kws={"linewidth": 1.2}, legend=False, ax=axes,
+        )  # fmt: skip
+        axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(
+        [Line2D([], [], color=colour, marker="o", markersize=5) for colour in COLOURS.values()], list(COLOURS),
+        loc="outside upper center", ncols=len(COLOURS), frameon=False,
+    )  # fmt: skip
+    return figure
+
+
+def _figure(width: float, height: float) -> Any:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)  # no window, no state of pyplot
     return figure
 
 
@@ -146,6 +182,6 @@ def show(table: Any, folder: Path) -> None:
     for name, text in texts.items():
         (folder / f"matrix-{name}.md").write_text(text, encoding="utf-8")
         print(text)
-    at_home: Any = effects(means, contender=AT_HOME).plot()
-    for name, figure in {"returns": draw_returns(means), "behind": draw_behind(means), "effects": at_home}.items():
+    drawn = {"returns": draw_returns(means, table), "behind": draw_behind(means), "factors": draw_factors(means)}
+    for name, figure in drawn.items():
         figure.savefig(folder / f"matrix-{name}.png", dpi=110, bbox_inches="tight")

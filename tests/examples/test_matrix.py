@@ -127,7 +127,7 @@ def test_from_one_end_to_the_other(tmp_path, capsys):
     pytest.importorskip("statsmodels")
     table = quick(tmp_path)
     assert len(table[table.agent == "team"]) == 8 * len(CONTENDERS) * 2
-    for name in ("returns", "behind", "effects"):
+    for name in ("returns", "behind", "factors"):
         assert (tmp_path / f"matrix-{name}.png").stat().st_size > 10_000
     shown = capsys.readouterr().out
     for name in ("compared", "moved", "shares", "learners"):

@@ -101,7 +101,7 @@ def draw_returns(means: Any, table: Any) -> Any:
     """Draw the whole matrix: a panel for each climate and exchange, in it thin lines for each learner."""
     grid = seaborn.catplot(
         means, x="plants", y="return", hue="contender", row="climate", col="exchange", kind="point", palette=COLOURS,
-        height=2.1, aspect=1.35, margin_titles=True, markersize=5, linewidth=1.6, err_kws={"linewidth": 1.2},
+        height=2.1, aspect=1.35, margin_titles=True, markersize=5, linewidth=1.6, err_kws={"linewidth": 1.2}, seed=0,
     )  # fmt: skip
     grid.set_titles(row_template="{row_name}", col_template="exchange: {col_name}")
     grid.set_axis_labels("plants", "return")
@@ -152,7 +152,7 @@ def draw_factors(means: Any) -> Any:
         by_seed = means.groupby([factor, "contender", "seed"], sort=False, as_index=False)["return"].mean()
         seaborn.pointplot(
             by_seed, x=factor, y="return", hue="contender", palette=COLOURS, markersize=5, linewidth=1.6,
-            err_kws={"linewidth": 1.2}, legend=False, ax=axes,
+            err_kws={"linewidth": 1.2}, seed=0, legend=False, ax=axes,
         )  # fmt: skip
         axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
         axes.spines[["top", "right"]].set_visible(False)

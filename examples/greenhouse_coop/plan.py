@@ -65,7 +65,8 @@ def days_left(env: Any) -> float:
 
 def share_alive(env: Any) -> float:
     """What is still to come, valued too low: as if there was one more day."""
-    return float(env.unwrapped.simulation.greenhouse.alive / PLANTS)
+    greenhouse: Greenhouse = env.unwrapped.simulation.greenhouse
+    return greenhouse.alive / len(greenhouse.pots)
 
 
 class CountingPlanner(RolloutPolicy):

@@ -1,6 +1,7 @@
 """The paper's matrix: the rows are what they say, and the script runs, resumes, and shows what it has found."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -88,6 +89,15 @@ def test_the_planner_pours_portions_for_each_pot(plants):
     simulate(variants.greenhouse(plants, "mild", "fixed"), {"waterer_0": Watched()}, seed=5)
     assert len(poured) == 4
     assert all(min(abs(portion - own) for own in plan.PORTIONS) < 1e-6 for portion in poured)
+
+
+@pytest.mark.parametrize("plants", [100, 400])
+def test_what_is_still_to_come_counts_shares_of_the_plants_that_there_are(plants):
+    simulation = variants.House(plants)
+    simulation.reset(1)
+    simulation.greenhouse.day = 60
+    env = SimpleNamespace(unwrapped=SimpleNamespace(simulation=simulation))
+    assert (plan.days_left(env), plan.share_alive(env)) == (40, 1)
 
 
 # -- the script -----------------------------------------------------------------------------------

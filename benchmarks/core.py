@@ -23,6 +23,7 @@ SECTIONS = (
     "suspended",
     "many",
     "branches",
+    "outside",
     "wolf_sheep",
     "experiments",
     "batch_run",

@@ -14,19 +14,21 @@
 
 #include <simenv.hpp>
 
+#include <algorithm>
+#include <cstring>
 #include <iostream>
-#include <map>
 #include <memory>
+#include <string>
+#include <vector>
 
 using namespace ns3;
 
 namespace {
 
-constexpr uint32_t PACKET = 1000;             // bytes
-constexpr double FIRST_RATE = 2e5;            // bit/s
-constexpr double LOWEST_RATE = 2e4, HIGHEST_RATE = 1e7;
-constexpr double PATIENCE = 0.3;              // seconds without an acknowledgement after which the timer says so
 constexpr const char* POINT = "sender.rate";
+constexpr uint32_t PACKET = 1000;                                          // bytes
+constexpr double FIRST_RATE = 2e5, LOWEST_RATE = 2e4, HIGHEST_RATE = 1e7;  // bit/s
+constexpr double PATIENCE = 0.3;  // seconds without an acknowledgement, and a timer goes off
 
 /// What is told of an episode: a sum over all that is done, in which no difference can hide; and delays.
 class Record {

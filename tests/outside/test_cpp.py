@@ -21,7 +21,8 @@ pytestmark = [
     pytest.mark.greenlet("there is no environment"),
 ]
 
-HELLO = {"hello": 1, "points": ["probe.echo", "probe.count"], "can": ["reseed"]}
+POINTS = [f"probe.{name}" for name in ("echo", "count", "types", "deaf", "last")]
+HELLO = {"hello": 1, "points": POINTS, "can": ["reseed"]}
 SOURCES = ROOT / "tests" / "outside" / "cpp"
 
 

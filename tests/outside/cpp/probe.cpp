@@ -81,7 +81,7 @@ int deaf(Client& client) {
 }  // namespace
 
 int main(int argc, char** argv) {
-    Client client({"probe.echo", "probe.count"});
+    Client client({"probe.echo", "probe.count", "probe.types", "probe.deaf", "probe.last"});
     if (argc <= 3) client.on_reseed([](std::uint64_t seed) { reseeded = seed; });
     Json result;
     const auto model = [&](const Episode& episode) -> Json {
@@ -100,6 +100,8 @@ int main(int argc, char** argv) {
         if (play == "name") client.remove("probe.echo", "\xc0\x80");
         if (play == "truncated") client.end({{"reached", 3}}, true);
         if (play == "shell") return std::system(episode.option("command", "true").c_str());
+        if (play == "number") return client.decide("probe.echo", "a", {}, [] { return 0.5; });
+        if (play == "crash") [&]() noexcept { fail("nested"); }();
         if (play == "leave") std::exit(episode.option("status", 0));
         if (play == "remove") {
             client.decide("probe.echo", 12, {}, [] { return 0; });

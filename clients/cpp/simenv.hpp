@@ -574,7 +574,7 @@ class Client {
         if (!start || !start->is_object() || !sent)
             return fail("no start of an episode with a seed of 64 bits: " + frame->text()), std::nullopt;
         const Json* given = start->find("options");
-        calls_ = 0;
+        calls_ = 0, refused_ = 0;
         state_ = State::running;
         return Episode{*sent, given && !given->is_null() ? *given : Json::Object()};
     }
@@ -690,9 +690,11 @@ class Client {
     }
 
     /// Leaves the model. Where an exception does that already the rule decides: a second one would end the process.
-    static std::optional<Json> unwind() {
-        if (std::uncaught_exceptions() == 0) throw Stop();
-        return std::nullopt;
+    std::optional<Json> unwind() {
+        if (std::uncaught_exceptions() != 0) return std::nullopt;
+        if (++refused_ <= 1000) throw Stop();
+        std::fputs("simenv: the model catches simenv::Stop again and again, and does not unwind\n", stderr);
+        std::_Exit(EXIT_FAILURE);
     }
 
     template <class Write> void finish(Write&& write, bool truncated) {
@@ -814,6 +816,7 @@ class Client {
     State state_ = State::idle;
     int in_ = -1, out_ = -1;
     std::uint64_t calls_ = 0;
+    int refused_ = 0;  ///< How often the model was to unwind in this episode.
     std::string sending_, received_;
     std::size_t line_ = 0;  ///< How much of what was received has been read.
 };

@@ -281,6 +281,17 @@ def test_a_model_that_does_not_hear_is_told_again(child):
     assert child.begin(4, play="seed") == ended(4)
 
 
+@pytest.mark.parametrize("gone", [False, True])
+def test_a_model_that_never_hears_is_ended(child, gone):
+    child.begin(play="deaf", times=-1)
+    if gone:
+        child.close("out")
+    else:
+        child.send(stop=True)
+    assert child.receive() is None
+    assert child.ended() == (1, "simenv: the model catches simenv::Stop again and again, and does not unwind\n")
+
+
 def test_many_stops_leave_nothing_behind(child):
     def resident() -> int:
         with open(f"/proc/{child.process.pid}/statm", encoding="ascii") as file:

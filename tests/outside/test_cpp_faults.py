@@ -38,7 +38,8 @@ def probe(tmp_path_factory):
 
 @pytest.fixture
 def env(probe):
-    env = aec_env(ProcessSimulation(probe, {"probe.count": ANYTHING, "probe.echo": ANYTHING, "probe.deaf": ANYTHING}, timeout=10.0))
+    points = dict.fromkeys(("probe.count", "probe.echo", "probe.deaf"), ANYTHING)
+    env = aec_env(ProcessSimulation(probe, points, timeout=10.0))
     yield env
     env.close()
 

@@ -59,12 +59,12 @@ int count(Client& client, const Episode& episode) {
     return sum;
 }
 
-int deaf(Client& client) {
-    for (int heard = 0;; ++heard) {
+int deaf(Client& client, const Episode& episode) {
+    for (int most = episode.option("times", 3), heard = 0;;) {
         try {
             client.decide("probe.deaf", "a", {}, [] { return 0; });
         } catch (...) {
-            if (heard == 3) throw;
+            if (++heard == most) throw;
         }
     }
 }
@@ -89,7 +89,7 @@ int main(int argc, char** argv) {
         if (play == "echo") return result = echo(client, episode);
         if (play == "types") return result = types(client);
         if (play == "count") return result = count(client, episode);
-        if (play == "deaf") return deaf(client);
+        if (play == "deaf") return deaf(client, episode);
         if (play == "fail") fail(episode.option("how", "nested"));
         if (play == "seed") return episode.seed;
         if (play == "reseed") return client.decide("probe.echo", "a", {}, [&] { return reseeded; });

@@ -287,6 +287,15 @@ template <class T> void write(std::string& out, const T& value) {
     }
 }
 
+/// A value as the model takes it; an error begins with what it is about.
+template <class T, class About> T taken(const Json& value, About&& about) {
+    try {
+        return value.as<T>();
+    } catch (const JsonError& error) {
+        throw JsonError(about() + ": " + error.what());
+    }
+}
+
 /// Reads JSON (RFC 8259).
 class Reader {
   public:
@@ -501,10 +510,10 @@ struct Episode {
     std::uint64_t seed;
     Json options;
 
-    /// The option of that name, or what it is by default.
+    /// The option of that name, or what it is by default. Throws JsonError for one of another type.
     template <class T> T option(std::string_view name, T otherwise) const {
         const Json* found = options.find(name);
-        return found ? found->as<T>() : otherwise;
+        return found ? detail::taken<T>(*found, [&] { return "option " + std::string(name); }) : otherwise;
     }
     std::string option(std::string_view name, const char* otherwise) const {
         return option<std::string>(name, otherwise);
@@ -594,11 +603,8 @@ class Client {
         if (!connected_) return std::nullopt;
         const std::optional<Json> value = call(point, entity, arguments, time);
         if (!value) return std::nullopt;
-        try {
-            return value->as<T>();
-        } catch (const JsonError& error) {
-            throw JsonError("decision " + std::to_string(calls_) + ", at " + std::string(point) + ": " + error.what());
-        }
+        return detail::taken<T>(
+            *value, [&] { return "decision " + std::to_string(calls_) + ", at " + std::string(point); });
     }
 
     /// Says what an entity's arguments are by now, for its last observation and reward: before it is removed, or before

@@ -239,6 +239,10 @@ def test_options_that_are_missing_are_none(child):
     assert child.receive()["args"] == {"value": None}
 
 
+def test_an_option_of_another_type_is_an_error_that_names_it(child):
+    assert child.begin(times="x")["error"]["text"].startswith('option times: "x" is not of the type')
+
+
 def test_a_loop_of_the_authors_own(folder):
     with Child(compiled(SOURCES / "loop.cpp", folder)) as child:
         assert child.receive() == {"hello": 1, "points": ["loop.go"], "can": []}

@@ -24,6 +24,7 @@ import os
 import shlex
 import shutil
 import subprocess
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -95,7 +96,12 @@ def observe(call: Any) -> NDArray[np.float32]:
     return np.array(values, np.float32)
 
 
-_elapsed = difference(lambda call: call.time)
+def to_factor(action: Any) -> float:
+    """What an action decides: by what to multiply the rate."""
+    return float(2.0 ** np.asarray(action, float).item())
+
+
+_elapsed = difference(attrgetter("time"))
 
 
 def reward(call: Any) -> float:
@@ -110,9 +116,9 @@ POINTS: Final[dict[str, Definition]] = {
         observation_space=Box(-np.inf, np.inf, (len(OBSERVED),), np.float32),
         observation_space_mapping=observe,
         action_space=Box(-1.0, 1.0, (1,), np.float32),
-        action_space_mapping=lambda action: float(2.0 ** np.asarray(action, float).item()),
+        action_space_mapping=to_factor,
         reward_mapping=reward,
-        agent=lambda call: call.entity,
+        agent=attrgetter("entity"),
     )
 }
 """The decision point of the model, and what it is to an environment."""

@@ -141,3 +141,18 @@ def test_what_cannot_be_is_refused(tmp_path):
         sobol_indices(frame, "some")
     with pytest.raises(OptionValueError, match="no variance"):
         sobol_indices(results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "saltelli", 2), tmp_path / "b"), "return")
+
+
+def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
+    rows = [
+        {"a": a, "b": b, "contender": "rule", "seed": seed, "agent": "team", "return": 100 * b + noise * (seed - 1.5),
+         "length": 1, "status": "ok", "error": None}
+        for noise in (0, 4) for a in (f"quiet{noise}", f"loud{noise}") for b in (0, 1) for seed in range(4)
+    ]  # fmt: skip
+    found = effects(pd.DataFrame(rows)).main
+    for a in ("quiet0", "loud0"):
+        assert found.loc[("a", a), ["mean", "low", "high"]].tolist() == [50, 50, 50]
+    low, high = found.loc[("a", "loud4"), ["low", "high"]]
+    assert 44 <= low < 50 < high <= 56
+    alone = effects(pd.DataFrame([row for row in rows if row["seed"] == 1])).main
+    assert alone.loc[("a", "quiet0"), "low"] < 50 < alone.loc[("a", "quiet0"), "high"]

@@ -87,7 +87,9 @@ def effects(
 ) -> Effects:
     """Say what the factors of an experiment do.
 
-    Factors of many numbers are grouped into quarters. Runs that have failed are left out.
+    Factors of many numbers are grouped into quarters. Runs that have failed are left out. Intervals are over the seeds,
+    for the rows that there are: what the other factors do at a level makes them no wider. Where there is only one seed,
+    they are over the rows.
 
     Args:
         frame: What ``run_experiment`` has returned.
@@ -115,8 +117,11 @@ def effects(
     values = numbers(table[of], of).to_numpy()
     at = {name: [_at(levels[name], level) for level in own] for name, own in found.items()}
     main = []
-    for there in (values[mask] for masks in at.values() for mask in masks):
-        main.append([there.mean(), *interval(there, confidence), there.mean() - values.mean(), len(there)])
+    seeds = table["seed"].to_numpy()
+    for mask in (mask for masks in at.values() for mask in masks):
+        there = values[mask]
+        sample = _by_seed(there, seeds[mask])
+        main.append([there.mean(), *interval(sample, confidence), there.mean() - values.mean(), len(there)])
     pairs = [(name, level) for name, own in found.items() for level in own]
     index = pandas.MultiIndex.from_tuples(pairs, names=["factor", "level"])
     rows = pandas.DataFrame(main, index, columns=["mean", "low", "high", "effect", "count"])
@@ -124,6 +129,15 @@ def effects(
     strengths = [(*pair, _strength(own.to_numpy(np.float64))) for pair, own in cells.items()]
     apart = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(["factor", "other"])
     return Effects(rows.astype({"count": int}), apart.sort_values("strength", ascending=False), of, found, cells)
+
+
+def _by_seed(values: NDArray[np.float64], seeds: NDArray[Any]) -> NDArray[np.float64]:
+    """The mean of each seed; the values themselves where there is only one seed."""
+    distinct, place = np.unique(seeds, return_inverse=True)
+    if len(distinct) < 2:
+        return values
+    sums: NDArray[np.float64] = np.bincount(place, values)
+    return sums / np.bincount(place)
 
 
 def _taken(frame: DataFrame, of: str, contender: str | None, agent: str) -> tuple[DataFrame, list[str]]:

@@ -14,8 +14,10 @@ from simenv_marl import (
     OptionValueError,
     SimulationError,
     SteppedSimulation,
+    UnknownPointError,
     aec_env,
     design,
+    evaluate,
     make_step,
     run_experiment,
     simulate,
@@ -122,3 +124,20 @@ def test_bad_input():
         simulate(SteppedSimulation(lambda: object(), 3))
     with pytest.raises(TypeError, match="length"):
         simulate(SteppedSimulation(Walk, 3, length=1))
+
+
+def test_points_are_those_that_are_named():
+    def decide():
+        """Decide something of another model."""
+
+    others = []
+    for package in ("one", "another"):
+        decide.__module__ = f"{package}.model"
+        others.append(next(iter(STRIDE.values()))(decide))
+    with pytest.raises(UnknownPointError, match="points is empty"):
+        aec_env(SteppedSimulation(Walk, 5))
+    assert simulate(SteppedSimulation(Walk, 5), seed=2).model.place == walked(2, 5)
+    table = evaluate(SteppedSimulation(Walk, 5), {"rule": {}}, seeds=range(2)).frame
+    assert table["return"].tolist() == [0.0, 0.0]
+    played = simulate(SteppedSimulation(Walk, 5), {"stride_0": lambda place: 2}, points=STRIDE, seed=2)
+    assert played.model.place == walked(2, 5, drift=1.0)

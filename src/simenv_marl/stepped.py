@@ -25,6 +25,9 @@ class SteppedSimulation(SimulationInterface):
         parameters: With what it is made.
     """
 
+    points: Any = ()
+    """The decision points of the model are named where environments are made."""
+
     def __init__(self, model: Callable[..., Any], steps: int | None = None, /, **parameters: Any) -> None:
         """Say what is stepped.
 

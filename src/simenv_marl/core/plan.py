@@ -332,7 +332,7 @@ class Plan:
         modes = getattr(model, "render_modes", RENDER_MODES) if hasattr(model, "render") else ()
         required = not unanswered or others is not None or names_agents(checked.policies)
         own = own_points(model)
-        named = find_points(points, model, own, required=required)
+        named = find_points(points, model, own, required=required, empty=unanswered)
         return cls(
             source, named, checked, list(modes), unanswered=unanswered, rewarded=rewarded, others=others,
             render_fps=getattr(model, "render_fps", RENDER_FPS), spare=spare, variant=variant,

@@ -103,7 +103,12 @@ def own_points(simulation: Any) -> dict[DecisionPoint, Definition]:
 
 
 def find_points(
-    points: Any, simulation: Any, own: Mapping[DecisionPoint, Definition] | None = None, *, required: bool = True
+    points: Any,
+    simulation: Any,
+    own: Mapping[DecisionPoint, Definition] | None = None,
+    *,
+    required: bool = True,
+    empty: bool = False,
 ) -> list[NamedPoint]:
     """Find all that ``points=`` names.
 
@@ -114,6 +119,7 @@ def find_points(
         simulation: The simulation.
         own: Its ``own_points``, if they are known.
         required: Whether all decorated points are meant where none is named, and not none.
+        empty: Whether ``points`` may name none.
 
     Returns:
         The points, in the order in which they were named.
@@ -137,7 +143,7 @@ def find_points(
         if isinstance(points, str) or not hasattr(points, "__iter__"):
             points = [points]
         found = [find_point(key, own=own) for key in points]
-    if not found:
+    if not found and not empty:
         raise UnknownPointError("no decision point was named: points is empty")
     for number, named in enumerate(found):
         if any(named.point is other.point for other in found[:number]):

@@ -136,8 +136,7 @@ def _by_seed(values: NDArray[np.float64], seeds: NDArray[Any]) -> NDArray[np.flo
     distinct, place = np.unique(seeds, return_inverse=True)
     if len(distinct) < 2:
         return values
-    sums: NDArray[np.float64] = np.bincount(place, values)
-    return sums / np.bincount(place)
+    return np.bincount(place, values) / np.bincount(place)
 
 
 def _taken(frame: DataFrame, of: str, contender: str | None, agent: str) -> tuple[DataFrame, list[str]]:

@@ -22,6 +22,7 @@ decision through the rooms.
 
 from . import errors
 from .branching import branch
+from .callbacks import CallbackGuard
 from .core.provenance import provenance
 from .core.reseeding import reseed_generators
 from .core.variant import Variant
@@ -75,6 +76,7 @@ __all__ = [
     "TRUNCATED",
     "ActionValues",
     "Call",
+    "CallbackGuard",
     "ChangedArgs",
     "ChangedResult",
     "Comparison",

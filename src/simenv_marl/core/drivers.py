@@ -8,7 +8,7 @@ from typing import Any, Final
 from weakref import finalize
 
 from ..simulation import make_simulation
-from .events import FAILED
+from .events import FINISHED, STALLED
 from .greenlets import GreenletDriver
 from .switch import BaseDriver
 from .threads import ThreadDriver
@@ -29,8 +29,10 @@ def run_job(driver: BaseDriver, job: Callable[[], Any], context: Context | None 
         driver.unwind()  # an interrupt has come while it was waited for
         raise
     value = box.pop()
-    if kind is not FAILED:
+    if kind is FINISHED:
         return value
+    if kind is STALLED:
+        driver.unwind()
     try:
         raise value
     finally:

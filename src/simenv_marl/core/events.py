@@ -14,6 +14,7 @@ action, or is over.
 | ``Told`` | a rule has decided | its action is noted |
 | ``Finished`` | ``run`` has returned | all agents end |
 | ``Failed``, ``Refused`` | the simulation has raised; a decision was refused | the error is raised |
+| ``Stalled`` | a callback has raised, and the C code that called it goes on and on | the error is raised |
 """
 
 from __future__ import annotations
@@ -180,6 +181,22 @@ class Refused:
         raise episode.driver.refusal()
 
 
+class Stalled:
+    """A callback has raised, and the C code that has called it does not come to its end: see ``CallbackGuard``.
+
+    Attributes:
+        deliver, told: None: the simulation does not go on.
+    """
+
+    deliver = told = None
+
+    def arise(self, episode: Episode, box: list[Any], _: Any) -> Any:
+        """Raise the error, which the box holds. What is left in the simulation is still to unwind."""
+        episode.failed_in_model = True
+        raise box.pop()
+
+
 FINISHED: Final = Finished()
 FAILED: Final = Failed()
+STALLED: Final = Stalled()
 REFUSED: Final = Refused()

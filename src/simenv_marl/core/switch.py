@@ -5,7 +5,8 @@ A *driver* keeps one stack for a simulation, on which *jobs* run one after the o
 and then hands replies to the simulation; ``throw`` raises ``SimulationExit`` in it. Each returns the *event* that comes
 from the simulation next, a tuple of three: a decision (what the plan has for it, and the call's args and kwargs), or
 the end of the job: ``FINISHED`` or ``FAILED``, with a list that holds the result or the error, and None. The list is
-to be emptied: the stack waits for the next job with it in its hands.
+to be emptied: the stack waits for the next job with it in its hands. ``STALLED``, with such a list and a number of
+seconds, is a job that has failed and does not come to its end for so long.
 
 On the simulation's side a driver enters its stack in the hooks of the functions that are decided, with a function that
 hands a call over and carries out the reply.
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextvars import Context
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, Final, Protocol
 
 from greenlet import getcurrent, greenlet
@@ -23,9 +24,8 @@ from greenlet import getcurrent, greenlet
 from ..errors import SimulationError, WrongThreadError, annotate
 from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Taker, stack_of
-from ..simulation import Sentinel
 from .children import Children, ChildThread, unwatch, watch
-from .events import FAILED, FINISHED, REFUSED
+from .events import FAILED, FINISHED, REFUSED, STALLED
 
 
 class SimulationExit(SystemExit):
@@ -48,12 +48,13 @@ class Crossing(Protocol):
         """What crosses, with the decision, args and kwargs, once the rule has decided a call; None: nothing."""
 
 
-STUCK: Final = Sentinel("STUCK")
-"""What ``throw`` returns, with for how many seconds it has waited, where nothing comes from the simulation."""
 Event = tuple[Any, Any, Any]
 
 NO_DECISIONS: Final[Mapping[Hook, Crossing]] = MappingProxyType({})
 """What crosses while a simulation is made, reset or closed: nothing."""
+
+SECONDS_TO_UNWIND: Final = 5.0
+"""How long a simulation that is to be unwound may take to its next decision or to its end."""
 
 UNWINDING_TRIES: Final = 1000
 """How often a simulation that is to be unwound may decide or swallow before it is given up. A SimPy model loses one of
@@ -179,12 +180,9 @@ class BaseDriver:
         """
         problems: list[BaseException] = []
         for _ in range(UNWINDING_TRIES):
-            kind, box, _ = self.throw()
-            if kind is STUCK:
-                self.given_up = (
-                    f"has neither decided anything nor ended for {box} s; it is left running in its thread until it"
-                    " decides again"
-                )
+            kind, box, seconds = self.throw()
+            if kind is STALLED:
+                self.given_up = f"has neither decided anything nor ended for {seconds} s; it is left where it is"
                 break
             if kind is FINISHED or kind is FAILED:
                 value = box.pop()
@@ -293,6 +291,18 @@ class BaseDriver:
 
         return _TELLING[hook.kind](hook.rule, told)
 
+    def stall(self, error: BaseException, seconds: float) -> None:
+        """On the stack: tell the user of an error that cannot surface, since something does not come to its end.
+
+        Args:
+            error: The error.
+            seconds: For how long it has been waited.
+
+        Raises:
+            SimulationExit: The answer to it.
+        """
+        self._decider(_NO_HOOK, STALLED, away=True)([error], seconds)  # type: ignore[arg-type]
+
     def decides(self, hook: Hook) -> bool:
         """Whether calls of a hook are handed over by the job that is under way."""
         return hook in self._events
@@ -379,6 +389,9 @@ class BaseDriver:
     def forked_worker(self) -> None:
         """The simulation has begun a worker of ``multiprocessing`` by a fork, and this is the worker."""
         self._go_astray("a process that the simulation has forked as a worker")
+
+
+_NO_HOOK: Final[Any] = SimpleNamespace(rule=None)
 
 
 def _telling(rule: Any, told: Any) -> Any:

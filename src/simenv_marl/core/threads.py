@@ -13,12 +13,9 @@ from ..errors import WrongThreadError, warn_user
 from ..hooks.hook import Hook
 from ..hooks.stacks import Taker
 from ..simulation import RULE, Sentinel
-from .events import FAILED
+from .events import FAILED, STALLED
 from .loops import hush
-from .switch import STUCK, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
-
-SECONDS_TO_UNWIND: Final = 5.0
-"""How long a simulation that is to be unwound may take to its next decision or to its end."""
+from .switch import SECONDS_TO_UNWIND, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 _A_WHILE: Final = 1.0
 """For how many seconds the user waits before it looks around: a Ctrl-C just before a wait does not wake from it."""
@@ -164,7 +161,7 @@ class ThreadDriver(BaseDriver):
         while (event := self._end or self._event) is None:
             left = patience - monotonic()
             if left <= 0:
-                return STUCK, SECONDS_TO_UNWIND, None
+                return STALLED, [], SECONDS_TO_UNWIND
             self._arrived.acquire(timeout=left)
         self._event = self._end = None
         return event

@@ -5,6 +5,7 @@ The rooms of the package; each imports only from those below it::
     __main__                            the command line
     planning                            what actions are worth, and policies that decide by that
     testing, registration, branching    checks of a simulation; registries; exact continuations of an episode
+    callbacks                           what is raised in callbacks of C code
     experiments                         contenders on the same seeds; designs; sweeps that resume; what factors do
     envs                                views: an episode read as a PettingZoo or Gymnasium environment
     many                                policies back in the model, in one simulation or in many at once; pictures

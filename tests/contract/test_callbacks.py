@@ -576,6 +576,30 @@ def test_interleaved_environments_whose_callbacks_are_suspended_in_any_order():
         env.close()
 
 
+def test_libraries_that_note_for_each_thread_which_call_is_under_way_need_threads(request):
+    """With greenlets their calls are mixed up, which the page on callbacks says: results are wrong, or a crash."""
+    if request.node.callspec.params["_driver"] != "thread":
+        pytest.skip("it needs threads")
+    integrate = pytest.importorskip("scipy.integrate")
+
+    def integral(number, ask):
+        return integrate.quad(lambda x: number * x + ask(), 0, 1)[0]
+
+    def main(simulation):
+        simulation.log.append(integral(simulation.seed, decide))
+
+    decide = decision(lambda: 0)
+    envs = [single_env(script(main), decide) for _ in range(3)]
+    for seed, env in enumerate(envs):
+        env.reset(seed=seed)
+    order, left = random.Random(0), list(envs)
+    while left:
+        env = order.choice(left)
+        if env.step(2)[2]:
+            left.remove(env)
+    assert [env.unwrapped.simulation.log for env in envs] == [[integral(seed, lambda: 2)] for seed in range(3)]
+
+
 @pytest.mark.parametrize("method", ["fork", "replay"])
 def test_an_episode_is_branched_while_it_is_suspended_in_a_callback(method, request):
     if method == "fork" and request.node.callspec.params["_driver"] == "thread":

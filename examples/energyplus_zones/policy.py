@@ -1,0 +1,42 @@
+"""A policy that looks who is there, and heats the earlier the colder the room is, beside the model's time switch.
+
+``python -m examples.energyplus_zones.policy`` compares the two on the same days.
+"""
+
+from __future__ import annotations
+
+from math import atan2, pi
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from simenv_marl import Evaluation, evaluate
+
+from .env import AGENTS, BuildingSim, to_action
+from .model import COMFORT
+
+WARM, COLD = COMFORT + 0.2, 15.0
+
+BEGIN, LATEST = 8.5, 10.0
+"""When the room is to be warm, and from when on none come any more."""
+
+HOURS_PER_DEGREE: Final = 1.0
+"""How long the heater takes to make it a degree warmer."""
+
+
+def by_presence(observation: NDArray[Any], info: dict[str, Any]) -> list[float]:
+    """Heat where people are, and in the morning in time for them."""
+    sine, cosine, _, temperature, _, people = observation.tolist()
+    hour = atan2(sine, cosine) / pi * 12 % 24
+    early = max(0.0, COMFORT - temperature) * HOURS_PER_DEGREE
+    return to_action(WARM if people or BEGIN - early <= hour < LATEST else COLD)
+
+
+def compare(seeds: range, workers: int = 0) -> Evaluation:
+    """Compare the policy with the time switch on the same days."""
+    contenders = {"time switch": {}, "by presence": dict.fromkeys(AGENTS, by_presence)}
+    return evaluate(BuildingSim, contenders, seeds=seeds, baseline="time switch", workers=workers)
+
+
+if __name__ == "__main__":
+    print(compare(range(20)).summary().round(2).to_string())

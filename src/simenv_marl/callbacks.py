@@ -99,12 +99,11 @@ class CallbackGuard:
     def _keep(self, error: BaseException) -> None:
         """Have an error surface where C was called, and C return there."""
         kept = self._error
+        if kept is None:
+            self._patience = monotonic() + SECONDS_TO_UNWIND
         if kept is None or isinstance(error, SimulationExit) or isinstance(kept, SimulationExit):
             self._error = error
-        if kept is not None:
-            return
-        self._patience = monotonic() + SECONDS_TO_UNWIND
-        if self._stop is not None:
+        if kept is None and self._stop is not None:
             try:
                 self._stop()
             except BaseException as problem:

@@ -9,9 +9,11 @@ import subprocess
 import sys
 import textwrap
 import threading
+import warnings
 import weakref
 from contextlib import closing, suppress
 from functools import cache, reduce
+from itertools import count
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -19,6 +21,7 @@ import greenlet
 import pytest
 
 from simenv_marl import RULE, CallbackGuard, aec_env, branch, handlers, parallel_env, simulate, single_env
+from tests.contract.test_faults import interrupt_at
 from tests.worlds.models import Script, alive, culprits, decision, notes, script, stacks
 
 ROOT = Path(__file__).parents[2]
@@ -415,6 +418,31 @@ def test_an_interrupt_that_comes_while_c_code_runs_surfaces(view, during):
         env.close()
 
 
+@pytest.mark.usefixtures("_collected")
+def test_an_interrupt_anywhere_around_callbacks_surfaces(monkeypatch):
+    monkeypatch.setattr("simenv_marl.core.threads.SECONDS_TO_UNWIND", 0.05)
+    decide = comparing()
+
+    def whole_run(env):
+        for seed in range(2):
+            env.reset(seed=seed)
+            env.step(1)
+        env.close()
+
+    for number in count(1):
+        env = single_env(sorting(decide, [], 4), decide)
+        where, raised = interrupt_at(number, whole_run, env)
+        if where is None:
+            assert raised is None
+            break
+        assert type(raised) is KeyboardInterrupt, where
+        del raised
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)  # a thread that was never begun cannot be unwound
+            whole_run(env)
+    assert number > 100
+
+
 def test_the_hook_of_what_cannot_be_raised_is_left_to_others(monkeypatch):
     others = []
     monkeypatch.setattr(sys, "unraisablehook", others.append)
@@ -471,6 +499,24 @@ def test_an_error_in_c_code_that_does_not_end_surfaces_nevertheless():
     env.reset()
     env.step(1)
     with pytest.warns(ResourceWarning, match="neither decided anything nor ended"):
+        env.close()
+
+
+@pytest.mark.usefixtures("_impatient")
+def test_an_error_while_c_code_that_does_not_end_is_unwound_surfaces_nevertheless():
+    def ask():
+        try:
+            return decide()
+        finally:
+            raise KeyError("while unwinding")
+
+    decide = decision()
+    env = single_env(endless(ask), decide)
+    env.reset()
+    with (
+        pytest.raises(KeyError, match="while unwinding"),
+        pytest.warns(ResourceWarning, match="neither decided anything nor ended"),
+    ):
         env.close()
 
 

@@ -182,6 +182,8 @@ class BaseDriver:
         for _ in range(UNWINDING_TRIES):
             kind, box, seconds = self.throw()
             if kind is STALLED:
+                problems += [error for error in box if not is_exit(error)]
+                box.clear()
                 self.given_up = f"has neither decided anything nor ended for {seconds} s; it is left where it is"
                 break
             if kind is FINISHED or kind is FAILED:

@@ -32,7 +32,7 @@ from simenv_marl import (
 
 from .model import HIGHEST_SETPOINT, LOWEST_SETPOINT, STEPS_PER_HOUR, Building, Zone
 
-AGENTS: Final = ["south", "north"]
+AGENTS: Final = ["south_0", "north_0"]
 
 OBSERVED: Final = (
     "the hour of the day, as a sine",
@@ -80,7 +80,7 @@ POINTS: Final[dict[Any, Definition]] = {
         action_space=Box(0.0, 1.0, (1,), np.float32),
         action_space_mapping=to_degrees,
         reward_mapping=reward,
-        agent=lambda zone: zone.name,
+        agent=lambda zone: f"{zone.name}_0",
     )
 }
 """The thermostats of both rooms."""

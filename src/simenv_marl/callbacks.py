@@ -49,22 +49,21 @@ class CallbackGuard:
         self._stop = stop
         self._depth = 0
         self._error: BaseException | None = None
-        self._patience = 0.0
 
     def callback(self, function: Callable[..., Any], result: Any = 0) -> Callable[..., Any]:
         """Wrap a function that C is going to call.
 
         Args:
             function: The function.
-            result: What C is answered by the call that has failed, and by those that come after it. 0 serves
-                everywhere but in cffi's void functions, which take None.
+            result: What C is answered by the call that has failed, and by those that come after it. 0 serves for
+                numbers, pointers and void functions of ctypes; void functions of cffi take None.
 
         Returns:
             The function to be given to ctypes, cffi, or whatever calls it from C.
         """
         guard = self
 
-        @wraps(function)
+        @wraps(function, updated=())  # it is no decision point, should the function be one
         def callback(*args: Any) -> Any:
             try:
                 if guard._error is None:

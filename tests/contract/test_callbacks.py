@@ -368,7 +368,8 @@ def test_outside_an_environment_errors_surface_and_callbacks_cost_next_to_nothin
 def test_outside_a_block_a_callback_is_called_as_it_is():
     guard = CallbackGuard(stop=lambda: pytest.fail("nothing is to be stopped"))
     divide = guard.callback(lambda number: 1 // number)
-    assert divide(1) == 1
+    with guard, guard:
+        assert divide(1) == 1
     with pytest.raises(ZeroDivisionError):
         divide(0)
     assert divide.__name__ == "<lambda>"
@@ -376,10 +377,10 @@ def test_outside_a_block_a_callback_is_called_as_it_is():
 
 def test_what_c_is_answered_after_an_error_can_be_said():
     answers, guard = [], CallbackGuard()
-    call = guard.callback(lambda: 1 // 0, result=-1)
+    call, other = guard.callback(lambda: 1 // 0, result=-1), guard.callback(lambda: 1)
     with pytest.raises(ZeroDivisionError), guard:
-        answers += [call(), call()]
-    assert answers == [-1, -1]
+        answers += [call(), call(), other()]
+    assert answers == [-1, -1, 0]
 
 
 # -- interrupts -----------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import pytest
 from pettingzoo import test as kit
 
 from simenv_marl import RULE, branch, parallel_env, simulate
+from simenv_marl.testing import check_simulation
 from tests.conftest import DRIVERS
 from tests.worlds.models import culprits, follow_the_rule, notes, play
 
@@ -86,6 +87,13 @@ def test_actions_change_the_results(plain):
     heater = env.unwrapped.simulation.building.zones[0]
     assert heater.temperature > 21
     env.close()
+
+
+def test_nothing_is_found_by_the_checks():
+    report = check_simulation(
+        zones.BuildingSim, episodes=1, seeds=[3], fingerprint=lambda simulation: simulation.results
+    )
+    assert [str(finding) for finding in report.findings] == []
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")  # of PettingZoo's own

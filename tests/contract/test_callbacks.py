@@ -330,6 +330,29 @@ def test_what_the_c_codes_caller_says_of_having_been_stopped_does_not_hide_the_e
     assert isinstance(caught.value.__context__, KeyError)
 
 
+@pytest.mark.usefixtures("_collected")
+def test_an_error_that_was_dealt_with_leaves_nothing_behind():
+    class Witness:
+        pass
+
+    def fail():
+        local = Witness()
+        raise ZeroDivisionError(local)
+
+    def call():
+        guard = CallbackGuard()
+        with guard:
+            try:
+                guard.callback(fail)()
+                raise RuntimeError("was stopped")
+            finally:
+                local = Witness()  # noqa: F841 - in the frame of the traceback
+
+    with suppress(ZeroDivisionError):
+        call()
+    assert sum(type(thing) is Witness for thing in gc.get_objects()) == 0
+
+
 def test_an_error_is_dealt_with_at_the_block_around_the_c_code_that_has_called_back():
     decide, told = comparing(), []
 

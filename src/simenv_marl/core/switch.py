@@ -194,7 +194,7 @@ class BaseDriver:
         if self.given_up is None:
             self.given_up = (
                 f"refuses to end: it went on after {UNWINDING_TRIES} times SimulationExit was raised in it; it is left"
-                " suspended. Let it re-raise what it does not know"
+                " suspended. Let it re-raise what it does not know; what is called back by C code needs a CallbackGuard"
             )
         self.give_up()
         return problems

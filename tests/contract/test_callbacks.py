@@ -527,6 +527,32 @@ def test_an_error_in_c_code_that_does_not_end_surfaces_nevertheless():
 
 
 @pytest.mark.usefixtures("_impatient")
+def test_c_code_that_the_stop_of_the_simulation_ends_is_unwound_after_an_error():
+    class Model(Script):
+        def run(self):
+            guard, self.stopped, log = CallbackGuard(), ctypes.c_int(0), self.log
+            callback = EACH(guard.callback(lambda _: 1 // decide()))
+            try:
+                with guard:
+                    loops().loop(callback, 2**31 - 1, ctypes.byref(self.stopped))
+                    loops().loop(callback, 100, ctypes.byref(ctypes.c_int(0)))  # takes a while to end
+            finally:
+                log.append("finally")
+
+        def stop(self):
+            self.stopped.value = 1
+
+    decide = decision()
+    env = single_env(lambda: Model(None), decide)
+    env.reset()
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.step(0)
+    assert "unwound" not in notes(caught.value)
+    assert env.unwrapped.simulation.log == ["finally"]
+    env.close()
+
+
+@pytest.mark.usefixtures("_impatient")
 def test_an_error_while_c_code_that_does_not_end_is_unwound_surfaces_nevertheless():
     def ask():
         try:

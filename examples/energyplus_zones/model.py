@@ -42,13 +42,17 @@ class Zone:
 
     Attributes:
         building: The building.
-        name: Its name; ``other`` is the room beside it.
+        name: Its name.
+        other: The room beside it.
+        begin, end, expected: When people come and leave on the present day, and how many.
         people: How many people are in it.
         temperature: Of its air.
         setpoint: Up to which temperature its heater works.
         energy: Kilowatt hours that its heater has used.
         cost: What that has cost, with what it costs that people were cold.
     """
+
+    other: Zone
 
     def __init__(self, building: Building, name: str) -> None:
         """Put a heater, a thermometer and a thermostat into a room of the building."""
@@ -57,15 +61,11 @@ class Zone:
         self.people, self.temperature, self.setpoint = 0, 0.0, 0.0
         self.energy = self.cost = 0.0
         self.begin = self.end = 0.0
+        self.expected = 0
         self._air = engine.sensor("Zone Mean Air Temperature", name)
         self._power = engine.sensor("Baseboard Electricity Rate", f"{name} heater")
         self._thermostat = engine.actuator("Zone Temperature Control", "Heating Setpoint", name)
         self._people = engine.actuator("People", "Number of People", f"{name} people")
-
-    @property
-    def other(self) -> Zone:
-        """The room beside it."""
-        return next(zone for zone in self.building.zones if zone is not self)
 
     def plan_day(self) -> None:
         """Draw when people come today, how many, and when they leave; on some days none come."""
@@ -124,7 +124,8 @@ class Building:
         days = {"begin": f"{first.month},{first.day}", "end": f"{last.month},{last.day}"}
         self.engine = engine = Engine(text.substitute(days))
         self._outside = engine.sensor("Site Outdoor Air Drybulb Temperature", "Environment")
-        self.zones = [Zone(self, "South"), Zone(self, "North")]
+        south, north = self.zones = [Zone(self, "South"), Zone(self, "North")]
+        south.other, north.other = north, south
         self.hour, self.weekday, self.outside, self.steps = 0.0, first.weekday(), 0.0, 0
         engine.at_begin_of_step(self.begin_step)
         engine.at_end_of_step(self.end_step)

@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix test test-clients test-rllib test-wrappers test-oldest test-clusters coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix test test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -69,6 +69,13 @@ test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[experiments]' '$(CLUSTER)'
 	touch $@
+
+# Simulators outside Python: in C++, ns-3, Java and EnergyPlus. What cannot be installed here is told of, and left out.
+test-outside: .venv/.test
+	sh tools/outside.sh
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[energyplus]' || \
+	    echo "EnergyPlus cannot be installed; its tests are skipped" >&2
+	$(BIN)/python -m pytest -n 2 -rs tests/outside
 
 lint: .venv/.test
 	$(BIN)/ruff check .

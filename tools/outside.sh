@@ -1,0 +1,18 @@
+#!/bin/sh
+# What the simulators outside Python are built with: installed where that is allowed, else told of.
+set -eu
+
+missing=""
+command -v g++ > /dev/null || missing="$missing g++"
+command -v pkg-config > /dev/null || missing="$missing pkg-config"
+command -v javac > /dev/null || missing="$missing openjdk-17-jdk-headless"
+pkg-config --exists ns3-core gsl 2> /dev/null || missing="$missing libns3-dev libgsl-dev"
+
+[ -n "$missing" ] || exit 0
+if [ "$(id -u)" = 0 ] && command -v apt-get > /dev/null; then
+    apt-get update -qq
+    # shellcheck disable=SC2086
+    DEBIAN_FRONTEND=noninteractive apt-get install -qq --yes --no-install-recommends $missing > /dev/null
+else
+    echo "not installed, and not to be installed by this user:$missing. Tests that need them are skipped." >&2
+fi

@@ -32,7 +32,17 @@ from .bound import BoundPoint, DeferredPolicy, given_simulation
 from .drivers import Spare
 from .events import Answered, Decision, Ended, Removed, Told
 from .options import Options
-from .points import NamedPoint, find_points, have_instances, locate, own_points, owner_class, portable, stand_ins
+from .points import (
+    NamedPoint,
+    by_name,
+    find_points,
+    have_instances,
+    locate,
+    own_points,
+    owner_class,
+    portable,
+    stand_ins,
+)
 from .roster import assign, call_the_roll, declared_agents, name_agents, names_agents
 from .variant import Variant
 
@@ -110,7 +120,8 @@ class Plan:
         by_point, self.policies, extra = assign(options.policies or {}, named, agents, own)
         self._everything, self._by_point = [*named, *extra], by_point
         self.hooks: list[Hook] = [point.point.hook for point in self._everything]
-        self.plugins = Plugins(options.plugins) if options.plugins else None
+        named_here = {name: point.hook for name, point in by_name(own).items()}
+        self.plugins = Plugins(options.plugins, named_here) if options.plugins else None
         self.wanted = {*self.policies, *declared_agents(options.possible_agents)}
         mappings = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
         self.looked_into = any(isinstance(p, AskingPolicy) for p in (*by_point.values(), *self.policies.values()))
@@ -272,7 +283,7 @@ class Plan:
     def _find_removals(self, *, warns: bool) -> None:
         for binding in self.points:
             for name, agent in (*binding.point.removed_by.items(), *binding.definition.removed_by.items()):
-                point, _ = locate(name)
+                point, _ = locate(name, self._own)
                 removal = self._cross(point, Removed(point))
                 if not isinstance(removal, Removed):
                     raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")

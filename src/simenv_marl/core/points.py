@@ -169,8 +169,7 @@ def find_point(
     """
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {shown(definition)}")
-    by_name = {point.name: point for point in own if hasattr(point.rule, BY_NAME)}
-    point, given = (by_name[key], None) if isinstance(key, str) and key in by_name else locate(key)
+    point, given = locate(key, own)
     definition = definition or given or own.get(point) or point.definition
     if definition is None:
         raise DefinitionError(
@@ -180,11 +179,19 @@ def find_point(
     return NamedPoint(point, definition)
 
 
-def locate(key: Any) -> tuple[DecisionPoint, Definition | None]:
+def by_name(own: Mapping[DecisionPoint, Definition]) -> dict[str, DecisionPoint]:
+    """Those of a simulation's own points that are found by a name, and not in a module."""
+    return {point.name: point for point in own if hasattr(point.rule, BY_NAME)}
+
+
+def locate(
+    key: Any, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})
+) -> tuple[DecisionPoint, Definition | None]:
     """Find the point of a function, whether it has a definition or not.
 
     Args:
         key: A dotted name, or a function.
+        own: The simulation's own points.
 
     Returns:
         The point; the definition that the function itself was decorated with.
@@ -194,7 +201,8 @@ def locate(key: Any) -> tuple[DecisionPoint, Definition | None]:
         PatchError: It leads to something that cannot be patched.
     """
     if isinstance(key, str):
-        return _locate_name(key)
+        point = by_name(own).get(key)
+        return _locate_name(key) if point is None else (point, None)
     function, _ = unbind(key)
     hook = hook_of(function)
     if hook is not None:

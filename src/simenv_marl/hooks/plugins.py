@@ -7,8 +7,9 @@ alone (the option ``plugins``). What has none costs nothing, or, exposed by ``ex
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from ..errors import HandlerError, SimEnvError, shown
@@ -131,8 +132,12 @@ def handlers(*entries: Entry) -> Iterator[None]:
         held.let_go()
 
 
-def _attachable(entry: Any) -> Attached:
+def _attachable(entry: Any, named: Mapping[str, Target] = MappingProxyType({})) -> Attached:
     """A handler that fits its target.
+
+    Args:
+        entry: As ``handlers`` takes it.
+        named: Targets that names lead to before they lead into modules.
 
     Raises:
         SimEnvError: As ``attach_handler``.
@@ -140,7 +145,8 @@ def _attachable(entry: Any) -> Attached:
     if not isinstance(entry, (tuple, list)) or len(entry) != 3:
         raise HandlerError(f"handlers are given as (handler, target, position), not {shown(entry)}")
     handler, target, position = entry
-    return Attached(handler, find_target(target), position)
+    here = isinstance(target, str) and target in named
+    return Attached(handler, named[target] if here else find_target(target), position)
 
 
 # -- of one environment ---------------------------------------------------------------------------
@@ -192,8 +198,12 @@ class Plugins(_Added):
 
     memory: dict[Any, Any] | None = None
 
-    def __init__(self, entries: Iterable[Any]) -> None:
+    def __init__(self, entries: Iterable[Any], named: Mapping[str, Target] = MappingProxyType({})) -> None:
         """Find the targets, and make sure that the handlers fit.
+
+        Args:
+            entries: As ``handlers`` takes them.
+            named: The targets of names that are the simulation's own.
 
         Raises:
             SimEnvError: As ``attach_handler``.
@@ -202,7 +212,7 @@ class Plugins(_Added):
         self._attached: list[Attached] = []
         with LOCK:
             for entry in entries:
-                self._attached.append(_attachable(entry))
+                self._attached.append(_attachable(entry, named))
                 self._given.append(entry[1])
         super().__init__([(attached.target, attached) for attached in self._attached])
 

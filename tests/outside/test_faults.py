@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from simenv_marl import (
     aec_env,
     single_env,
 )
+from simenv_marl.remote.child import _Process
 from tests.outside.reservoirs import BOTH, INFLOW, PRICE, broken, by_its_rule, reservoirs
 from tests.outside.test_process import all_told, child, ruled, runs
 from tests.worlds.faulty import AT_ONCE, FAULTS
@@ -64,6 +66,9 @@ AT_ONCE_TOLD = {
     "exit": (ProcessDiedError, "exited with code 0"),
     "exit 3": (ProcessDiedError, "exited with code 3"),
     "garbage": (WireError, "Welcome to the simulator"),
+    "error": (RemoteError, "has raised Drought: no water"),
+    "no start": (WireError, "has sent .*decide.* before the start of an episode"),
+    "error, no start": (RemoteError, "has raised Drought: no water"),
 }
 
 
@@ -108,7 +113,8 @@ def test_at_once(what):
     for _ in range(2):
         with pytest.raises(kind, match=f"(?s){text}"):
             env.reset(seed=1)
-        assert not env.unwrapped.simulation._link.child
+        left = env.unwrapped.simulation._link.child
+        assert left is None or not left.usable
     env.close()
 
 
@@ -187,6 +193,12 @@ def test_a_process_that_writes_much_on_its_standard_error_is_not_held_up():
     env.close()
 
 
+def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
+    monkeypatch.setattr(_Process, "listen", lambda process: True)  # so that there is always more
+    with pytest.raises(ProcessTimeoutError, match="sent nothing"):
+        broken("at once", "silence", timeout=1.0).reset()
+
+
 def test_a_fork_cannot_go_on_with_the_process_and_can_begin_anew():
     env = aec_env(reservoirs())
     env.reset(seed=1)
@@ -246,3 +258,58 @@ def test_a_process_that_does_not_end_is_ended():
     env.close()
     assert not runs(number)
     assert time.monotonic() - began < 20
+
+
+def test_an_end_that_follows_a_stop_is_not_the_next_episode():
+    env = aec_env(broken("in mid-episode", "end after stop"), "reservoir.inflow")
+    env.reset(seed=1)
+    with pytest.raises(WireError, match=r"has sent .*end.* (after \"stop\"|before the start)"):
+        env.reset(seed=2)
+    env.reset(seed=2)
+    env.close()
+
+
+# -- interrupts, and what runs out ----------------------------------------------------------------
+
+INTERRUPTS = """
+import os, signal, sys, time
+reading, writing = map(int, os.environ["SIMENV_MARL_FDS"].split(","))
+if sys.argv[1] == "on close":
+    os.write(writing, b'{"hello": 1, "points": ["reservoir.inflow", "broker.price"]}\\n')
+    os.read(reading, 1000)
+    os.write(writing, b'{"end": {}}\\n')
+    os.read(reading, 1000)
+open(sys.argv[2], "w").write(str(os.getpid()))
+os.kill(os.getppid(), signal.SIGINT)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("when", ["before hello", "on close"])
+def test_an_interrupt_ends_the_process(when, tmp_path):
+    simulation = reservoirs()
+    simulation.command = [sys.executable, "-c", INTERRUPTS, when, str(tmp_path / "number")]
+
+    def begin_and_close():
+        simulation.reset()
+        simulation.close()
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        begin_and_close()
+    assert not runs(int((tmp_path / "number").read_text()))
+    assert caught.tb  # all that the traceback holds lives
+
+
+def test_no_descriptor_is_left_where_there_are_no_more(monkeypatch):
+    before, pipes, pipe = len(os.listdir("/proc/self/fd")), [], os.pipe
+
+    def scarce():
+        if pipes:
+            raise OSError("too many open files")
+        pipes.append(1)
+        return pipe()
+
+    monkeypatch.setattr(os, "pipe", scarce)
+    with pytest.raises(ProcessDiedError, match="too many open files"):
+        reservoirs().reset()
+    assert len(os.listdir("/proc/self/fd")) == before

@@ -19,6 +19,7 @@ from pettingzoo.test import api_test, parallel_api_test
 from simenv_marl import (
     RULE,
     TRUNCATED,
+    AgentError,
     BranchError,
     DefinitionError,
     OptionValueError,
@@ -53,6 +54,7 @@ from tests.outside.reservoirs import (
     reservoirs,
     told,
 )
+from tests.worlds import bare as bare_world
 
 ROSTER = {"reservoir.inflow": ["a", "b", *(f"new{number}" for number in range(1, 40))]}
 
@@ -265,6 +267,11 @@ def test_simulate_many_and_evaluate(workers):
     assert prices["rule"].tolist() == [by_its_rule(seed)["price"] for seed in range(4)]
 
 
+def test_what_the_process_told_comes_back_from_workers():
+    simulations = simulate_many(reservoirs({"broker.price": _PLAIN}), {}, seeds=range(2), workers=2)
+    assert [simulation.result for simulation in simulations] == [by_its_rule(0), by_its_rule(1)]
+
+
 def _cheap(observation):
     return 0
 
@@ -281,6 +288,46 @@ def test_handlers_extend_decisions_by_their_name(make_env):
     with handlers((lambda call: 7.0, "broker.price", "instead")):
         assert simulate(reservoirs(), seed=1).result["price"] == 7.0
     assert env.unwrapped.simulation.result == by_its_rule(1)
+
+
+# -- names, and what may be left out --------------------------------------------------------------
+
+PLAIN = make_step(
+    observation_space=spaces.Discrete(2),
+    observation_space_mapping=lambda call: call["entity"] is call.entity is None and call["time"] is call.time is None,
+    action_space=spaces.Discrete(3),
+    action_space_mapping={0: "none", 1: None, 2: {"some": [1.5]}},
+    reward_mapping=lambda call: float(len(call)),
+)
+
+
+def bare(*points, definitions=None):
+    """A simulator that sends as little as it may."""
+    command = [sys.executable, bare_world.__file__, *points]
+    return ProcessSimulation(command, definitions or dict.fromkeys(points, PLAIN))
+
+
+@pytest.mark.parametrize("name", ["rate", "a:b/ü", "42", "a.", "json.dumps", "math.sin", "tests.worlds.bare.main"])
+def test_points_may_have_any_name_also_that_of_a_function(make_env, name):
+    before, seen = json.dumps, []
+    env = make_env(aec_env, bare(name), name, plugins=[(lambda call: seen.append(call.point), name, "before")])
+    all_told(env, 1, lambda agent, space: 2)
+    assert env.unwrapped.simulation.result == [{"some": [1.5]}] * 6
+    assert seen == [name] * 6
+    assert simulate(bare(name), {name: lambda observation: 0}, seed=1).result == ["none"] * 6
+    assert json.dumps is before
+    all_told(env, 2, ruled)
+    assert env.unwrapped.simulation.result == [None] * 6
+
+
+def test_another_point_of_the_process_may_end_an_agent(make_env):
+    ending = replace(PLAIN, agent="mill", removed_by={"mill.sold": lambda call: "mill"})
+    mill = bare("mill.rate", "mill.sold", definitions={"mill.rate": ending, "mill.sold": PLAIN})
+    env = make_env(aec_env, mill, "mill.rate")
+    env.reset(seed=1)
+    env.step(0)
+    with pytest.raises(AgentError, match=r"decides at mill\.rate after its end"):
+        env.step(0)
 
 
 def test_apply_answers_with_what_it_returns(make_env):
@@ -400,6 +447,26 @@ _PLAIN = make_step(
 )
 
 
+def test_the_environment_variables_may_be_those_of_this_process():
+    assert pickle.loads(pickle.dumps(reservoirs({"broker.price": _PLAIN}, env=os.environ))).env == dict(os.environ)
+
+
+def test_calls_can_be_copied():
+    seen = []
+
+    def look(call):
+        seen.append((copy.copy(call), copy.deepcopy(call), pickle.loads(pickle.dumps(call))))
+        return [call.total]
+
+    watched = replace(_PLAIN, observation_space_mapping=look)
+    simulate(reservoirs({"broker.price": watched}), {"broker.price": _cheap}, seed=1)
+    assert len({repr(copied) for copied, _, _ in seen}) == len(seen) == 4
+    for copies in seen:
+        assert {(each.total, each.time, each.point, each.entity) for each in copies} == {
+            (copies[0].total, copies[0].time, "broker.price", None)
+        }
+
+
 def test_processes_interleaved_are_those_run_one_by_one(make_env):
     envs = [make_env(aec_env, reservoirs()) for _ in range(8)]
     for seed, env in enumerate(envs):
@@ -466,7 +533,13 @@ def test_the_process_ends_with_the_one_that_has_started_it():
 # -- bad input ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [{"a": object()}, {"a": {1: 2}}, {"a": {3}}, {"a": [b"bytes"]}])
+_ROUND: list = []
+_ROUND.append(_ROUND)
+
+
+@pytest.mark.parametrize(
+    "options", [{"a": object()}, {"a": {1: 2}}, {"a": {3}}, {"a": [b"bytes"]}, {"a": _ROUND}, {"a": 10**5000}]
+)
 def test_options_that_are_no_json_are_refused_before_anything_is_sent(make_env, options):
     env = make_env(aec_env, reservoirs())
     env.reset(seed=1)

@@ -1,5 +1,6 @@
 """A simulator that does something wrong: ``python faulty.py WHAT``, one of ``FAULTS``, or of ``AT_ONCE``."""
 
+import json
 import os
 import signal
 import subprocess
@@ -59,6 +60,9 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
 }
 """What goes wrong in mid-episode, after three decisions."""
 
+
+_HELLO = json.dumps({"hello": 1, "points": outside.POINTS}).encode() + b"\n"
+
 AT_ONCE: dict[str, Callable[[Any], Any]] = {
     "no hello": lambda wire: wire.send({"decide": 1, "point": "reservoir.inflow"}),
     "version 2": lambda wire: wire.send({"hello": 2, "points": outside.POINTS}),
@@ -69,6 +73,9 @@ AT_ONCE: dict[str, Callable[[Any], Any]] = {
     "exit": lambda wire: os._exit(0),
     "exit 3": lambda wire: os._exit(3),
     "garbage": lambda wire: wire.raw(b"Welcome to the simulator!\n"),
+    "error": lambda wire: wire.send({"error": {"type": "Drought", "text": "no water"}}),
+    "no start": lambda wire: wire.raw(_HELLO + b'{"decide": 1, "point": "reservoir.inflow"}\n'),
+    "error, no start": lambda wire: wire.raw(_HELLO + b'{"error": {"type": "Drought", "text": "no water"}}\n'),
 }
 """What goes wrong in place of the hello."""
 
@@ -84,8 +91,13 @@ class Faulty:
 
     def run(self, decide: Callable[..., Any], *_: Any) -> None:
         """Decide three times, then do it."""
-        for _ in range(3):
-            decide("reservoir.inflow", "a", None, {"level": 1.0, "queue-length": 0}, lambda: 1.0)
+        try:
+            for _ in range(3):
+                decide("reservoir.inflow", "a", None, {"level": 1.0, "queue-length": 0}, lambda: 1.0)
+        except outside.Stopped:
+            if self.what == "end after stop":
+                self.wire.send({"end": {}})
+            raise
         if not self.options.get("well"):
             FAULTS[self.what](self.wire)
             self.wire.receive()

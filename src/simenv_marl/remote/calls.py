@@ -15,7 +15,7 @@ class RemoteCall:
     """An entity's latest call of a decision point: what mappings, ``agent`` and ``apply`` get.
 
     The call's arguments are its attributes and items: ``call.level``, ``call["queue-length"]``. Of one entity at one
-    point it is one object, which changes from call to call.
+    point it is one object, which changes from call to call; a copy of it does not.
 
     Attributes:
         point: The name of the decision point.
@@ -30,7 +30,12 @@ class RemoteCall:
         self.time: float | None = None
 
     def __getitem__(self, name: str) -> Any:
-        return self.__dict__[name]
+        try:
+            return self.__dict__[name]
+        except KeyError:
+            if name not in ("entity", "time"):
+                raise
+            return getattr(self, name)
 
     def __contains__(self, name: object) -> bool:
         return name in self.__dict__
@@ -42,6 +47,8 @@ class RemoteCall:
         return len(self.__dict__)
 
     def __getattr__(self, name: str) -> Any:
+        if name in RemoteCall.__slots__:  # of a copy that is being made
+            raise AttributeError(name)
         raise AttributeError(
             f"the call of {self.point} has no argument {name!r}; it has {', '.join(self.__dict__) or 'none'}"
         )

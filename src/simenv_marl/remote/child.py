@@ -16,7 +16,17 @@ from time import monotonic, sleep
 from typing import Any, Final, NoReturn, TypeGuard
 from weakref import finalize
 
-from ..errors import ProcessDiedError, ProcessTimeoutError, SimEnvError, WireError, WrongThreadError, told, warn_user
+from ..errors import (
+    ProcessDiedError,
+    ProcessTimeoutError,
+    RemoteError,
+    SimEnvError,
+    WireError,
+    WrongThreadError,
+    shown,
+    told,
+    warn_user,
+)
 from .wire import DESCRIPTORS, LONGEST, VERSION, decode
 
 CHUNK: Final = 1 << 16
@@ -41,11 +51,13 @@ class _Process:
     """
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], cwd: Any) -> None:
-        theirs_in, self.writing = os.pipe()
-        self.reading, theirs_out = os.pipe()
         self.last = bytearray()
         self._owner, self._ended = os.getpid(), False
+        ends: list[int] = []
         try:
+            ends += os.pipe()
+            ends += os.pipe()
+            theirs_in, self.writing, self.reading, theirs_out = ends
             self._popen = Popen(
                 command,
                 stdin=DEVNULL,
@@ -56,12 +68,11 @@ class _Process:
                 start_new_session=True,  # it and all that it starts can be ended; interrupts at a terminal are not its
             )
         except BaseException:
-            os.close(self.writing)
-            os.close(self.reading)
+            for end in ends:
+                os.close(end)
             raise
-        finally:
-            os.close(theirs_in)
-            os.close(theirs_out)
+        os.close(theirs_in)
+        os.close(theirs_out)
         assert self._popen.stderr is not None
         self.number, self.stderr = self._popen.pid, self._popen.stderr.fileno()
         for descriptor in (self.reading, self.writing, self.stderr):
@@ -123,22 +134,29 @@ class _Process:
         self._ended = True
         self.close_input()
         os.close(self.reading)
-        if self.owned:
-            self.wait(patience)
-            with suppress(ProcessLookupError, PermissionError):  # there is none of the group left
-                os.killpg(self.number, signal.SIGKILL)
-            try:
-                self._popen.wait(GRACE)
-            except TimeoutExpired:
-                warn_user(f"the process {self.number} was killed and has not ended yet", ResourceWarning)
-            for _ in range(REMEMBERED):  # others may still write, as those who have left the group
-                before = bytes(self.last)
-                if not self.listen() or self.last == before:
-                    break
-        else:
-            self._popen.returncode = 0  # it is waited for elsewhere
-        assert self._popen.stderr is not None
-        self._popen.stderr.close()
+        try:
+            if self.owned:
+                self.wait(patience)
+        finally:  # also after an interrupt
+            if self.owned:
+                self._kill()
+            else:
+                self._popen.returncode = 0  # it is waited for elsewhere
+            assert self._popen.stderr is not None
+            self._popen.stderr.close()
+
+    def _kill(self) -> None:
+        """End it and its group at once, and read the last that it wrote."""
+        with suppress(ProcessLookupError, PermissionError):  # there is none of the group left
+            os.killpg(self.number, signal.SIGKILL)
+        try:
+            self._popen.wait(GRACE)
+        except TimeoutExpired:
+            warn_user(f"the process {self.number} was killed and has not ended yet", ResourceWarning)
+        for _ in range(REMEMBERED):  # others may still write, as those who have left the group
+            before = bytes(self.last)
+            if not self.listen() or self.last == before:
+                break
 
 
 class Child:
@@ -162,6 +180,7 @@ class Child:
 
         Raises:
             ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or does not speak as it should.
+            RemoteError: It says what has failed.
         """
         self.timeout = timeout
         self._received = bytearray()
@@ -174,14 +193,18 @@ class Child:
         self._poll = select.poll()
         self._poll.register(self._process.reading, select.POLLIN)
         self._poll.register(self._process.stderr, select.POLLIN)
-        hello = self.receive()
+        try:
+            hello = self.receive()
+        except BaseException:  # also an interrupt
+            self.end(patience=0.0)
+            raise
         version, points, can = hello.get("hello"), hello.get("points"), hello.get("can", [])
         if version is None:
-            self.fail(WireError(f"{self._name} has begun with {hello}, and not with a hello"))
+            self.refuse(hello, f"has begun with {shown(hello)}, and not with a hello")
         if type(version) is not int or version != VERSION:
-            self.fail(WireError(f"{self._name} speaks version {version} of the wire; this is version {VERSION}"))
+            self.fail(WireError(f"{self} speaks version {shown(version)} of the wire; this is version {VERSION}"))
         if not _are_strings(points) or not _are_strings(can):
-            self.fail(WireError(f'{self._name} has said {hello}; its "points" and "can" must be lists of strings'))
+            self.fail(WireError(f'{self} has said {shown(hello)}; its "points" and "can" must be lists of strings'))
         self.points: frozenset[str] = frozenset(points)
         self.can: frozenset[str] = frozenset(can)
 
@@ -218,6 +241,17 @@ class Child:
         except WireError as error:
             self.fail(WireError(f"{self} has sent {error}"))
 
+    def check_silent(self) -> None:
+        """Make sure that it has sent nothing, where nothing is due.
+
+        Raises:
+            WireError, RemoteError: It has sent a frame.
+            ProcessDiedError, ProcessTimeoutError: As ``receive``.
+        """
+        if self._received or self._process.reading in dict(self._poll.poll(0)):
+            frame = self.receive()
+            self.refuse(frame, f"has sent {shown(frame)} before the start of an episode")
+
     def send(self, lines: bytes) -> None:
         """Send lines.
 
@@ -247,13 +281,13 @@ class Child:
         while not found:
             left = deadline - monotonic()
             ready = self._poll.poll(min(max(0.0, left), LONGEST_WAIT) * 1000)
-            if not ready and left <= 0:
-                self.fail(ProcessTimeoutError(f"{self} {self._state()}; it has sent {sent} for {self.timeout:g} s"))
             for which, _ in ready:
                 if which == descriptor:
                     found = True
                 elif not self._process.listen():
                     self._poll.unregister(which)
+            if not found and left <= 0:
+                self.fail(ProcessTimeoutError(f"{self} {self._state()}; it has sent {sent} for {self.timeout:g} s"))
 
     def _check_usable(self) -> None:
         if not self._finalizer.alive:  # its descriptors may be something else's by now
@@ -283,6 +317,15 @@ class Child:
         self.end(patience=0.0)
         text = self._process.last.decode(errors="replace").strip()
         raise type(error)(f"{error}. The last that it wrote on its standard error:\n{text}" if text else str(error))
+
+    def refuse(self, frame: Mapping[str, Any], what: str) -> NoReturn:
+        """Raise the error that it tells, or say that a frame is none, or not due."""
+        error = frame.get("error")
+        if not isinstance(error, dict):
+            self.fail(WireError(f"{self} {what}"))
+        kind, text, trace = (error.get(name) or "" for name in ("type", "text", "trace"))
+        where = f"\n{trace}" if trace else ""
+        self.fail(RemoteError(f"the model in {self} has raised {kind or 'an error'}: {text}{where}"))
 
     def end(self, patience: float = GRACE) -> None:
         """Close its pipes, and end it and all that it has started.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from math import inf
 from types import NoneType
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from ..decision import BY_NAME, Definition
 from ..errors import (
@@ -16,7 +16,6 @@ from ..errors import (
     OptionValueError,
     ProcessDiedError,
     ProcessError,
-    RemoteError,
     SimEnvError,
     SimulationError,
     UnknownPointError,
@@ -38,7 +37,7 @@ class _Link:
 
     Attributes:
         child: The process; None as long as none was started.
-        state: "idle" between episodes, "waits" for the answer to a call, or "busy" with its model.
+        state: "idle" between episodes, "waits" for the answer to a call, "busy" with its model, or "stopped".
         played: Whether it has ended an episode by itself, after which it may exit.
         first: The first frame of an episode that was begun and does not run yet.
         number: Of the latest call.
@@ -68,10 +67,11 @@ class _Link:
 
     def break_off(self) -> None:
         """End the episode, if one goes on: the process unwinds where it waits, and is ended where it is busy."""
-        child, state, self.state = self.child, self.state, "idle"
+        child, state = self.child, self.state
         if child is None or not child.usable:
             return
         if state == "waits":
+            self.state = "stopped"
             with suppress(SimEnvError):  # it is ended then, and the next episode begins in a new one
                 child.send(STOP)
         elif state == "busy":
@@ -122,14 +122,14 @@ class ProcessSimulation(SimulationInterface):
         self.command = _words(command)
         if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < inf:
             raise OptionValueError(f"timeout must be a positive number of seconds, not {shown(timeout)}")
-        self.timeout, self.env, self.cwd = float(timeout), env, cwd
+        self.timeout, self.env, self.cwd = float(timeout), None if env is None else dict(env), cwd
         self.points = _by_function(points)
         self.result: Any = None
         self._link = _Link()
 
     def __getstate__(self) -> dict[str, Any]:
         points = {getattr(function, BY_NAME): definition for function, definition in self.points.items()}
-        return {**vars(self), "points": points, "result": None, "_link": None}
+        return {**vars(self), "points": points, "_link": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -155,22 +155,26 @@ class ProcessSimulation(SimulationInterface):
         child = link.child
         if child is not None and child.usable:
             may_exit = link.played
-            link.state = "busy"
             try:
-                child.send(start)
-                link.begin(child.receive())
+                self._begin(child, start)
                 return
             except ProcessDiedError:
                 if not may_exit or child.exit_code() != 0:
                     raise
-            except BaseException:
-                link.break_off()
-                raise
-        link.child = child = self._started()
-        link.state = "busy"
+        link.child, link.state = self._started(), "idle"
+        self._begin(link.child, start)
+
+    def _begin(self, child: Child, start: bytes) -> None:
+        """Send the line of a start, and wait for what comes first."""
+        link = self._link
+        stopped, link.state = link.state == "stopped", "busy"
         try:
+            child.check_silent()
             child.send(start)
-            link.begin(child.receive())
+            first = child.receive()
+            if stopped and "end" in first:
+                child.refuse(first, f'has sent {shown(first)} after "stop", and not only after the next start')
+            link.begin(first)
         except BaseException:
             link.break_off()
             raise
@@ -211,7 +215,7 @@ class ProcessSimulation(SimulationInterface):
                 elif "remove" in frame:
                     self._remove(child, frame)
                 else:
-                    _refuse(child, frame)
+                    child.refuse(frame, f"has sent what is no frame of the wire: {shown(frame)}")
                 frame = child.receive()
             return self._end(child, frame["end"])
         except BaseException:
@@ -348,13 +352,3 @@ def _by_function(points: Any) -> dict[Any, Definition]:
                 f" {shown(name)}: {shown(definition)}"
             )
     return {point_named(name).decide: definition for name, definition in points.items()}
-
-
-def _refuse(child: Child, frame: dict[str, Any]) -> NoReturn:
-    """Raise the error that a process tells, or say that its frame is none."""
-    error = frame.get("error")
-    if not isinstance(error, dict):
-        child.fail(WireError(f"{child} has sent what is no frame of the wire: {shown(frame)}"))
-    kind, text, trace = (error.get(name) or "" for name in ("type", "text", "trace"))
-    where = f"\n{trace}" if trace else ""
-    child.fail(RemoteError(f"the model in {child} has raised {kind or 'an error'}: {text}{where}"))

@@ -35,7 +35,12 @@ def encode(frame: Mapping[str, Any]) -> bytes:
     Raises:
         WireError: Something in it cannot travel, or it is too long.
     """
-    line = _ENCODER.encode(sendable(frame)).encode() + b"\n"
+    try:
+        line = _ENCODER.encode(sendable(frame)).encode() + b"\n"
+    except WireError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise WireError(f"what was to be sent is no JSON ({told(error)})") from None
     if len(line) > LONGEST:
         raise WireError(f"a line of {len(line):,} bytes was to be sent, and the longest that may be has {LONGEST:,}")
     return line

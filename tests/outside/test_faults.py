@@ -37,6 +37,7 @@ IN_MID_EPISODE = {
     "number": (WireError, "call 7 where call 4 was due"),
     "number text": (WireError, "call '4' where call 4"),
     "point": (WireError, r"moon\.phase.*not in its hello"),
+    "point, no text": (WireError, r"named the point \['a'\]"),
     "entity": (WireError, r"\['a'\] at reservoir\.inflow; an entity is"),
     "args": (WireError, r"args .* no object: \[1\]"),
     "time": (WireError, "the time 'now'"),

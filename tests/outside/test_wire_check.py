@@ -98,6 +98,15 @@ def test_what_is_wrong_is_found(tmp_path, change, tried):
     assert found(report)[tried] == "wrong", str(report)
 
 
+@pytest.mark.parametrize(
+    "what",
+    ["point, no text", "entity", "args", "time", "end", "removed point", "number text", "unknown frame"],
+)
+def test_frames_that_are_wrong_are_found(what):
+    report = check_wire([sys.executable, faulty.__file__, "in mid-episode", what], timeout=10.0)
+    assert found(report)["an episode by its rule"] == "wrong", str(report)
+
+
 def test_a_reseed_that_changes_nothing_is_noted(tmp_path):
     report = check_wire(changed(tmp_path, "outside.random.Random.seed = lambda *_: None"))
     assert found(report)["reseed"] == "note"

@@ -40,6 +40,7 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
     "number": lambda wire: wire.send({"decide": 7, "point": "reservoir.inflow", "entity": "a", "args": {}}),
     "number text": lambda wire: wire.send({"decide": "4", "point": "reservoir.inflow", "entity": "a", "args": {}}),
     "point": lambda wire: wire.send({"decide": 4, "point": "moon.phase", "args": {}}),
+    "point, no text": lambda wire: wire.send({"decide": 4, "point": ["a"], "args": {}}),
     "entity": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": ["a"], "args": {}}),
     "args": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "args": [1]}),
     "time": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": "now"}),

@@ -154,16 +154,19 @@ class _Check:
             frame = child.receive()
             frames.append(frame)
             if "end" in frame:
+                child.check_end(frame["end"])
                 return frames
             if "decide" not in frame:
                 if "error" in frame:
                     child.fail(ProcessError(f"it has sent {shown(frame)}"))
                 if not {"remove", "update"} & frame.keys():
                     child.fail(ProcessError(f"it has sent what is no frame of the wire: {shown(frame)}"))
+                child.check_named(frame, frame.get("update", frame.get("remove")))
                 continue
             number += 1
-            if frame["decide"] != number or frame.get("point") not in child.points:
-                child.fail(ProcessError(f"call {number} of one of its points was due, and it has sent {shown(frame)}"))
+            if type(frame["decide"]) is not int or frame["decide"] != number:
+                child.fail(ProcessError(f"call {number} was due, and it has sent {shown(frame)}"))
+            child.check_named(frame, frame.get("entity"))
             if number == stop or number == self._most:
                 child.send(STOP)
                 return frames

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
+from types import NoneType
 from typing import Any, Final, NoReturn, TypeGuard
 from weakref import finalize
 
@@ -39,6 +40,10 @@ LONGEST_WAIT: Final = 3600.0
 
 GRACE: Final = 2.0
 """For how many seconds is waited for a process to end by itself."""
+
+
+_ENTITIES: Final = (str, int, NoneType)
+_TIMES: Final = (float, int, NoneType)
 
 
 class _Process:
@@ -132,9 +137,9 @@ class _Process:
         if self._ended:
             return
         self._ended = True
-        self.close_input()
-        os.close(self.reading)
         try:
+            os.close(self.reading)
+            self.close_input()
             if self.owned:
                 self.wait(patience)
         finally:  # also after an interrupt
@@ -251,6 +256,32 @@ class Child:
         if self._received or self._process.reading in dict(self._poll.poll(0)):
             frame = self.receive()
             self.refuse(frame, f"has sent {shown(frame)} before the start of an episode")
+
+    def check_named(self, frame: Mapping[str, Any], entity: Any) -> tuple[str, float | None]:
+        """The point and the time of a frame that names an entity.
+
+        Raises:
+            WireError: They, the entity or the frame's arguments are none.
+        """
+        name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
+        if not isinstance(name, str) or name not in self.points:
+            self.fail(WireError(f"{self} has named the point {shown(name)}, which is not in its hello"))
+        if type(entity) not in _ENTITIES:
+            self.fail(WireError(f"{self} has named {shown(entity)} at {name}; an entity is a string or an integer"))
+        if arguments is not None and not isinstance(arguments, dict):
+            self.fail(WireError(f"{self} has sent args for {name} that are no object: {shown(arguments)}"))
+        if type(time) not in _TIMES:
+            self.fail(WireError(f"{self} has sent the time {shown(time)} for {name}, which is no number"))
+        return name, time
+
+    def check_end(self, end: Any) -> None:
+        """Make sure that an end is one.
+
+        Raises:
+            WireError: It is none.
+        """
+        if not isinstance(end, dict):
+            self.fail(WireError(f'{self} has sent the end {shown(end)}; it is an object with "truncated" and "result"'))
 
     def send(self, lines: bytes) -> None:
         """Send lines.

@@ -6,8 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from math import inf
-from types import NoneType
-from typing import Any, Final
+from typing import Any
 
 from ..decision import BY_NAME, Definition
 from ..errors import (
@@ -27,9 +26,6 @@ from ..simulation import RULE, TRUNCATED, SimulationInterface
 from .calls import RemoteCall, point_named
 from .child import GRACE, Child
 from .wire import STOP, answer, encode
-
-_ENTITIES: Final = (str, int, NoneType)
-_TIMES: Final = (float, int, NoneType)
 
 
 class _Link:
@@ -260,14 +256,17 @@ class ProcessSimulation(SimulationInterface):
         link, number = self._link, frame["decide"]
         if type(number) is not int or number != link.number + 1:
             child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
-        named = self._named(child, frame, frame.get("entity"))
+        entity = frame.get("entity")
+        name, time = child.check_named(frame, entity)
+        if time is not None:
+            link.time = float(time)
         link.number, link.state = number, "waits"
-        function = functions.get(named[0])
+        function = functions.get(name)
         if function is None:
             return answer(number, RULE)
-        call = link.calls.get(named)
+        call = link.calls.get((name, entity))
         if call is None:
-            call = link.calls[named] = RemoteCall(*named)
+            call = link.calls[name, entity] = RemoteCall(name, entity)
         call.__dict__, call.time = frame.get("args") or {}, link.time
         value = function(call)
         try:
@@ -293,30 +292,15 @@ class ProcessSimulation(SimulationInterface):
             point_named(call.point).remove(call)
 
     def _named(self, child: Child, frame: dict[str, Any], entity: Any) -> tuple[str, Any]:
-        """The point and the entity of a frame, whose time is noted.
-
-        Raises:
-            WireError: They, or the frame's arguments or time, are none.
-        """
-        name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
-        if not isinstance(name, str) or name not in child.points:
-            child.fail(WireError(f"{child} has named the point {shown(name)}, which is not in its hello"))
-        if type(entity) not in _ENTITIES:
-            child.fail(WireError(f"{child} has named {shown(entity)} at {name}; an entity is a string or an integer"))
-        if arguments is not None and not isinstance(arguments, dict):
-            child.fail(WireError(f"{child} has sent args for {name} that are no object: {shown(arguments)}"))
-        if type(time) not in _TIMES:
-            child.fail(WireError(f"{child} has sent the time {shown(time)} for {name}, which is no number"))
+        """The point and the entity of a frame, whose time is noted."""
+        name, time = child.check_named(frame, entity)
         if time is not None:
             self._link.time = float(time)
         return name, entity
 
     def _end(self, child: Child, end: Any) -> Any:
         """Note the end of the episode."""
-        if not isinstance(end, dict):
-            child.fail(
-                WireError(f'{child} has sent the end {shown(end)}; it is an object with "truncated" and "result"')
-            )
+        child.check_end(end)
         self._link.state, self._link.played = "idle", True
         self.result = end.get("result")
         return TRUNCATED if end.get("truncated") else None

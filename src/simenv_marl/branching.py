@@ -22,6 +22,7 @@ from .core.processes import pack_error, pack_plainly, unpack, unpack_error
 from .core.rng import is_seed, process_kept, seed_process
 from .envs import View
 from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, shown, told
+from .remote.kept import processes_kept
 
 Result = TypeVar("Result")
 
@@ -89,7 +90,8 @@ def branch(
             ' method="replay"'
         )
     if obstacles or not forks or method == "replay":
-        return [_replayed(env, view, function, number) for number in range(n)]
+        with processes_kept():
+            return [_replayed(env, view, function, number) for number in range(n)]
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +32,14 @@ from simenv_marl import (
     WireError,
     aec_env,
     branch,
+    design,
     evaluate,
     generate_env,
     handlers,
     joint_env,
     make_step,
     parallel_env,
+    run_experiment,
     simulate,
     simulate_many,
     single_env,
@@ -55,6 +58,7 @@ from tests.outside.reservoirs import (
     told,
 )
 from tests.worlds import bare as bare_world
+from tests.worlds import outside
 
 ROSTER = {"reservoir.inflow": ["a", "b", *(f"new{number}" for number in range(1, 40))]}
 
@@ -348,8 +352,8 @@ def test_variants_and_specs_carry_it(make_env):
     assert env.unwrapped.simulation.timeout == 5.0
 
 
-def _patient(timeout):
-    return reservoirs(timeout=timeout)
+def _patient(words=None, timeout=30.0):
+    return ProcessSimulation(words or command(), BOTH, timeout=timeout)
 
 
 # -- branches and planning ------------------------------------------------------------------------
@@ -415,6 +419,73 @@ def test_a_planner_decides():
     planner = RolloutPolicy([0, 1, 2], futures=1, horizon=2)
     simulation = simulate(reservoirs(), {"broker.price": planner}, seed=1)
     assert simulation.result["price"] in (0.5, 1.0, 2.0)
+
+
+# -- processes that are kept ----------------------------------------------------------------------
+
+
+@pytest.fixture
+def started(tmp_path):
+    """A simulation whose processes leave a line where they begin, and how many there were."""
+    log = tmp_path / "started"
+    script = f'echo x >> {log}; exec "$@"'
+    simulation = ProcessSimulation(["sh", "-c", script, "sh", *command()], BOTH)
+    return simulation, lambda: log.read_text().count("x")
+
+
+def test_many_simulations_share_a_process(started, tmp_path):
+    simulation, number = started
+    evaluate(simulation, {"rule": {}, "cheap": {"broker.price": _cheap}}, seeds=range(5))
+    assert number() == 1
+    prices = simulate_many(simulation, {}, seeds=range(5), collect=_price)
+    assert (prices, number()) == ([by_its_rule(seed)["price"] for seed in range(5)], 2)
+    run_experiment(
+        partial(_patient, simulation.command), design({"timeout": [10.0, 20.0]}), seeds=range(3),
+        store=tmp_path / "store", metric={"price": _price},
+    )  # fmt: skip
+    assert number() == 4  # one for each time limit
+    env = aec_env(simulation)
+    env.reset(seed=3)
+    env.step(RULE)
+    assert len({str(result) for result in branch(env, _played_out, 4)}) == 1
+    env.close()
+    assert number() == 6
+
+
+def test_processes_that_are_kept_end_with_what_has_run(started):
+    numbers = []
+
+    def notice(simulation):
+        numbers.append(simulation._link.child._process.number)
+        return 1 / (3 - len(numbers))
+
+    with pytest.raises(ZeroDivisionError):
+        simulate_many(started[0], {}, seeds=range(3), collect=notice)
+    assert len(numbers) == 3
+    assert len(set(numbers)) == 1
+    assert not runs(numbers[0])
+    assert len(simulate_many(started[0], {}, seeds=range(3), collect=notice)) == 3
+    assert not runs(numbers[-1])
+
+
+def test_a_process_that_exits_after_a_stop_is_started_anew(make_env, tmp_path):
+    script = tmp_path / "once.py"
+    folder = outside.__file__.rpartition("/")[0]
+    script.write_text(
+        f"import os, sys\nsys.path.insert(0, {folder!r})\nimport outside\n"
+        "class Once(outside.Reservoirs):\n"
+        "    def run(self, *given):\n"
+        "        try:\n            super().run(*given)\n"
+        "        except outside.Stopped:\n            os._exit(0)\n"
+        "outside.Wire().play(Once, outside.POINTS)\n"
+    )
+    env = make_env(aec_env, ProcessSimulation([sys.executable, str(script)], BOTH))
+    env.reset(seed=1)
+    env.step(RULE)
+    number = child(env)
+    all_told(env, 1, ruled)
+    assert child(env) != number
+    assert env.unwrapped.simulation.result == by_its_rule(1)
 
 
 # -- copies, processes, threads -------------------------------------------------------------------

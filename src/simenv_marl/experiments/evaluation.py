@@ -15,6 +15,7 @@ from ..core.processes import pack
 from ..errors import OptionValueError, shown
 from ..many.collect import check_numbers, checked_seeds
 from ..many.spread import progress_bar, spread
+from ..remote.kept import processes_kept
 from .extras import needed
 from .playing import (
     TEAM,
@@ -243,7 +244,7 @@ def evaluate(
     if workers:
         pack((found, common))  # as here what cannot be sent there
     outcomes, done = {name: list[Outcome]() for name in found}, 0
-    with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar:
+    with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar, processes_kept():
         while done < len(places):
             lot = places[done : _next(done, len(places), width)]
             for name, known in outcomes.items():
@@ -304,7 +305,8 @@ def _play_part(
 ) -> list[Outcome]:
     """In a worker: play a part of a contender's episodes."""
     (plan,) = _plans(contender, simulation, points, options, named).values()
-    return _play(plan, seeds, metrics, size, team)
+    with processes_kept():
+        return _play(plan, seeds, metrics, size, team)
 
 
 def _play(plan: Plan, seeds: Sequence[int], metrics: Metrics, size: int, team: Any) -> list[Outcome]:

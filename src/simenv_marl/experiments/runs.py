@@ -18,6 +18,7 @@ from ..core.processes import pack
 from ..errors import OptionValueError, SimEnvError, StoreError, shown, told
 from ..many.collect import check_numbers
 from ..many.spread import progress_bar, spread
+from ..remote.kept import processes_kept
 from .evaluation import distinct_seeds, rows_of, typed
 from .extras import needed
 from .playing import (
@@ -153,7 +154,7 @@ def run_experiment(
 
 def _run_missing(arguments: Any, missing: list[Run], workers: int, at_once: int, total: int | None) -> None:
     """Run what is missing, with a bar where it is said how many runs there are in all."""
-    with nullcontext() if total is None else progress_bar(total, "run", total - len(missing)) as bar:
+    with nullcontext() if total is None else progress_bar(total, "run", total - len(missing)) as bar, processes_kept():
         for number in _work(arguments, missing, workers, at_once):
             if bar is not None:
                 bar.update(number)
@@ -280,9 +281,10 @@ def _do_part(*arguments: Any) -> None:
     """In a worker: do a part of the runs."""
     *others, runs = arguments
     parent = _parents.setdefault(os.getpid(), os.getppid())
-    for _ in _do(*others, runs=runs):
-        if os.getppid() != parent:  # it was killed, and nothing waits for this any more
-            return
+    with processes_kept():
+        for _ in _do(*others, runs=runs):
+            if os.getppid() != parent:  # it was killed, and nothing waits for this any more
+                return
 
 
 _parents: dict[int, int] = {}

@@ -28,6 +28,7 @@ from ..core.together import step_all
 from ..decision import DecisionPoint
 from ..errors import InvalidActionError, annotate, shown
 from ..hooks.stacks import outside_simulation
+from ..remote.kept import processes_kept
 from ..simulation import RULE, positional
 
 # -- who is asked ---------------------------------------------------------------------------------
@@ -273,7 +274,7 @@ def run(
     Raises:
         BaseException: Whatever a model, a mapping, a policy or ``finish`` raises. All simulations are unwound.
     """
-    with outside_simulation():
+    with outside_simulation(), processes_kept():
         _Batches(plan, seeds, size, finish, watcher).run()
 
 

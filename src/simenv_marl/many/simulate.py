@@ -9,6 +9,7 @@ from ..core.episode import When
 from ..core.plan import Plan
 from ..core.session import Session, checked_seed
 from ..errors import close_after
+from ..remote.kept import processes_kept
 
 
 def simulate(
@@ -37,11 +38,12 @@ def simulate(
         BaseException: Whatever the model, a mapping or a policy raises.
     """
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
-    session = Session(plan)
-    try:
-        session.start(checked_seed(seed), None, When.NEVER)
-    except BaseException as error:
-        close_after(error, session.close, "the simulation")
-        raise
-    session.close()
+    with processes_kept():  # policies may branch
+        session = Session(plan)
+        try:
+            session.start(checked_seed(seed), None, When.NEVER)
+        except BaseException as error:
+            close_after(error, session.close, "the simulation")
+            raise
+        session.close()
     return session.simulation

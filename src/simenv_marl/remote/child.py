@@ -170,6 +170,7 @@ class Child:
     Attributes:
         points: The names of its decision points.
         can: What else it can, such as "reseed".
+        may_exit: Whether its episode is over, after which it may exit.
     """
 
     def __init__(
@@ -187,7 +188,7 @@ class Child:
             ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or does not speak as it should.
             RemoteError: It says what has failed.
         """
-        self.timeout = timeout
+        self.timeout, self.may_exit = timeout, False
         self._received = bytearray()
         try:
             self._process = _Process(command, os.environ if env is None else env, cwd)

@@ -24,7 +24,8 @@ from ..errors import (
 )
 from ..simulation import RULE, TRUNCATED, SimulationInterface
 from .calls import RemoteCall, point_named
-from .child import GRACE, Child
+from .child import Child
+from .kept import keep, take
 from .wire import STOP, answer, encode
 
 
@@ -34,7 +35,6 @@ class _Link:
     Attributes:
         child: The process; None as long as none was started.
         state: "idle" between episodes, "waits" for the answer to a call, "busy" with its model, or "stopped".
-        played: Whether it has ended an episode by itself, after which it may exit.
         first: The first frame of an episode that was begun and does not run yet.
         number: Of the latest call.
         calls: By point and entity, the latest call.
@@ -42,17 +42,16 @@ class _Link:
         seed: With which it is to draw anew before it goes on; None: it is not to.
     """
 
-    __slots__ = ("calls", "child", "first", "number", "played", "seed", "state", "time")
+    __slots__ = ("calls", "child", "first", "number", "seed", "state", "time")
 
     def __init__(self) -> None:
         self.child: Child | None = None
         self.state = "idle"
-        self.played = False
         self.begin(None)
 
     def begin(self, first: dict[str, Any] | None) -> None:
         """Begin an episode with its first frame."""
-        self.first, self.number, self.played = first, 0, False
+        self.first, self.number = first, 0
         self.seed: int | None = None
         self.calls: dict[tuple[str, Any], RemoteCall] = {}
         self.time: float | None = None
@@ -67,7 +66,7 @@ class _Link:
         if child is None or not child.usable:
             return
         if state == "waits":
-            self.state = "stopped"
+            self.state, child.may_exit = "stopped", True
             with suppress(SimEnvError):  # it is ended then, and the next episode begins in a new one
                 child.send(STOP)
         elif state == "busy":
@@ -148,40 +147,43 @@ class ProcessSimulation(SimulationInterface):
         start = encode({"start": {"seed": seed, "options": options or {}}})
         self.result, link = None, self._link
         link.break_off()
+        if link.child is None:
+            link.child = take(self._alike())
         child = link.child
         if child is not None and child.usable:
-            may_exit = link.played
             try:
                 self._begin(child, start)
                 return
             except ProcessDiedError:
-                if not may_exit or child.exit_code() != 0:
+                if not child.may_exit or child.exit_code() != 0:
                     raise
-        link.child, link.state = self._started(), "idle"
+        link.child, link.state = Child(self.command, self.timeout, self.env, self.cwd), "idle"
         self._begin(link.child, start)
+
+    def _alike(self) -> tuple[Any, ...]:
+        """What processes have in common that may stand for one another."""
+        env = None if self.env is None else tuple(sorted(self.env.items()))
+        return tuple(self.command), self.timeout, env, self.cwd
 
     def _begin(self, child: Child, start: bytes) -> None:
         """Send the line of a start, and wait for what comes first."""
         link = self._link
         stopped, link.state = link.state == "stopped", "busy"
         try:
+            missing = [name for name in self._names() if name not in child.points]
+            if missing:
+                has = ", ".join(sorted(child.points)) or "none"
+                child.fail(UnknownPointError(f"{child} has no decision point {', '.join(missing)}; it has {has}"))
             child.check_silent()
             child.send(start)
             first = child.receive()
             if stopped and "end" in first:
                 child.refuse(first, f'has sent {shown(first)} after "stop", and not only after the next start')
+            child.may_exit = False
             link.begin(first)
         except BaseException:
             link.break_off()
             raise
-
-    def _started(self) -> Child:
-        child = Child(self.command, self.timeout, self.env, self.cwd)
-        missing = [name for name in self._names() if name not in child.points]
-        if missing:
-            has = ", ".join(sorted(child.points)) or "none"
-            child.fail(UnknownPointError(f"{child} has no decision point {', '.join(missing)}; it has {has}"))
-        return child
 
     def run(self) -> Any:
         """Have the process run through the episode; its calls are those of the points' decision functions.
@@ -227,8 +229,9 @@ class ProcessSimulation(SimulationInterface):
         link = self._link
         if last and link.child is not None:
             link.break_off()
-            link.child.end(GRACE)
-            link.child = None
+            child, link.child = link.child, None
+            if not keep(self._alike(), child):
+                child.end()
 
     @property
     def time(self) -> Callable[[], float]:
@@ -301,7 +304,7 @@ class ProcessSimulation(SimulationInterface):
     def _end(self, child: Child, end: Any) -> Any:
         """Note the end of the episode."""
         child.check_end(end)
-        self._link.state, self._link.played = "idle", True
+        self._link.state, child.may_exit = "idle", True
         self.result = end.get("result")
         return TRUNCATED if end.get("truncated") else None
 

@@ -58,7 +58,9 @@ def answer(number: int, value: Any) -> bytes:
     """
     if value is RULE:
         return b'{"act":%d,"rule":true}\n' % number
-    if type(value) is float and value - value == 0.0:  # what most decisions are takes no walk through the value
+    if type(value) is int:  # what most decisions are takes no walk through the value
+        return b'{"act":%d,"value":%d}\n' % (number, value)
+    if type(value) is float and value - value == 0.0:
         return b'{"act":%d,"value":%a}\n' % (number, value)
     return encode({"act": number, "value": value})
 
@@ -102,7 +104,8 @@ def decode(line: bytes | bytearray) -> dict[str, Any]:
         WireError: It is no JSON object in UTF-8.
     """
     try:
-        decoder, text = _WITH_OBJECTS if b'"float"' in line else _DECODER, line.decode()
+        text = line.decode()
+        decoder = _WITH_OBJECTS if '"float"' in text else _DECODER
         frame, end = decoder.raw_decode(text) if text[:1] == "{" else (decoder.decode(text), len(text))
         if end < len(text) and not text[end:].isspace():
             raise ValueError(f"more follows after {end} characters")

@@ -45,6 +45,7 @@ IN_MID_EPISODE = {
     "end": (WireError, "the end True"),
     "half a line": (ProcessDiedError, "closed its pipe in the middle of a line, and has exited with code 0"),
     "half a line, silent": (ProcessTimeoutError, "still runs; it has sent half a line for 0.3 s"),
+    "drop by drop": (ProcessTimeoutError, "still runs; it has sent half a line for 0.3 s"),
     "silence": (ProcessTimeoutError, "still runs; it has sent nothing for 0.3 s"),
     "exit": (ProcessDiedError, "closed its pipe, and has exited with code 0"),
     "exit 3": (ProcessDiedError, "closed its pipe, and has exited with code 3"),
@@ -79,7 +80,7 @@ def test_all_faults_are_tested():
 
 def patience(what: str) -> float:
     """For how long to wait for a simulator, in seconds: not long where nothing comes."""
-    return 0.3 if what in ("silence", "half a line, silent", "grandchild") else 20.0
+    return 0.3 if what in ("silence", "drop by drop", "half a line, silent", "grandchild") else 20.0
 
 
 @pytest.mark.parametrize("what", IN_MID_EPISODE)

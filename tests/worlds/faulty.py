@@ -48,6 +48,7 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
     "end": lambda wire: wire.send({"end": True}),
     "half a line": lambda wire: (wire.raw(b'{"decide": 4'), os._exit(0)),
     "half a line, silent": lambda wire: (wire.raw(b'{"decide": 4'), time.sleep(600)),
+    "drop by drop": lambda wire: [(wire.raw(b"{"), time.sleep(0.05)) for _ in range(12_000)],
     "silence": lambda wire: time.sleep(600),
     "exit": lambda wire: os._exit(0),
     "exit 3": lambda wire: os._exit(3),

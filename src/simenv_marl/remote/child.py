@@ -53,11 +53,12 @@ class _Process:
         reading, writing: This side's ends of the two pipes.
         stderr: Where its standard error is read.
         last: What was last read there.
+        owner: The process that has started it.
     """
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], cwd: Any) -> None:
         self.last = bytearray()
-        self._owner, self._ended = os.getpid(), False
+        self.owner, self._ended = os.getpid(), False
         ends: list[int] = []
         try:
             ends += os.pipe()
@@ -82,11 +83,6 @@ class _Process:
         self.number, self.stderr = self._popen.pid, self._popen.stderr.fileno()
         for descriptor in (self.reading, self.writing, self.stderr):
             os.set_blocking(descriptor, False)
-
-    @property
-    def owned(self) -> bool:
-        """Whether this is the process that has started it, and no fork of that."""
-        return os.getpid() == self._owner
 
     def listen(self) -> bool:
         """Read what is there of its standard error; return whether more may come."""
@@ -140,10 +136,10 @@ class _Process:
         try:
             os.close(self.reading)
             self.close_input()
-            if self.owned:
+            if self.owner == os.getpid():
                 self.wait(patience)
         finally:  # also after an interrupt
-            if self.owned:
+            if self.owner == os.getpid():
                 self._kill()
             else:
                 self._popen.returncode = 0  # it is waited for elsewhere
@@ -189,7 +185,7 @@ class Child:
             RemoteError: It says what has failed.
         """
         self.timeout, self.may_exit = timeout, False
-        self._received = bytearray()
+        self._rest = b""  # of what was received: the lines that come next
         try:
             self._process = _Process(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
@@ -227,25 +223,29 @@ class Child:
             ProcessTimeoutError: Nothing came.
             WireError: It has sent something else than a frame.
         """
-        received, deadline, searched, reading = self._received, 0.0, 0, self._process.reading
-        while (end := received.find(b"\n", searched)) < 0:
-            searched = len(received)
-            if searched >= LONGEST:
-                break
-            deadline = deadline or monotonic() + self.timeout
-            self._wait(reading, deadline, "half a line" if received else "nothing")
-            chunk = os.read(reading, CHUNK)
-            if not chunk:
-                self._died()
-            received += chunk
-        if not 0 <= end < LONGEST:
-            self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
-        line = received[:end]
-        del received[: end + 1]
+        line, complete, self._rest = self._rest.partition(b"\n")
+        if not complete:
+            line = self._completed(line)
         try:
             return decode(line)
         except WireError as error:
             self.fail(WireError(f"{self} has sent {error}"))
+
+    def _completed(self, line: bytes) -> bytes:
+        """Wait for the rest of a line, of which this is the beginning."""
+        parts, length, complete, reading = [line], len(line), b"", self._process.reading
+        begun = monotonic()
+        while not complete:
+            self._wait(reading, begun, "half a line" if length else "nothing")
+            chunk = os.read(reading, CHUNK)
+            if not chunk:
+                self._died(half=length > 0)
+            part, complete, self._rest = chunk.partition(b"\n")
+            parts.append(part)
+            length += len(part)
+            if length >= LONGEST:
+                self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
+        return b"".join(parts)
 
     def check_silent(self) -> None:
         """Make sure that it has sent nothing, where nothing is due.
@@ -254,7 +254,7 @@ class Child:
             WireError, RemoteError: It has sent a frame.
             ProcessDiedError, ProcessTimeoutError: As ``receive``.
         """
-        if self._received or self._process.reading in dict(self._poll.poll(0)):
+        if self._rest or self._process.reading in dict(self._poll.poll(0)):
             frame = self.receive()
             self.refuse(frame, f"has sent {shown(frame)} before the start of an episode")
 
@@ -292,49 +292,45 @@ class Child:
         Raises:
             ProcessTimeoutError: It does not read.
         """
-        self._check_usable()
-        deadline, writing, reading = 0.0, self._process.writing, self._process.reading
+        process, begun = self._process, 0.0
+        if process.owner != os.getpid():
+            raise WrongThreadError(
+                f"{self} belongs to another process, of which this one is a fork; reset() starts one for this one"
+            )
         while lines:
             try:
-                lines = lines[os.write(writing, lines) :]
+                lines = lines[os.write(process.writing, lines) :]
             except BrokenPipeError:
                 return
             except BlockingIOError:
-                deadline = deadline or monotonic() + self.timeout
-                self._poll.unregister(reading)
-                self._poll.register(writing, select.POLLOUT)
-                self._wait(writing, deadline, "nothing, and does not read")
-                self._poll.unregister(writing)
-                self._poll.register(reading, select.POLLIN)
+                begun = begun or monotonic()
+                self._poll.unregister(process.reading)
+                self._poll.register(process.writing, select.POLLOUT)
+                self._wait(process.writing, begun, "nothing, and does not read")
+                self._poll.unregister(process.writing)
+                self._poll.register(process.reading, select.POLLIN)
+            except OSError as error:  # its input is closed, and has no number any more
+                raise ProcessDiedError(f"{self} was ended") from error
 
-    def _wait(self, descriptor: int, deadline: float, sent: str) -> None:
+    def _wait(self, descriptor: int, begun: float, sent: str) -> None:
         """Wait until a descriptor is ready; read what comes on standard error meanwhile."""
         found = False
         while not found:
-            left = deadline - monotonic()
-            ready = self._poll.poll(min(max(0.0, left), LONGEST_WAIT) * 1000)
-            for which, _ in ready:
+            left = begun + self.timeout - monotonic()
+            for which, _ in self._poll.poll(min(left, LONGEST_WAIT) * 1000 if left > 0 else 0):
                 if which == descriptor:
                     found = True
                 elif not self._process.listen():
                     self._poll.unregister(which)
-            if not found and left <= 0:
+            if left <= 0:  # also for what comes drop by drop
                 self.fail(ProcessTimeoutError(f"{self} {self._state()}; it has sent {sent} for {self.timeout:g} s"))
-
-    def _check_usable(self) -> None:
-        if not self._finalizer.alive:  # its descriptors may be something else's by now
-            raise ProcessDiedError(f"{self} was ended")
-        if not self._process.owned:
-            raise WrongThreadError(
-                f"{self} belongs to another process, of which this one is a fork; reset() starts one for this one"
-            )
 
     # -- ends -------------------------------------------------------------------------------------
 
     @property
     def usable(self) -> bool:
         """Whether it was not ended, and is no other process's."""
-        return self._finalizer.alive and self._process.owned
+        return self._finalizer.alive and self._process.owner == os.getpid()
 
     def exit_code(self) -> int | None:
         """With what it has exited, or minus the signal that has ended it; None as long as it runs."""
@@ -368,11 +364,11 @@ class Child:
         self._finalizer.detach()
         self._process.end(patience)
 
-    def _died(self) -> NoReturn:
-        """Raise the error of a process that has closed its pipe."""
+    def _died(self, *, half: bool) -> NoReturn:
+        """Raise the error of a process that has closed its pipe, maybe in the middle of a line."""
         self._process.wait(GRACE)
-        half = " in the middle of a line" if self._received else ""
-        self.fail(ProcessDiedError(f"{self} has closed its pipe{half}, and {self._state()}"))
+        where = " in the middle of a line" if half else ""
+        self.fail(ProcessDiedError(f"{self} has closed its pipe{where}, and {self._state()}"))
 
     def _state(self) -> str:
         code = self.exit_code()

@@ -97,7 +97,7 @@ def _at(where: str) -> str:
     return f" (at {where})" if where else ""
 
 
-def decode(line: bytes | bytearray) -> dict[str, Any]:
+def decode(line: bytes) -> dict[str, Any]:
     """The frame of a line.
 
     Raises:
@@ -110,9 +110,9 @@ def decode(line: bytes | bytearray) -> dict[str, Any]:
         if end < len(text) and not text[end:].isspace():
             raise ValueError(f"more follows after {end} characters")
     except (ValueError, RecursionError) as error:
-        raise WireError(f"a line that is no JSON in UTF-8 ({told(error)}): {shown(bytes(line))}") from None
+        raise WireError(f"a line that is no JSON in UTF-8 ({told(error)}): {shown(line)}") from None
     if not isinstance(frame, dict):
-        raise WireError(f"a line that is no JSON object: {shown(bytes(line))}")
+        raise WireError(f"a line that is no JSON object: {shown(line)}")
     return frame
 
 

@@ -165,11 +165,7 @@ class Session:
                 self._starting = False
 
     def _close_simulation(self, *, last: bool = False) -> None:
-        """Call the simulation's ``close`` on its stack, once for each reset that has succeeded.
-
-        Args:
-            last: Whether no reset follows.
-        """
+        """Call the simulation's ``close`` on its stack, once for each reset that has succeeded; maybe the last."""
         close = closer(self.simulation) if self._open else None
         if close is None:
             return

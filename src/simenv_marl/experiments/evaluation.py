@@ -243,22 +243,43 @@ def evaluate(
     plans = _plans(found, *common[:4])  # made here also where the work is done elsewhere, so that errors come before
     if workers:
         pack((found, common))  # as here what cannot be sent there
-    outcomes, done = {name: list[Outcome]() for name in found}, 0
+
+    def play(name: str, lot: list[int]) -> list[Outcome]:
+        if workers:
+            return _spread(({name: found[name]}, *common), lot, int(workers), size)
+        return _play(plans[name], lot, metrics, size, team)
+
+    def is_narrow(outcomes: Mapping[str, Sequence[Outcome]]) -> bool:
+        return width is not None and _widest(outcomes, team, baseline, confidence) <= width
+
     with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar, processes_kept():
-        while done < len(places):
-            lot = places[done : _next(done, len(places), width)]
-            for name, known in outcomes.items():
-                with telling(name):
-                    if workers:
-                        known += _spread(({name: found[name]}, *common), lot, int(workers), size)
-                    else:
-                        known += _play(plans[name], lot, metrics, size, team)
-                if bar is not None:
-                    bar.update(len(lot))
-            done += len(lot)
-            if width is not None and done >= FIRST and _widest(outcomes, team, baseline, confidence) <= width:
-                break
+        outcomes = _play_all(list(found), places, width, play, is_narrow, bar)
+    done = len(next(iter(outcomes.values())))
     return Evaluation(_frame(places[:done], outcomes, tuple(metrics), team), baseline, float(confidence))
+
+
+def _play_all(
+    names: list[str],
+    places: list[int],
+    width: float | None,
+    play: Callable[[str, list[int]], list[Outcome]],
+    is_narrow: Callable[[Mapping[str, Sequence[Outcome]]], bool],
+    bar: Any,
+) -> dict[str, list[Outcome]]:
+    """Have the contenders of these names play, one lot of seeds after the other, until that is enough."""
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in names}
+    done = 0
+    while done < len(places):
+        lot = places[done : _next(done, len(places), width)]
+        for name, known in outcomes.items():
+            with telling(name):
+                known += play(name, lot)
+            if bar is not None:
+                bar.update(len(lot))
+        done += len(lot)
+        if done >= FIRST and is_narrow(outcomes):
+            break
+    return outcomes
 
 
 def _next(done: int, number: int, width: float | None) -> int:

@@ -8,6 +8,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -133,23 +134,45 @@ def run_experiment(
     points = list(points) if isinstance(points, Iterator) else points
     workshop = (make, contenders, points, options, points_of(contenders))
     folder, keys, factors = _folder(store), [written(row) for row in rows], list(table.columns)
-    tried = _try(Workshop(*workshop), rows, contenders)
+    trying = Workshop(*workshop)
+    tried = _try(trying, rows, contenders)
     arguments = (*workshop, metrics, size, folder, new_session())
     if workers:
         pack(arguments)  # what cannot be sent to other processes is found out before
     prepare(folder, factors, list(metrics))
-    stored = read(folder, factors, tried[0])
-    compare(folder, stored, keys)
-    if tried[0] not in stored.rows:  # so that what is there is compared with what it would be now
-        known = [row for row, key in zip(rows, keys, strict=True) if key in stored.rows]
-        with suppress(SimEnvError):  # of a row that has failed
-            tried = _try(Workshop(*workshop), known, contenders)
-        stored = read(folder, factors, tried[0])
-    warn_of_changes(folder, stored, tried[1])
+    stored = _compared(folder, factors, keys, rows, tried, partial(_try, trying, contenders=contenders))
     missing = list(_missing(rows, keys, contenders, places, stored, retry=retry_errors))
     total = len(set(keys)) * len(contenders) * len(places) if progress else None
     _run_missing(arguments, missing, int(workers), len(places) if batched else 1, total)
     return _frame(table, keys, list(contenders), places, read(folder, factors), list(metrics), team)
+
+
+def _compared(
+    folder: Path,
+    factors: list[str],
+    keys: list[str],
+    rows: Sequence[Row],
+    tried: Any,
+    trying: Callable[[list[Row]], Any],
+) -> Stored:
+    """What is stored, once it is known to be of this experiment, with warnings of what has changed since.
+
+    Args:
+        folder: Where.
+        factors: Their names.
+        keys: Of the rows, as they are stored.
+        rows: All of them.
+        tried: Of which row a simulation was made, and of what.
+        trying: Makes one of other rows.
+    """
+    stored = read(folder, factors, tried[0])
+    compare(folder, stored, keys)
+    if tried[0] not in stored.rows:  # so that what is there is compared with what it would be now
+        with suppress(SimEnvError):  # of a row that has failed
+            tried = trying([row for row, key in zip(rows, keys, strict=True) if key in stored.rows])
+        stored = read(folder, factors, tried[0])
+    warn_of_changes(folder, stored, tried[1])
+    return stored
 
 
 def _run_missing(arguments: Any, missing: list[Run], workers: int, at_once: int, total: int | None) -> None:

@@ -1,12 +1,13 @@
 """What an experiment costs beside its model, what workers bring to it, and what it is worth to pair seeds.
 
-Overheads and intervals are measured wherever this runs; two workers only where it is not pinned to one core: run
-``python -m benchmarks.core --only experiments``.
+Two workers are measured in a process pinned to two cores, where there are two.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import sys
 import tempfile
 import time
 from typing import Any
@@ -17,7 +18,7 @@ from examples.greenhouse_coop.experiment.questions import BEST_CONSTANTS, FINAL
 from examples.greenhouse_coop.train import VENTILATOR, Crew, learn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from benchmarks.measure import Section, now
+from benchmarks.measure import Section, alone, now
 from benchmarks.noop import Model
 from simenv_marl import design, evaluate, run_experiment
 
@@ -45,11 +46,11 @@ class Turn:
 
 
 class SlowTurn(Turn):
-    """The same, after a while of work."""
+    """The same, after a while of work, of the processor."""
 
     def run(self) -> None:
-        end = time.perf_counter() + WORK
-        while time.perf_counter() < end:
+        end = time.thread_time() + WORK
+        while time.thread_time() < end:
             pass
         self.model.left()
 
@@ -76,7 +77,7 @@ def wall(rows: int, workers: int) -> float:
 def widths(generations: int) -> tuple[float, float]:
     """How wide the interval of the difference is, paired by seed and not: a trained pair against the best constants."""
     with tqdm(disable=True) as bar, Crew(1, bar) as crew:
-        trained = learn(crew, BEST_CONSTANTS, generations, np.random.default_rng(0))
+        trained = learn(crew.rate, BEST_CONSTANTS, generations, np.random.default_rng(0))
     contenders: dict[str, Any] = {"constants": BEST_CONSTANTS, "trained": trained}
     found = evaluate(
         GreenhouseSim, contenders, seeds=FINAL, baseline="constants", team=lambda returns: returns[VENTILATOR]
@@ -103,15 +104,22 @@ def measure(rounds: int, number: int) -> Section:
     overhead = experiment(Turn, rows, 0) / rows * 1e3
     section.ratio(f"milliseconds per run beside the model, {rows:,} rows, one process", overhead, 1.0, 0.3, 3)
     section.time("a run beside its model, milliseconds", overhead)
-    if (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) == 1:
-        section.remarks.append("Experiments: pinned to one core, so that two workers were not measured.")
-    else:
+    if (os.cpu_count() or 1) > 1:
         few = min(rows, 2000)
-        wall(16, 2)  # the workers start
-        alone, shared = wall(few, 0), wall(few, 2)
-        section.ratio("a model of 10 ms: one process / two workers", alone / shared, 1.8, 1.95, at_least=True)
-        section.time(f"{few} runs of 10 ms, one process, seconds", alone)
-        section.time(f"{few} runs of 10 ms, two workers, seconds", shared)
+        one, two = alone("experiments", str(few), cores="0,1")
+        section.ratio("a model of 10 ms: one process / two workers", one / two, 1.8, 1.95, at_least=True)
+        section.time(f"{few} runs of 10 ms, one process, seconds", one)
+        section.time(f"{few} runs of 10 ms, two workers, seconds", two)
     paired, unpaired = widths(GENERATIONS if rows == ROWS else 1)
     section.ratio("width of the interval of a difference, paired / unpaired, 32 seeds", paired / unpaired, 0.5, 0.33)
     return section
+
+
+def main(rows: int) -> None:
+    """Print the seconds of one process, and of two workers once they have started."""
+    wall(16, 2)
+    print(json.dumps([wall(rows, 0), wall(rows, 2)]))
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -41,6 +41,7 @@ IN_MID_EPISODE = {
     "entity": (WireError, r"\['a'\] at reservoir\.inflow; an entity is"),
     "args": (WireError, r"args .* no object: \[1\]"),
     "time": (WireError, "the time 'now'"),
+    "large time": (WireError, "the time 1000"),
     "removed point": (WireError, r"moon\.phase.*not in its hello"),
     "end": (WireError, "the end True"),
     "half a line": (ProcessDiedError, "closed its pipe in the middle of a line, and has exited with code 0"),

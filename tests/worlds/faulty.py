@@ -44,6 +44,7 @@ FAULTS: dict[str, Callable[[Any], Any]] = {
     "entity": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": ["a"], "args": {}}),
     "args": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "args": [1]}),
     "time": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": "now"}),
+    "large time": lambda wire: wire.send({"decide": 4, "point": "reservoir.inflow", "entity": "a", "time": 10**400}),
     "removed point": lambda wire: wire.send({"remove": "a", "point": "moon.phase"}),
     "end": lambda wire: wire.send({"end": True}),
     "half a line": lambda wire: (wire.raw(b'{"decide": 4'), os._exit(0)),

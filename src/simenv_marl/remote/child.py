@@ -43,7 +43,7 @@ GRACE: Final = 2.0
 
 
 _ENTITIES: Final = (str, int, NoneType)
-_TIMES: Final = (float, int, NoneType)
+_TIMES: Final = (float, NoneType)
 
 
 class _Process:
@@ -223,7 +223,9 @@ class Child:
             ProcessTimeoutError: Nothing came.
             WireError: It has sent something else than a frame.
         """
-        line, complete, self._rest = self._rest.partition(b"\n")
+        line = complete = self._rest
+        if line:
+            line, complete, self._rest = line.partition(b"\n")
         if not complete:
             line = self._completed(line)
         try:
@@ -233,19 +235,21 @@ class Child:
 
     def _completed(self, line: bytes) -> bytes:
         """Wait for the rest of a line, of which this is the beginning."""
-        parts, length, complete, reading = [line], len(line), b"", self._process.reading
-        begun = monotonic()
-        while not complete:
+        parts, length, reading, begun = [line], len(line), self._process.reading, monotonic()
+        while True:
             self._wait(reading, begun, "half a line" if length else "nothing")
             chunk = os.read(reading, CHUNK)
             if not chunk:
                 self._died(half=length > 0)
             part, complete, self._rest = chunk.partition(b"\n")
-            parts.append(part)
             length += len(part)
             if length >= LONGEST:
                 self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
-        return b"".join(parts)
+            if length == len(part) and complete:  # as most lines, in one piece
+                return part
+            parts.append(part)
+            if complete:
+                return b"".join(parts)
 
     def check_silent(self) -> None:
         """Make sure that it has sent nothing, where nothing is due.
@@ -271,6 +275,8 @@ class Child:
             self.fail(WireError(f"{self} has named {shown(entity)} at {name}; an entity is a string or an integer"))
         if arguments is not None and not isinstance(arguments, dict):
             self.fail(WireError(f"{self} has sent args for {name} that are no object: {shown(arguments)}"))
+        if type(time) is int and abs(time) < 1 << 1000:  # a float has no larger ones
+            time = float(time)
         if type(time) not in _TIMES:
             self.fail(WireError(f"{self} has sent the time {shown(time)} for {name}, which is no number"))
         return name, time

@@ -58,7 +58,8 @@ class _Link:
         if first is not None:
             self.state = "waits" if "decide" in first else "idle" if "end" in first else "busy"
             if type(first.get("time")) in (float, int):
-                self.time = float(first["time"])
+                with suppress(OverflowError):  # which is told of where the frame is read
+                    self.time = float(first["time"])
 
     def break_off(self) -> None:
         """End the episode, if one goes on: the process unwinds where it waits, and is ended where it is busy."""
@@ -262,7 +263,7 @@ class ProcessSimulation(SimulationInterface):
         entity = frame.get("entity")
         name, time = child.check_named(frame, entity)
         if time is not None:
-            link.time = float(time)
+            link.time = time
         link.number, link.state = number, "waits"
         function = functions.get(name)
         if function is None:
@@ -298,7 +299,7 @@ class ProcessSimulation(SimulationInterface):
         """The point and the entity of a frame, whose time is noted."""
         name, time = child.check_named(frame, entity)
         if time is not None:
-            self._link.time = float(time)
+            self._link.time = time
         return name, entity
 
     def _end(self, child: Child, end: Any) -> Any:

@@ -228,8 +228,16 @@ def test_what_energyplus_does_not_know_is_an_error(monkeypatch):
 # -- what builds on episodes ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["fork", "replay"])
-def test_branches_go_on_exactly(method):
+def test_branches_go_on_exactly():
+    _branched("replay")
+
+
+@pytest.mark.greenlet("with threads there is no fork")
+def test_forked_branches_go_on_exactly():
+    _branched("fork")
+
+
+def _branched(method):
     def begun():
         env = zones.raw_env()
         env.reset(seed=3)

@@ -1,0 +1,1 @@
+"""Blocks for models of financial entities, and a pension fund that is built on them."""

@@ -1,0 +1,176 @@
+"""What a pension fund cannot decide: prices, yields, returns, and how long people live.
+
+**Mortality** is Makeham's law: at age x, the force of mortality is A + B c^x. ``Mortality`` has the parameters of the
+Standard Ultimate Survival Model, A = 0.00022, B = 2.7e-6, c = 1.124 (Dickson, Hardy and Waters, Actuarial Mathematics
+for Life Contingent Risks; also behind the Standard Ultimate Life Table of the Society of Actuaries' FAM-L exam).
+
+**The market** has three variables, which move by the month and are correlated. Inflation and the yield of bonds are
+first-order autoregressive, as inflation is in Wilkie's model (A stochastic investment model for actuarial use,
+Transactions of the Faculty of Actuaries 39, 1986; 0.58 of a deviation is left after a year, after his revision of
+1995) and the rate in Vasicek's (An equilibrium characterization of the term structure, Journal of Financial Economics
+5, 1977). Returns on equities are lognormal. The levels are round numbers of our own, in the range of what regulators
+assume, and fitted to nothing: see ``Market``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from math import exp, log, sqrt
+from random import Random
+
+OLDEST = 120 * 12
+"""The age in months that is not survived."""
+
+STEP = 0.0025
+"""Provisions are valued at the yield rounded to this: there is a table of annuity factors for each step."""
+
+
+@dataclass(frozen=True)
+class Mortality:
+    """Makeham's law of mortality.
+
+    Attributes:
+        a: What does not depend on age.
+        b: The level of what does.
+        c: By which factor that grows each year.
+        factor: By which all of it is multiplied: less than 1, and people live longer than the tables say.
+
+    >>> round(Mortality().life_expectancy(65 * 12), 1)
+    22.7
+    """
+
+    a: float = 0.00022
+    b: float = 2.7e-6
+    c: float = 1.124
+    factor: float = 1.0
+
+    def force(self, years: float) -> float:
+        """The force of mortality at an age in years."""
+        return self.factor * (self.a + self.b * exp(years * log(self.c)))
+
+    def monthly(self) -> list[float]:
+        """The probability to die within a month, by age in months up to ``OLDEST``.
+
+        It is 1 - exp(-the integral of the force over the month), which has a closed form.
+        """
+        growth = (self.c ** (1 / 12) - 1) / log(self.c)
+        hazards = [self.factor * (self.a / 12 + self.b * self.c ** (age / 12) * growth) for age in range(OLDEST)]
+        return [1 - exp(-hazard) for hazard in hazards[:-1]] + [1.0]
+
+    def life_expectancy(self, age: int) -> float:
+        """How many years people of an age in months have before them."""
+        months, alive = 0.0, 1.0
+        for probability in self.monthly()[age:]:
+            alive *= 1 - probability
+            months += alive
+        return months / 12
+
+
+@lru_cache(maxsize=256)
+def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[float, ...]:
+    """What a pension of 1 a year is worth, paid for life in twelfths from retirement on.
+
+    Args:
+        mortality: By which people die.
+        steps: The yield, in units of ``STEP``.
+        retirement: The age in months from which it is paid.
+
+    Returns:
+        Its value by age in months, from ``OLDEST - 1`` *down to* 0: the order in which those born later come last.
+    """
+    discount = (1 + STEP * steps) ** (-1 / 12)
+    value, values = 0.0, []
+    for age, probability in reversed(list(enumerate(mortality.monthly()))):
+        value = (1 / 12 if age >= retirement else 0.0) + discount * (1 - probability) * value
+        values.append(value)
+    return tuple(values)
+
+
+@dataclass(frozen=True)
+class Climate:
+    """What the market is like. Rates are by the year.
+
+    Attributes:
+        inflation: Mean inflation: the European Central Bank's target.
+        inflation_sd: Its standard deviation in the long run.
+        inflation_memory: What is left of a deviation from the mean after a year.
+        bond_yield: Mean yield of bonds.
+        yield_sd: Its standard deviation in the long run.
+        yield_memory: What is left of a deviation from the mean after a year.
+        equity_premium: By how much the mean log return of equities exceeds the mean yield.
+        equity_sd: Standard deviation of that return.
+        correlations: Of the shocks of inflation and yield, inflation and equities, yield and equities.
+    """
+
+    inflation: float = 0.02
+    inflation_sd: float = 0.015
+    inflation_memory: float = 0.58
+    bond_yield: float = 0.025
+    yield_sd: float = 0.012
+    yield_memory: float = 0.85
+    equity_premium: float = 0.03
+    equity_sd: float = 0.18
+    correlations: tuple[float, float, float] = (0.4, -0.1, 0.1)
+
+
+class Market:
+    """Inflation, yields and returns, month by month.
+
+    Attributes:
+        inflation: The present inflation, by the year.
+        bond_yield: The present yield, by the year.
+        price_level: What cost 1 in the first month costs now.
+        equity_return: Of the month that has gone by.
+        bond_return: Of the month that has gone by, for bonds of ``DURATION`` years.
+    """
+
+    DURATION = 12.0
+
+    def __init__(self, climate: Climate, random: Random) -> None:
+        """Begin where inflation and yield are on average in the long run."""
+        self.climate, self.random = climate, random
+        self.inflation, self.bond_yield, self.price_level = climate.inflation, climate.bond_yield, 1.0
+        self.equity_return = self.bond_return = 0.0
+        self._roots = _cholesky(climate.correlations)
+
+    @property
+    def yield_steps(self) -> int:
+        """The yield in units of ``STEP``, between -0.5 % and 8 %."""
+        return min(max(round(self.bond_yield / STEP), -2), 32)
+
+    def advance(self) -> None:
+        """Let a month go by."""
+        climate, draw = self.climate, self.random.gauss
+        first, second, third = draw(0, 1), draw(0, 1), draw(0, 1)
+        shocks = [row[0] * first + row[1] * second + row[2] * third for row in self._roots]
+        self.inflation = _revert(self.inflation, climate.inflation, climate.inflation_memory) + (
+            _monthly_sd(climate.inflation_sd, climate.inflation_memory) * shocks[0]
+        )
+        before = self.bond_yield
+        self.bond_yield = _revert(before, climate.bond_yield, climate.yield_memory) + (
+            _monthly_sd(climate.yield_sd, climate.yield_memory) * shocks[1]
+        )
+        self.bond_return = max(before / 12 - self.DURATION * (self.bond_yield - before), -0.5)
+        mean = (climate.bond_yield + climate.equity_premium) / 12
+        self.equity_return = exp(mean + climate.equity_sd / sqrt(12) * shocks[2]) - 1
+        self.price_level *= 1 + self.inflation / 12
+
+
+def _revert(value: float, mean: float, memory: float) -> float:
+    """Where a value is a month later, but for chance."""
+    return mean + exp(log(memory) / 12) * (value - mean)
+
+
+def _monthly_sd(long_run: float, memory: float) -> float:
+    """The standard deviation of monthly shocks whose sum has that in the long run."""
+    return long_run * sqrt(1 - memory ** (1 / 6))
+
+
+def _cholesky(correlations: Sequence[float]) -> tuple[tuple[float, float, float], ...]:
+    """The matrix that makes three independent shocks correlated."""
+    one, two, three = correlations
+    middle = sqrt(1 - one * one)
+    cross = (three - one * two) / middle
+    return (1.0, 0.0, 0.0), (one, middle, 0.0), (two, cross, sqrt(1 - two * two - cross * cross))

@@ -21,7 +21,8 @@ against these rights; its *coverage* is its assets by its *provisions*, what all
 
 - Premiums cover the cost of what they buy; a discount takes a coverage well above what is required (Pensions Act,
   articles 128 and 129; the discount of a fifth from 125 % on is our round number).
-- Coverage is judged by its mean over twelve months, the *policy* coverage. Below 110 % there is no indexation.
+- Coverage is judged by its mean over twelve months, the *policy* coverage. Below 110 % there is no indexation. Above
+  what is required in the long run (125 % here), missed indexation may be repaired (a fifth of it a year: our number).
 - The minimum is 104.3 %. A fund that is below it at six yearly measurements in a row has to cut rights; so has,
   at once, one that cannot recover otherwise within ten years, for which 90 % stands here. Cuts may be spread over
   ten years.
@@ -377,8 +378,8 @@ class Manager(Entity):
         return self.equities if self.company.policy_coverage() < MINIMUM else 1.0
 
     def choose_mix(self) -> float:
-        """Decide on the share of equities: 40 %, as long as there is no shortfall to speak of."""
-        return 0.4 if self.company.policy_coverage() >= TRANSFERABLE else 0.3
+        """Decide on the share of equities: 40 % where that is lawful, and 30 % while coverage is below 100 %."""
+        return min(0.4 if self.company.policy_coverage() >= TRANSFERABLE else 0.3, self.lawful_mix())
 
     def rebalance(self) -> None:
         """Buy and sell, within what is lawful."""
@@ -483,9 +484,18 @@ class Company(Entity):
         cost = min(self.cost_rate(client) * (1 + client.extra), HIGHEST_PREMIUM)
         return cost * (0.8 if self.policy_coverage() >= REQUIRED else 1.0), min(1.3 * cost, HIGHEST_PREMIUM)
 
+    def repair(self) -> float:
+        """By how much rights may grow beyond inflation, where coverage is as high as required in the long run.
+
+        Returns:
+            A fifth of what they are behind prices.
+        """
+        behind = self.market.price_level / max(self.indexed, 1e-9) - 1
+        return max(0.0, behind) / 5 if self.policy_coverage() >= REQUIRED else 0.0
+
     def lawful_indexation(self) -> float:
-        """The highest indexation that is lawful: inflation, if coverage is high enough."""
-        return max(0.0, self.market.inflation) if self.policy_coverage() >= INDEXING else 0.0
+        """The highest indexation that is lawful: inflation and repair, if coverage is high enough."""
+        return max(0.0, self.market.inflation) + self.repair() if self.policy_coverage() >= INDEXING else 0.0
 
     # decisions
 
@@ -501,9 +511,9 @@ class Company(Entity):
         return surcharge * self.cost_rate(client) * (1 + client.extra)
 
     def choose_indexation(self) -> float:
-        """Decide by how much rights grow: the policy ladder, from nothing at 110 % to full inflation at 130 %."""
+        """Decide by how much rights grow: the policy ladder, from nothing at 110 % to all that is lawful at 130 %."""
         step = (self.policy_coverage() - INDEXING) / 0.2
-        return max(0.0, self.market.inflation) * min(max(step, 0.0), 1.0)
+        return self.lawful_indexation() * min(max(step, 0.0), 1.0)
 
     def choose_cut(self) -> float:
         """Decide by how much rights are cut in a shortfall: a tenth of it, from the third measurement on."""
@@ -666,6 +676,11 @@ class Fund:
         calendar.at(month + 12 - client.age % 12, self.review_year, client)
         if client.status != "retired":
             calendar.at(client.born + RETIREMENT, client.retire)
+
+    @property
+    def clients(self) -> list[Client]:
+        """All clients there are."""
+        return clients_of(self.world)
 
     def advance(self) -> None:
         """Let a month go by."""

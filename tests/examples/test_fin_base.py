@@ -487,14 +487,14 @@ def with_coverage(fund, coverage):
     return company
 
 
-@pytest.mark.parametrize(("coverage", "indexed"), [(1.09, False), (1.11, True)])
-def test_rights_are_indexed_from_110_percent_on_and_by_no_more_than_inflation(monkeypatch, coverage, indexed):
+@pytest.mark.parametrize(("coverage", "behind", "indexed"), [(1.09, 0.2, 0), (1.11, 0.2, 0.03), (1.3, 0.2, 0.07)])
+def test_rights_are_indexed_as_the_law_allows_it_by_coverage(monkeypatch, coverage, behind, indexed):
     fund = Fund(1, Parameters(clients=100))
     company = with_coverage(fund, coverage)
     monkeypatch.setattr(Company, "choose_indexation", lambda company: 5.0)
-    fund.market.inflation = 0.03
+    fund.market.inflation, fund.market.price_level = 0.03, 1 + behind
     company.conclude_year()
-    assert company.indexed == pytest.approx(1.03 if indexed else 1.0)
+    assert company.indexed == pytest.approx(1 + indexed)
 
 
 def test_the_risk_of_the_assets_is_not_raised_in_a_shortfall(monkeypatch):

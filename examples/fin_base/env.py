@@ -1,0 +1,473 @@
+"""The pension fund as environments: which of its decisions become agents, and what they see, may do and are worth.
+
+The model knows nothing of this: its methods are named as decision points from here, and nothing else of it changes.
+
+- ``COMPANY``, ``MANAGER``, ``REGULATOR``: single agents. ``indexer_0`` and ``planner_0`` decide once a year on
+  indexation and cuts, ``manager_0`` each quarter on the assets, ``regulator_0`` on what recovery plans must contain.
+  Their rewards differ, and partly oppose each other: see ``REWARDS``.
+- ``TEAM``: the same agents, all with the reward of the company.
+- ``PREMIUMS``: each client is an agent, which decides once a year on its own premium *for the company*; one policy can
+  be shared by all. The agent ends when the client retires, leaves or dies.
+- ``FundSim``: the simulation, some years of a fund; its time is in years, so that infos tell how many have gone by.
+
+``premium_env``, ``board_env``, ``team_env`` and ``mix_env`` make environments of these; the last is goal-based: the
+goal is a coverage, and episodes can be replayed with another.
+
+Actions that the law forbids are masked: discounts on premiums without the coverage for them, indexation below 110 %,
+more risk in a shortfall. What is not masked can still be denied: a recovery plan that cuts less than the regulator
+demands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import log
+from typing import Any, Final
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+
+from simenv_marl import (
+    TRUNCATED,
+    Definition,
+    SimulationAECEnv,
+    SimulationEnv,
+    SimulationInterface,
+    aec_env,
+    difference,
+    make_step,
+    single_env,
+)
+
+from .pension import MINIMUM, REQUIRED, SPREAD, Client, Company, Fund, Manager, Parameters
+
+YEARS: Final = 40
+"""After how many years an episode is truncated."""
+
+CLIENTS: Final = 1000
+"""How many clients there are in the beginning, unless an environment is told otherwise."""
+
+SURCHARGES: Final = (0.8, 0.9, 1.0, 1.05, 1.15, 1.3)
+"""Premiums that can be asked, by what the client's accrual costs."""
+
+INDEXATIONS: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Indexations, by the highest that is lawful."""
+
+CUTS: Final = (0.0, 0.5 / SPREAD, 1 / SPREAD, 3 / SPREAD, 1.0)
+"""Cuts, by the shortfall: those of the company's plans, and those that the regulator demands."""
+
+MIXES: Final = (0.0, 0.2, 0.3, 0.4, 0.6, 0.8)
+"""Shares of equities."""
+
+MODEL: Final = Company.__module__
+
+
+# -- what is observed -----------------------------------------------------------------------------
+
+OBSERVED: Final = (
+    "coverage, up to 10",
+    "policy coverage, up to 10",
+    "yearly measurements below the minimum, in a row",
+    "share of equities",
+    "yield, in tens of per cent",
+    "inflation, in tens of per cent",
+    "what has become of a right of 1, in first prices",
+)
+"""What the single agents observe of the company."""
+
+OF_A_CLIENT: Final = (
+    "age, by 100 years",
+    "wage, by 100,000 in first prices",
+    "rights, by the wage",
+    "how much more than the standard is accrued",
+    "what the standard accrual costs, by the wage",
+    "savings, by the wage",
+)
+"""What is observed of a client, behind the same of the company."""
+
+
+def look_at(company: Company) -> tuple[float, ...]:
+    """What ``OBSERVED`` lists."""
+    market = company.market
+    return (
+        min(company.coverage(), 10.0),
+        min(company.policy_coverage(), 10.0),
+        company.measured_short,
+        company.manager.equities,
+        10 * market.bond_yield,
+        10 * market.inflation,
+        company.indexed / market.price_level,
+    )
+
+
+def look_at_client(company: Company, client: Client) -> list[float]:
+    """What ``OBSERVED`` and ``OF_A_CLIENT`` list."""
+    wage = client.wage
+    return [
+        *look_at(company),
+        client.age / 1200,
+        wage / 100_000_00 / company.market.price_level,
+        client.accrued / wage,
+        client.extra,
+        company.cost_rate(client),
+        client.cents / wage,
+    ]
+
+
+def company_of(*call: Any) -> Company:
+    """The company that a decision of a single agent is about: the last argument, or its own."""
+    last = call[-1]
+    return last if isinstance(last, Company) else last.company
+
+
+SPACE: Final = Box(-10.0, 100.0, (len(OBSERVED),), np.float32)
+CLIENT_SPACE: Final = Box(-10.0, 100.0, (len(OBSERVED) + len(OF_A_CLIENT),), np.float32)
+
+
+def observe(*call: Any) -> NDArray[np.float32]:
+    """Observe the company."""
+    return np.array(look_at(company_of(*call)), np.float32)
+
+
+def observe_client(company: Company, client: Client) -> NDArray[np.float32]:
+    """Observe the company and one client."""
+    return np.array(look_at_client(company, client), np.float32)
+
+
+# -- what it is worth -----------------------------------------------------------------------------
+
+
+@difference
+def purchasing_power(*call: Any) -> float:
+    """The logarithm of what a right of 1 from the first month buys."""
+    company = company_of(*call)
+    return log(max(company.indexed / company.market.price_level, 1e-9))
+
+
+@difference
+def gain_of_coverage(*call: Any) -> float:
+    """The coverage."""
+    return company_of(*call).coverage()
+
+
+def sound(company: Company) -> float:
+    """1 for a company that is not in a shortfall, less ten times by how much it is."""
+    coverage = company.policy_coverage()
+    return 1.0 if coverage >= MINIMUM else 1.0 - 10 * (MINIMUM - coverage)
+
+
+def company_reward(*call: Any) -> float:
+    """Be sound, and let pensions keep their value: a per cent of it is worth a tenth of a sound year."""
+    return sound(company_of(*call)) + 10 * float(purchasing_power(*call))
+
+
+def manager_reward(*call: Any) -> float:
+    """Gain coverage."""
+    return float(gain_of_coverage(*call))
+
+
+def regulator_reward(*call: Any) -> float:
+    """Let there be no shortfall: whatever that does to pensions."""
+    return sound(company_of(*call))
+
+
+def premium_reward(company: Company, client: Client) -> float:
+    """A sound company, less what the client has paid: ten per cent of the wage are a fifth of a sound year."""
+    return sound(company) - 2 * client.premium
+
+
+REWARDS: Final = {
+    "indexer_0": company_reward,
+    "planner_0": company_reward,
+    "manager_0": manager_reward,
+    "regulator_0": regulator_reward,
+}
+"""The company wants to be sound *and* to keep pensions' value, the manager gains, the regulator no shortfall."""
+
+
+# -- what is decided ------------------------------------------------------------------------------
+
+
+def nearest(levels: Sequence[float], value: float) -> int:
+    """The number of the level that a value is nearest to."""
+    return min(range(len(levels)), key=lambda number: abs(levels[number] - value))
+
+
+def ask_premium(action: Any, company: Company, client: Client) -> float:
+    """Ask for a premium that is so and so many times what the accrual costs."""
+    return SURCHARGES[action] * company.cost_rate(client) * (1 + client.extra)
+
+
+def premium_asked(premium: float, company: Company, client: Client) -> int:
+    """Which action a premium of the company's rule corresponds to."""
+    return nearest(SURCHARGES, premium / (company.cost_rate(client) * (1 + client.extra)))
+
+
+def lawful_surcharges(company: Company, client: Client) -> NDArray[np.int8]:
+    """Discounts take a high coverage."""
+    return ALL_SURCHARGES if company.policy_coverage() >= REQUIRED else NO_DISCOUNTS
+
+
+ALL_SURCHARGES: Final = np.ones(len(SURCHARGES), np.int8)
+NO_DISCOUNTS: Final = np.array([level >= 1 for level in SURCHARGES], np.int8)
+
+
+def index(action: Any, company: Company) -> float:
+    """Index by so much of what is lawful."""
+    return INDEXATIONS[action] * company.lawful_indexation()
+
+
+def indexed(indexation: float, company: Company) -> int:
+    """Which action an indexation of the company's rule is nearest to."""
+    most = company.lawful_indexation()
+    return nearest(INDEXATIONS, indexation / most) if most > 0 else 0
+
+
+def lawful_indexations(company: Company) -> list[bool]:
+    """None but the first where nothing is lawful."""
+    some = company.lawful_indexation() > 0
+    return [level == 0 or some for level in INDEXATIONS]
+
+
+def cut(action: Any, *call: Any) -> float:
+    """Cut, or demand to cut, so much of the shortfall."""
+    return CUTS[action] * company_of(*call).shortfall()
+
+
+def was_cut(decided: float, *call: Any) -> int:
+    """Which action a cut of a rule is nearest to."""
+    shortfall = company_of(*call).shortfall()
+    return nearest(CUTS, decided / shortfall) if shortfall > 0 else 0
+
+
+def lawful_mixes(manager: Manager) -> list[bool]:
+    """No more risk than there is, in a shortfall; and always none."""
+    most = manager.lawful_mix()
+    return [level <= most for level in MIXES]
+
+
+PREMIUMS: Final[dict[Any, Definition]] = {
+    f"{MODEL}.Company.set_premium": make_step(
+        observation_space=CLIENT_SPACE,
+        observation_space_mapping=observe_client,
+        action_space=Discrete(len(SURCHARGES)),
+        apply=ask_premium,
+        action_mask_mapping=lawful_surcharges,
+        rule_action_mapping=premium_asked,
+        reward_mapping=premium_reward,
+        agent=lambda company, client: client.name,
+        removed_by={
+            f"{MODEL}.Client.vanish": lambda client, *rest, **more: client.name,
+            f"{MODEL}.Client.retire": lambda client: client.name,
+        },
+    )
+}
+"""The premium of each client, by an agent of its own."""
+
+COMPANY: Final[dict[Any, Definition]] = {
+    f"{MODEL}.Company.choose_indexation": make_step(
+        observation_space=SPACE,
+        observation_space_mapping=observe,
+        action_space=Discrete(len(INDEXATIONS)),
+        apply=index,
+        action_mask_mapping=lawful_indexations,
+        rule_action_mapping=indexed,
+        reward_mapping=company_reward,
+        agent="indexer_0",
+    ),
+    f"{MODEL}.Company.choose_cut": make_step(
+        observation_space=SPACE,
+        observation_space_mapping=observe,
+        action_space=Discrete(len(CUTS)),
+        apply=cut,
+        rule_action_mapping=was_cut,
+        reward_mapping=company_reward,
+        agent="planner_0",
+    ),
+}
+"""What the company decides once a year: indexation in good years, cuts in a shortfall."""
+
+MANAGER: Final[dict[Any, Definition]] = {
+    f"{MODEL}.Manager.choose_mix": make_step(
+        observation_space=SPACE,
+        observation_space_mapping=observe,
+        action_space=Discrete(len(MIXES)),
+        action_space_mapping=dict(enumerate(MIXES)),
+        action_mask_mapping=lawful_mixes,
+        rule_action_mapping=lambda equities: nearest(MIXES, equities),
+        reward_mapping=manager_reward,
+        agent="manager_0",
+    )
+}
+"""The asset mix, each quarter."""
+
+REGULATOR: Final[dict[Any, Definition]] = {
+    f"{MODEL}.Regulator.choose_demand": make_step(
+        observation_space=SPACE,
+        observation_space_mapping=observe,
+        action_space=Discrete(len(CUTS)),
+        apply=cut,
+        rule_action_mapping=was_cut,
+        reward_mapping=regulator_reward,
+        agent="regulator_0",
+    )
+}
+"""What the regulator demands in a shortfall."""
+
+BOARD: Final[dict[Any, Definition]] = COMPANY | MANAGER | REGULATOR
+"""All single agents, each with a reward of its own."""
+
+TEAM: Final[dict[Any, Definition]] = {
+    point: replace(definition, reward_mapping=company_reward) for point, definition in BOARD.items()
+}
+"""The same, with the company's reward for all of them."""
+
+GOALS: Final = Box(0.0, 10.0, (1,), np.float32)
+
+
+def reach(achieved: Any, desired: Any, info: Any) -> Any:
+    """How far away the desired coverage is, as a reward: for one step or for many."""
+    return -np.abs(np.asarray(achieved) - np.asarray(desired)).max(axis=-1)
+
+
+def coverage_of(manager: Manager) -> list[float]:
+    """The goal that is achieved: the coverage, up to 10."""
+    return [min(manager.company.coverage(), 10.0)]
+
+
+MIX_WITH_GOAL: Final[dict[Any, Definition]] = {
+    point: replace(
+        definition,
+        reward_mapping=lambda manager: float(reach(coverage_of(manager), [REQUIRED], None)),
+        goal_space=GOALS,
+        achieved_goal_mapping=coverage_of,
+        desired_goal_mapping=lambda manager: [REQUIRED],
+        compute_reward=reach,
+    )
+    for point, definition in MANAGER.items()
+}
+"""The asset mix, with the required coverage as its goal."""
+
+
+# -- the simulation -------------------------------------------------------------------------------
+
+
+class FundSim(SimulationInterface):
+    """Some years of a pension fund, or until it cannot pay all pensions.
+
+    Attributes:
+        fund: The fund of the present episode.
+    """
+
+    points = BOARD
+
+    def __init__(self, years: int = YEARS, parameters: Parameters | None = None) -> None:
+        """Make a simulation.
+
+        Args:
+            years: After how many years it is truncated.
+            parameters: What the fund is like; None: as the model has it, with ``CLIENTS`` clients.
+        """
+        self.years = years
+        self.parameters = parameters or Parameters(clients=CLIENTS)
+        self.fund = Fund(0, replace(self.parameters, clients=0))
+        self._stopped = False
+
+    def reset(self, seed: int | None = None) -> None:
+        """Found another fund."""
+        self._stopped = False
+        self.fund = Fund(seed, self.parameters)
+
+    def run(self) -> Any:
+        """Let month after month go by.
+
+        Returns:
+            ``TRUNCATED`` where the fund has paid all pensions to the end.
+        """
+        fund = self.fund
+        while fund.world.month < 12 * self.years:
+            if self._stopped or fund.company.rations:
+                return None
+            fund.advance()
+        fund.world.check()
+        return TRUNCATED
+
+    def stop(self) -> None:
+        """Ask the loop to end after the present month."""
+        self._stopped = True
+
+    def time(self) -> float:
+        """The time in years."""
+        return self.fund.world.month / 12
+
+    def reseed(self, seed: int) -> None:
+        """Draw anew what lies ahead, of the market and of the people."""
+        fund = self.fund
+        fund.world.random.seed(seed)
+        fund.market.random.seed(f"{seed}/market")
+        fund.people.seed(f"{seed}/people")
+
+    def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
+        """Whose decisions will be called for: those of the company, its manager and its regulator."""
+        company = self.fund.company
+        callers = {"Company": (company,), "Manager": (company.manager,), "Regulator": (company.regulator, company)}
+        kind, name = point.split(".")[-2:]
+        return [] if name == "set_premium" else [callers[kind]]
+
+    def state(self) -> NDArray[np.float32]:
+        """All that is known of the company, and how its rights are spread over the ages, by ten years."""
+        company = self.fund.company
+        ages = [0.0] * 12
+        for client in self.fund.clients:
+            ages[min(client.age // 120, 11)] += client.accrued
+        total = sum(ages) or 1.0
+        return np.array([*look_at(company), *(rights / total for rights in ages), self.time() / self.years], np.float32)
+
+
+STATE_SPACE: Final = Box(-10.0, 100.0, (len(OBSERVED) + 13,), np.float32)
+"""The space of the state."""
+
+
+# -- environments ---------------------------------------------------------------------------------
+
+
+def board_env(simulation: Any = FundSim, **options: Any) -> SimulationAECEnv:
+    """Make the environment of the company's, the manager's and the regulator's decisions, with rewards that differ.
+
+    Args:
+        simulation: The simulation.
+        **options: As ``simenv_marl.aec_env`` takes them.
+    """
+    return aec_env(simulation, BOARD, **{"state_space": STATE_SPACE, **options})
+
+
+def team_env(simulation: Any = FundSim, **options: Any) -> SimulationAECEnv:
+    """Make the same environment with one reward for all.
+
+    Args:
+        simulation: The simulation.
+        **options: As ``simenv_marl.aec_env`` takes them.
+    """
+    return aec_env(simulation, TEAM, **{"state_space": STATE_SPACE, **options})
+
+
+def premium_env(simulation: Any = FundSim, **options: Any) -> SimulationAECEnv:
+    """Make the environment in which each client's premium is decided by an agent of its own.
+
+    Args:
+        simulation: The simulation.
+        **options: As ``simenv_marl.aec_env`` takes them.
+    """
+    return aec_env(simulation, PREMIUMS, **{"state_space": STATE_SPACE, **options})
+
+
+def mix_env(simulation: Any = FundSim, **options: Any) -> SimulationEnv:
+    """Make the goal-based environment of the asset mix alone.
+
+    Args:
+        simulation: The simulation.
+        **options: As ``simenv_marl.single_env`` takes them.
+    """
+    return single_env(simulation, MIX_WITH_GOAL, **options)

@@ -1,0 +1,326 @@
+"""The pension fund as environments: the same fund by its rules, what may be decided, and who ends when."""
+
+import numpy as np
+import pytest
+from examples.fin_base.env import (
+    BOARD,
+    COMPANY,
+    INDEXATIONS,
+    MANAGER,
+    MIX_WITH_GOAL,
+    MIXES,
+    PREMIUMS,
+    REGULATOR,
+    STATE_SPACE,
+    SURCHARGES,
+    TEAM,
+    FundSim,
+    board_env,
+    lawful_indexations,
+    lawful_mixes,
+    lawful_surcharges,
+    mix_env,
+    premium_env,
+    team_env,
+)
+from examples.fin_base.pension import MINIMUM, Client, Parameters, clients_of
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import api_test, seed_test
+
+from simenv_marl import RULE, InvalidActionError, aec_env, branch, joint_env, parallel_env, single_env, vector_env
+from simenv_marl.testing import check_simulation
+
+from .test_fin_base import state, with_coverage
+
+SMALL = Parameters(clients=60, coverage=1.0)  # poor enough for plans, cuts and demands
+
+
+def small(years=12):
+    return FundSim(years, SMALL)
+
+
+def plain(seed, years=12):
+    simulation = small(years)
+    simulation.reset(seed)
+    simulation.run()
+    return simulation.fund
+
+
+def by_rule_aec(environment, seed):
+    environment.reset(seed=seed)
+    for agent in environment.agent_iter():
+        environment.step(None if environment.terminations[agent] or environment.truncations[agent] else RULE)
+    return environment.simulation.fund
+
+
+def by_rule_parallel(environment, seed):
+    environment.reset(seed=seed)
+    while environment.agents:
+        environment.step(dict.fromkeys(environment.agents, RULE))
+    return environment.simulation.fund
+
+
+def by_rule_single(environment, seed):
+    environment.reset(seed=seed)
+    over = False
+    while not over:
+        _, _, terminated, truncated, _ = environment.step(RULE)
+        over = terminated or truncated
+    return environment.simulation.fund
+
+
+VIEWS = {
+    "aec board": (aec_env, BOARD, by_rule_aec),
+    "aec premiums": (aec_env, PREMIUMS, by_rule_aec),
+    "aec all": (aec_env, BOARD | PREMIUMS, by_rule_aec),
+    "parallel board": (parallel_env, BOARD, by_rule_parallel),
+    "parallel premiums": (parallel_env, PREMIUMS, by_rule_parallel),
+    "joint board": (joint_env, BOARD, by_rule_single),
+    "single manager": (single_env, MANAGER, by_rule_single),
+    "single goal": (single_env, MIX_WITH_GOAL, by_rule_single),
+    "single regulator": (single_env, REGULATOR, by_rule_single),
+}
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("driver", ["greenlet", "thread"])
+def test_the_rule_through_every_view_is_the_plain_run(view, driver):
+    make, points, play = VIEWS[view]
+    fund, expected = play(make(small(), points, driver=driver), 4), plain(4)
+    assert state(fund) == state(expected)
+    assert fund.world.counts == expected.world.counts
+
+
+def test_the_single_view_of_one_client_by_rule_is_the_plain_run():
+    fund = plain(4)
+    name = next(client.name for client in clients_of(fund.world) if client.works)
+    assert state(by_rule_single(single_env(small(), PREMIUMS, agent=name), 4)) == state(fund)
+
+
+def test_a_vector_whose_managers_act_as_the_rule_earns_what_the_rule_earns():
+    def earned(seed):
+        environment, rewards, over = single_env(small(), MANAGER), [], False
+        environment.reset(seed=seed)
+        while not over:
+            _, reward, terminated, truncated, _ = environment.step(RULE)
+            rewards.append(reward)
+            over = terminated or truncated
+        return rewards
+
+    expected = np.array([earned(4), earned(5)])
+    envs = vector_env(small(), MANAGER, num_envs=2)
+    observations, _ = envs.reset(seed=[4, 5])
+    for step in range(expected.shape[1]):
+        equities = np.where(observations[:, 1] >= 1, 3, 2)
+        lawful = np.where(observations[:, 1] < MINIMUM, np.rint(10 * observations[:, 3]).astype(int) - 1, 3)
+        observations, rewards, *_ = envs.step(np.minimum(equities, lawful))
+        assert rewards == pytest.approx(expected[:, step])
+    envs.close()
+
+
+@pytest.mark.parametrize("points", [PREMIUMS, MANAGER])
+def test_the_rule_has_actions_which_do_the_same(points):
+    environment = aec_env(small(6), points)
+    environment.reset(seed=4)
+    told = {}
+    for agent in environment.agent_iter():
+        _, _, terminated, truncated, info = environment.last()
+        if "rule_action" in info:
+            told.setdefault(agent, []).append(info["rule_action"])
+        environment.step(None if terminated or truncated else RULE)
+    assert told
+    environment.reset(seed=4)
+    for agent in environment.agent_iter():
+        _, _, terminated, truncated, _ = environment.last()
+        environment.step(None if terminated or truncated else told[agent].pop(0))
+    assert state(environment.simulation.fund) == state(plain(4, 6))
+
+
+# -- what may be decided --------------------------------------------------------------------------
+
+
+def fund_with(coverage):
+    simulation = small()
+    simulation.reset(1)
+    with_coverage(simulation.fund, coverage)
+    return simulation.fund
+
+
+@pytest.mark.parametrize(
+    ("coverage", "discounts", "indexations", "mixes"),
+    [(0.95, False, 1, 4), (1.08, False, 1, 6), (1.2, False, 5, 6), (1.3, True, 5, 6)],
+)
+def test_masks_are_what_the_law_allows(coverage, discounts, indexations, mixes):
+    company = fund_with(coverage).company
+    client = next(client for client in clients_of(company.world) if client.works)
+    allowed = lawful_surcharges(company, client)
+    assert [bool(legal) for legal in allowed] == [level >= 1 or discounts for level in SURCHARGES]
+    assert sum(lawful_indexations(company)) == indexations
+    assert sum(lawful_mixes(company.manager)) == mixes
+    lowest, highest = company.lawful_premium(client)
+    for level, legal in zip(SURCHARGES, allowed, strict=True):
+        assert (lowest - 1e-9 <= level * company.cost_rate(client) <= highest + 1e-9) == bool(legal)
+
+
+def test_what_is_masked_is_refused():
+    environment = premium_env(small())
+    environment.reset(seed=1)
+    with pytest.raises(InvalidActionError):
+        environment.step(0)
+
+
+def test_actions_are_what_becomes_of_the_fund():
+    environment = premium_env(small())
+    environment.reset(seed=1)
+    client = environment.simulation.fund.world.entities[environment.agent_selection]
+    cost = client.company.cost_rate(client) * (1 + client.extra)
+    environment.step(5)
+    assert client.premium == pytest.approx(1.3 * cost)
+
+    environment = aec_env(small(), MANAGER)
+    environment.reset(seed=1)
+    environment.step(1)
+    assert environment.simulation.fund.company.manager.equities == MIXES[1]
+
+    environment = aec_env(FundSim(4, Parameters(clients=60, coverage=1.6)), COMPANY)
+    environment.reset(seed=1)
+    company = environment.simulation.fund.company
+    assert environment.agent_selection == "indexer_0"
+    most = company.lawful_indexation()
+    environment.step(2)
+    assert company.indexed == pytest.approx(1 + INDEXATIONS[2] * most)
+
+
+def test_a_plan_that_cuts_too_little_is_denied_and_the_demand_carried_out():
+    environment = board_env(FundSim(3, Parameters(clients=60, coverage=0.8)))
+    environment.reset(seed=1)
+    fund = environment.simulation.fund
+    while environment.agent_selection == "manager_0":
+        environment.step(RULE)
+    assert environment.agent_selection == "regulator_0"
+    environment.step(4)
+    short = fund.company.shortfall()
+    assert environment.agent_selection == "planner_0"
+    environment.step(0)
+    assert fund.world.counts["RecoveryPlan denied: cuts too little"] == 1
+    assert fund.company.indexed == pytest.approx(1 - short)
+
+
+def test_no_cent_is_lost_by_random_legal_actions():
+    environment = aec_env(small(), BOARD | PREMIUMS)
+    for seed in range(10):
+        environment.reset(seed=seed)
+        generator = np.random.default_rng(seed)
+        for _ in environment.agent_iter():
+            _, _, terminated, truncated, info = environment.last()
+            legal = np.flatnonzero(info.get("action_mask", np.ones(5)))
+            environment.step(None if terminated or truncated else int(generator.choice(legal)))
+        environment.simulation.fund.world.check()
+
+
+# -- agents, rewards, time ------------------------------------------------------------------------
+
+
+def test_the_agent_of_a_client_ends_when_the_client_retires_leaves_or_dies(monkeypatch):
+    ended, gone = [], []
+    for name in ("retire", "vanish"):
+        original = getattr(Client, name)
+
+        def noted(client, *rest, original=original):
+            if client.status in ("working", "away"):
+                gone.append(client.name)
+            return original(client, *rest)
+
+        monkeypatch.setattr(Client, name, noted)
+    environment = premium_env(small())
+    environment.reset(seed=4)
+    decided = set()
+    for agent in environment.agent_iter():
+        _, _, terminated, truncated, _ = environment.last()
+        if terminated:
+            ended.append(agent)
+        decided.add(agent)
+        environment.step(None if terminated or truncated else RULE)
+    assert len(ended) == len(set(ended)) > 10
+    assert set(ended) == set(gone) & decided
+
+
+def play(environment, seed, until=40):
+    """Rewards and infos by agent, with the rule."""
+    seen = {}
+    environment.reset(seed=seed)
+    for agent in environment.agent_iter(until):
+        _, reward, terminated, truncated, info = environment.last()
+        seen.setdefault(agent, []).append((reward, info))
+        environment.step(None if terminated or truncated else RULE)
+    return seen
+
+
+def test_the_boards_rewards_differ_and_a_teams_are_one():
+    alone, together = play(board_env(small()), 4), play(team_env(small()), 4)
+    assert alone.keys() == together.keys()
+    manager = [[reward for reward, _ in seen["manager_0"]] for seen in (alone, together)]
+    assert manager[0] != manager[1]
+    planner = [[reward for reward, _ in seen["planner_0"]] for seen in (alone, together)]
+    assert planner[0] == planner[1]
+    definitions = {id(definition.reward_mapping) for definition in TEAM.values()}
+    assert len(definitions) == 1
+
+
+def test_infos_tell_the_time_in_years():
+    seen = play(aec_env(small(), BOARD | PREMIUMS), 4, 400)
+    assert [info["time"] for _, info in seen["manager_0"]][:5] == [0.25, 0.5, 0.75, 1.0, 1.25]
+    assert {info["elapsed"] for _, info in seen["manager_0"][1:]} == {0.25}
+    assert any(info["elapsed"] > 0.9 for agent in seen if agent.startswith("client") for _, info in seen[agent])
+
+
+def test_the_goal_is_a_coverage_and_rewards_can_be_computed_for_another():
+    environment = mix_env(small())
+    environment.reset(seed=1)
+    observation, reward, _, _, info = environment.step(3)
+    achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+    assert environment.compute_reward(achieved, desired, info) == pytest.approx(reward, abs=1e-6)
+    stacked = environment.compute_reward(
+        np.stack([achieved] * 3), np.stack([achieved, desired, achieved + 1]), [info] * 3
+    )
+    assert stacked == pytest.approx([0, reward, -1], abs=1e-6)
+
+
+def test_a_state_for_critics():
+    environment = board_env(small())
+    environment.reset(seed=1)
+    first = environment.state()
+    assert STATE_SPACE.contains(first)
+    by_rule_aec(environment, 1)
+    assert STATE_SPACE.contains(environment.state())
+    assert first[-1] < environment.state()[-1] == 1
+
+
+def test_what_lies_ahead_can_be_drawn_anew():
+    environment = single_env(small(3), MANAGER)
+    environment.reset(seed=1)
+    environment.step(3)
+
+    def end(copied, number):
+        over = False
+        while not over:
+            _, _, terminated, truncated, _ = copied.step(RULE)
+            over = terminated or truncated
+        return copied.simulation.fund.company.coverage()
+
+    ends = branch(environment, end, 3, seeds=[1, 1, 2])
+    assert ends[0] == ends[1] != ends[2]
+
+
+def test_others_checks_pass():
+    api_test(board_env(small(3)), num_cycles=30)
+    with pytest.warns(UserWarning, match="possible_agents"):  # which clients there will be is not known beforehand
+        api_test(premium_env(small(3)), num_cycles=30)
+    seed_test(lambda: board_env(small(3)), num_cycles=10)
+    check_env(mix_env(small(3)), skip_render_check=True)
+
+
+@pytest.mark.parametrize("points", [BOARD, PREMIUMS])
+def test_the_librarys_check_finds_nothing(points):
+    report = check_simulation(lambda: small(3), points, episodes=2)
+    assert not [finding for finding in report.findings if finding.severity != "note"], report

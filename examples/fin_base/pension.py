@@ -342,8 +342,9 @@ class Client(Entity):
 
     def accrue(self, cents: int) -> None:
         """Have a right to so many more cents a year, or fewer."""
-        self.accrued += cents
-        self.company.book_right(self.born, cents)
+        if cents:
+            self.accrued += cents
+            self.company.book_right(self.born, cents)
 
     def value(self) -> int:
         """What its rights are worth, in cents."""
@@ -419,6 +420,7 @@ class Company(Entity):
     __slots__ = (
         "_factors",
         "_history",
+        "_policy_coverage",
         "_provisions",
         "_rights",
         "indexed",
@@ -441,6 +443,7 @@ class Company(Entity):
         self.rations: dict[int, int] = {}
         self._rights = [0] * OLDEST  # by month of birth: the first is OLDEST - 1 months before the first month
         self._history: deque[float] = deque(maxlen=12)
+        self._policy_coverage = 1.0
         self._factors = annuity_factors(tables, market.yield_steps, RETIREMENT)
         self._provisions: float | None = None
 
@@ -468,8 +471,7 @@ class Company(Entity):
 
     def policy_coverage(self) -> float:
         """The mean of the coverage over the last twelve months, by which it is judged."""
-        history = self._history
-        return sum(history) / len(history) if history else self.coverage()
+        return self._policy_coverage
 
     def shortfall(self) -> float:
         """The share of all rights that would have to be cut to reach the minimum."""
@@ -576,7 +578,9 @@ class Company(Entity):
 
     def measure(self) -> None:
         """Note the coverage of the month."""
-        self._history.append(self.coverage())
+        history = self._history
+        history.append(self.coverage())
+        self._policy_coverage = sum(history) / len(history)
 
     def conclude_year(self) -> None:
         """Measure, index rights or cut them, after the regulator has looked at the plan."""

@@ -200,9 +200,9 @@ def ask_premium(action: Any, company: Company, client: Client) -> float:
     return SURCHARGES[action] * company.cost_rate(client) * (1 + client.extra)
 
 
-def premium_asked(premium: float, company: Company, client: Client) -> int:
+def premium_asked(premium: float, company: Company, client: Client) -> int | None:
     """Which action a premium of the company's rule corresponds to."""
-    return nearest(SURCHARGES, premium / (company.cost_rate(client) * (1 + client.extra)))
+    return ACTIONS.get(round(premium / (company.cost_rate(client) * (1 + client.extra)), 6))
 
 
 def lawful_surcharges(company: Company, client: Client) -> NDArray[np.int8]:
@@ -210,6 +210,7 @@ def lawful_surcharges(company: Company, client: Client) -> NDArray[np.int8]:
     return ALL_SURCHARGES if company.policy_coverage() >= REQUIRED else NO_DISCOUNTS
 
 
+ACTIONS: Final = {level: action for action, level in enumerate(SURCHARGES)}
 ALL_SURCHARGES: Final = np.ones(len(SURCHARGES), np.int8)
 NO_DISCOUNTS: Final = np.array([level >= 1 for level in SURCHARGES], np.int8)
 

@@ -128,11 +128,11 @@ class PensionContract(Contract):
 
     def perform(self) -> bool:
         """Pay the pension or, where the money does not suffice for all pensions, its share of what there is."""
-        rations = self.debtor.rations
+        rations = self.debtor.ration()
         if not rations:
             return super().perform()
         self.missed += 1
-        self.debtor.world.ledger.move(self.debtor, self.creditor, rations.get(self.number, 0), self.reason)
+        self.debtor.world.ledger.move(self.debtor, self.creditor, rations[self.number], self.reason)
         return False
 
 
@@ -170,14 +170,16 @@ class Contribution(Request):
         self.extra = extra
 
     def objection(self) -> str | None:
-        """Only who works can, and only as much as is lawful and can be afforded."""
+        """Only who works can, and more only as far as it is lawful and can be afforded."""
         client = self.applicant
         if client.status != "working":
             return "not working"
+        if self.extra <= client.extra:
+            return None
         rate = client.company.cost_rate(client) * (1 + self.extra)
         if rate > HIGHEST_PREMIUM:
             return "above the highest premium"
-        return "cannot be afforded" if rate > DISPOSABLE and self.extra > client.extra else None
+        return "cannot be afforded" if rate > DISPOSABLE else None
 
     def carry_out(self) -> None:
         """Agree on it; the premium follows from it."""
@@ -413,7 +415,7 @@ class Company(Entity):
         manager: Who manages the assets.
         regulator: Who supervises it.
         measured_short: At how many yearly measurements in a row its policy coverage was below the minimum.
-        rations: What each pension contract gets while there is not enough for all.
+        rations: What each pension contract got in the last month, if there was not enough for all.
         indexed: What a right of 1 from the first month has become by indexation and cuts.
     """
 
@@ -422,6 +424,7 @@ class Company(Entity):
         "_history",
         "_policy_coverage",
         "_provisions",
+        "_rationed",
         "_rights",
         "indexed",
         "manager",
@@ -441,6 +444,7 @@ class Company(Entity):
         self.manager, self.regulator = Manager(self), Regulator(world)
         self.measured_short, self.indexed = 0, 1.0
         self.rations: dict[int, int] = {}
+        self._rationed = -1
         self._rights = [0] * OLDEST  # by month of birth: the first is OLDEST - 1 months before the first month
         self._history: deque[float] = deque(maxlen=12)
         self._policy_coverage = 1.0
@@ -533,7 +537,12 @@ class Company(Entity):
         self._provisions = None
 
     def review(self, client: Client) -> None:
-        """Set premium and accrual for a client's next year, and amend the contract."""
+        """Set premium and accrual for a client's next year, and amend the contract.
+
+        What is paid and accrued beyond the standard ends where it costs more than can be asked for.
+        """
+        if self.cost_rate(client) * (1 + client.extra) > HIGHEST_PREMIUM:
+            client.extra = 0.0
         lowest, highest = self.lawful_premium(client)
         client.premium = min(max(self.set_premium(client), lowest), highest)
         client.accrual = round(ACCRUAL * (1 + client.extra) * client.wage / 12)
@@ -564,17 +573,21 @@ class Company(Entity):
         self._factors = annuity_factors(self.tables, market.yield_steps, RETIREMENT)
         self._provisions = None
 
-    def ration(self) -> None:
-        """See whether there is enough for this month's pensions; if not, divide what there is."""
-        due = {
-            number: contract.cents
-            for number, contract in self.world.contracts.items()
-            if isinstance(contract, PensionContract)
-        }
+    def ration(self) -> dict[int, int]:
+        """See, once a month, whether there is enough for the pensions; if not, divide what there is.
+
+        Returns:
+            Cents by the number of the contract; nothing, where there is enough.
+        """
+        month, contracts = self.world.month, self.world.contracts.items()
+        if self._rationed == month:
+            return self.rations
+        self._rationed = month
+        due = {number: contract.cents for number, contract in contracts if isinstance(contract, PensionContract)}
         short = self.cents < sum(due.values())
         self.rations = dict(zip(due, share(self.cents, list(due.values())), strict=True)) if short else {}
-        if short:
-            self.world.counts["pensions rationed"] += 1
+        self.world.counts["pensions rationed"] += short
+        return self.rations
 
     def measure(self) -> None:
         """Note the coverage of the month."""
@@ -647,7 +660,6 @@ class Fund:
         calendar = world.calendar
         calendar.every(3, self.company.manager.rebalance, start=3)
         calendar.every(12, self.company.conclude_year, start=12)
-        calendar.every(1, self.company.ration, start=0)
 
     def _populate(self) -> None:
         """Make the first clients: as many of each age as one would be who joined at 25 and was mortal since."""

@@ -413,8 +413,7 @@ def test_pensions_are_rationed_where_the_money_does_not_suffice():
     world, company = fund.world, fund.company
     pensions = [contract for contract in world.contracts.values() if isinstance(contract, PensionContract)]
     world.ledger.move(company, world.outside, company.cents - 1001, "theft")
-    company.ration()
-    assert sum(company.rations.values()) == 1001
+    assert sum(company.ration().values()) == 1001
     before = {contract.number: contract.creditor.cents for contract in pensions}
     for contract in pensions:
         assert not contract.perform()
@@ -454,6 +453,18 @@ def test_a_request_that_is_denied_changes_nothing():
         before = state(fund)
         assert request.submit() == reason
         assert state(fund) == before
+
+
+def test_who_pays_more_can_pay_less_again_and_has_to_where_it_becomes_too_dear():
+    fund = Fund(1, Parameters(clients=400))
+    company = fund.company
+    client = next(c for c in clients_of(fund.world) if c.works and company.cost_rate(c) * 1.5 > pension.HIGHEST_PREMIUM)
+    client.extra = 0.5
+    assert Contribution(client, 0.25).submit() is None
+    assert client.extra == 0.25
+    client.extra = 0.5
+    company.review(client)
+    assert client.extra == 0
 
 
 def test_nobody_can_take_more_along_than_there_is(monkeypatch):

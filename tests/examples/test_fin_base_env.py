@@ -325,3 +325,14 @@ def test_others_checks_pass():
 def test_the_librarys_check_finds_nothing(points):
     report = check_simulation(lambda: small(3), points, episodes=2)
     assert not [finding for finding in report.findings if finding.severity != "note"], report
+
+
+def test_an_episode_is_terminated_when_pensions_cannot_be_paid_and_truncated_at_its_last_year():
+    for coverage, ends in ((0.02, (True, False)), (1.5, (False, True))):
+        environment = single_env(FundSim(4, Parameters(clients=60, coverage=coverage)), MANAGER)
+        environment.reset(seed=1)
+        over = (False, False)
+        while not any(over):
+            _, _, *over, _ = environment.step(RULE)
+        assert tuple(over) == ends
+        assert bool(environment.simulation.fund.company.rations) == ends[0]

@@ -569,7 +569,7 @@ class Company(Entity):
         if change >= 0:
             ledger.move(outside, self, change, "returns")
         else:
-            ledger.move(self, outside, min(-change, self.cents), "losses")
+            ledger.move(self, outside, -change, "losses")
         self._factors = annuity_factors(self.tables, market.yield_steps, RETIREMENT)
         self._provisions = None
 

@@ -424,6 +424,53 @@ def test_pensions_are_rationed_where_the_money_does_not_suffice():
     world.check()
 
 
+def test_who_retires_pays_no_more_and_draws_a_twelfth_of_the_rights_a_month():
+    fund = Fund(1, Parameters(clients=200, entry=0.0))
+    client = client_with(fund, "working")
+    premium = client.contract
+    client.retire()
+    assert not premium.in_force
+    assert (client.status, client.contract.cents) == ("retired", client.accrued // 12)
+    before, rights = client.cents, client.accrued
+    fund.world.perform_contracts()
+    assert client.cents == before + client.accrued // 12
+    assert client.accrued == rights
+
+
+def test_indexation_and_cuts_change_rights_and_pensions_alike():
+    fund = Fund(1, Parameters(clients=200))
+    before = {client.name: client.accrued for client in clients_of(fund.world)}
+    fund.company.change_rights(-0.1)
+    for client in clients_of(fund.world):
+        assert client.accrued == pytest.approx(0.9 * before[client.name], abs=1)
+        if client.status == "retired":
+            assert client.contract.cents == client.accrued // 12
+    assert fund.company.indexed == pytest.approx(0.9)
+
+
+def test_a_year_above_the_minimum_ends_the_row_of_measurements():
+    fund = Fund(1, Parameters(clients=100))
+    company = with_coverage(fund, 1.0)
+    company.conclude_year()
+    assert company.measured_short == 1
+    with_coverage(fund, 1.2)
+    company.conclude_year()
+    assert company.measured_short == 0
+
+
+def test_clients_pay_more_when_they_have_savings_and_less_when_they_could_not_pay():
+    fund = Fund(1, Parameters(clients=300))
+    world = fund.world
+    client = next(c for c in clients_of(world) if c.works and 45 * 12 <= c.age < 50 * 12)
+    assert client.choose_extra() == 0.0
+    world.ledger.move(world.outside, client, client.wage, "gift")
+    assert client.choose_extra() == 0.25
+    client.extra, client.contract.missed = 0.5, 1
+    assert client.choose_extra() == 0.25
+    fund.company.review(client)
+    assert client.contract.missed == 0  # a new year
+
+
 # -- requests and the law -------------------------------------------------------------------------
 
 

@@ -312,6 +312,17 @@ def test_what_lies_ahead_can_be_drawn_anew():
     assert ends[0] == ends[1] != ends[2]
 
 
+@pytest.mark.parametrize("generator", [lambda fund: fund.people, lambda fund: fund.market.random])
+def test_market_and_people_are_drawn_anew(generator):
+    draws = []
+    for seed in (3, 3, 4):
+        simulation = small()
+        simulation.reset(len(draws))
+        simulation.reseed(seed)
+        draws.append(generator(simulation.fund).random())
+    assert draws[0] == draws[1] != draws[2]
+
+
 def test_others_checks_pass():
     api_test(board_env(small(3)), num_cycles=30)
     with pytest.warns(UserWarning, match="possible_agents"):  # which clients there will be is not known beforehand

@@ -25,6 +25,7 @@ SECTIONS = (
     "branches",
     "outside",
     "wolf_sheep",
+    "pension",
     "experiments",
     "batch_run",
     "greenhouse",

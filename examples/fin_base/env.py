@@ -122,8 +122,14 @@ def company_of(*call: Any) -> Company:
     return last if isinstance(last, Company) else last.company
 
 
-SPACE: Final = Box(-10.0, 100.0, (len(OBSERVED),), np.float32)
-CLIENT_SPACE: Final = Box(-10.0, 100.0, (len(OBSERVED) + len(OF_A_CLIENT),), np.float32)
+LOW: Final = (0, 0, 0, 0, -3, -3, 0)
+HIGH: Final = (10, 10, 100, 1, 3, 3, 3)
+CLIENT_HIGH: Final = (1.2, 20, 20, 0.5, 1, 20)
+
+SPACE: Final = Box(np.array(LOW, np.float32), np.array(HIGH, np.float32))
+CLIENT_SPACE: Final = Box(
+    np.array([*LOW, *[0] * len(OF_A_CLIENT)], np.float32), np.array(HIGH + CLIENT_HIGH, np.float32)
+)
 
 
 def observe(*call: Any) -> NDArray[np.float32]:
@@ -427,7 +433,7 @@ class FundSim(SimulationInterface):
         return np.array([*look_at(company), *(rights / total for rights in ages), self.time() / self.years], np.float32)
 
 
-STATE_SPACE: Final = Box(-10.0, 100.0, (len(OBSERVED) + 13,), np.float32)
+STATE_SPACE: Final = Box(np.array([*LOW, *[0] * 13], np.float32), np.array([*HIGH, *[1] * 13], np.float32))
 """The space of the state."""
 
 

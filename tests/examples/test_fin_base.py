@@ -10,7 +10,7 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from examples.fin_base import blocks, economy, pension
+from examples.fin_base import blocks, company, economy, law, pension, people
 from examples.fin_base.blocks import Calendar, Contract, Entity, Request, Shortage, World, share
 from examples.fin_base.economy import OLDEST, STEP, Climate, Market, Mortality, annuity_factors
 from examples.fin_base.pension import (
@@ -602,7 +602,7 @@ def test_premiums_cover_their_cost_unless_coverage_is_high(monkeypatch, coverage
 # -- the files ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("module", [blocks, economy, pension])
+@pytest.mark.parametrize("module", [blocks, company, economy, law, pension, people])
 def test_the_model_knows_nothing_of_environments(module):
     tree = ast.parse(Path(module.__file__).read_text())
     imported = [
@@ -611,7 +611,7 @@ def test_the_model_knows_nothing_of_environments(module):
         if isinstance(node, ast.Import | ast.ImportFrom)
         for name in ([node.module] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names])
     ]
-    own = {"blocks", "economy"}
+    own = {"blocks", "company", "economy", "law", "people"}
     assert {name.split(".")[0] for name in imported} <= set(sys.stdlib_module_names) | own
 
 

@@ -1,0 +1,280 @@
+"""A pension company, its manager and its regulator: what they decide."""
+
+from __future__ import annotations
+
+from collections import deque
+from operator import mul
+
+from .blocks import Entity, World, share
+from .economy import OLDEST, Market, Mortality, annuity_factors
+from .law import (
+    ACCRUAL,
+    CRITICAL,
+    DISPOSABLE,
+    HIGHEST_PREMIUM,
+    INDEXING,
+    MEASUREMENTS,
+    MINIMUM,
+    REQUIRED,
+    RETIREMENT,
+    SPREAD,
+    TRANSFERABLE,
+)
+from .people import Client, PensionContract, RecoveryPlan, clients_of
+
+
+class Manager(Entity):
+    """Manages the company's assets.
+
+    Attributes:
+        company: Whose assets it manages.
+        equities: The share of them that is in equities; the rest is in bonds.
+    """
+
+    __slots__ = ("company", "equities")
+
+    kind = "manager"
+
+    def __init__(self, company: Company, equities: float = 0.4) -> None:
+        super().__init__(company.world)
+        self.company, self.equities = company, equities
+
+    def lawful_mix(self) -> float:
+        """The highest share of equities that is lawful: in a shortfall the present one."""
+        return self.equities if self.company.policy_coverage() < MINIMUM else 1.0
+
+    def choose_mix(self) -> float:
+        """Decide on the share of equities: 40 % where that is lawful, and 30 % while coverage is below 100 %."""
+        return min(0.4 if self.company.policy_coverage() >= TRANSFERABLE else 0.3, self.lawful_mix())
+
+    def rebalance(self) -> None:
+        """Buy and sell, within what is lawful."""
+        self.equities = min(max(self.choose_mix(), 0.0), self.lawful_mix())
+
+
+class Regulator(Entity):
+    """Decides what recovery plans have to contain."""
+
+    __slots__ = ()
+
+    kind = "regulator"
+
+    def choose_demand(self, company: Company) -> float:
+        """Decide which cut of rights to demand this year.
+
+        Returns:
+            A tenth of the shortfall if coverage is critical or has been below the minimum too often; 0 otherwise.
+        """
+        due = company.policy_coverage() < CRITICAL or company.measured_short >= MEASUREMENTS
+        return company.shortfall() / SPREAD if due else 0.0
+
+
+class Company(Entity):
+    """Promises pensions, and holds assets for them.
+
+    Attributes:
+        market: Where its assets are.
+        tables: The mortality that it reckons with.
+        manager: Who manages the assets.
+        regulator: Who supervises it.
+        measured_short: At how many yearly measurements in a row its policy coverage was below the minimum.
+        rations: What each pension contract got in the last month, if there was not enough for all.
+        indexed: What a right of 1 from the first month has become by indexation and cuts.
+    """
+
+    __slots__ = (
+        "_factors",
+        "_history",
+        "_policy_coverage",
+        "_provisions",
+        "_rationed",
+        "_rights",
+        "indexed",
+        "manager",
+        "market",
+        "measured_short",
+        "rations",
+        "regulator",
+        "tables",
+    )
+
+    kind = "company"
+
+    def __init__(self, world: World, market: Market, tables: Mortality) -> None:
+        """Found a company without clients."""
+        super().__init__(world)
+        self.market, self.tables = market, tables
+        self.manager, self.regulator = Manager(self), Regulator(world)
+        self.measured_short, self.indexed = 0, 1.0
+        self.rations: dict[int, int] = {}
+        self._rationed = -1
+        self._rights = [0] * OLDEST  # by month of birth: the first is OLDEST - 1 months before the first month
+        self._history: deque[float] = deque(maxlen=12)
+        self._policy_coverage = 1.0
+        self._factors = annuity_factors(tables, market.yield_steps, RETIREMENT)
+        self._provisions: float | None = None
+
+    # what it knows at any time
+
+    def factor(self, age: int) -> float:
+        """What a pension of 1 a year is worth at an age in months, at the present yield."""
+        return self._factors[OLDEST - 1 - age]
+
+    def provisions(self) -> float:
+        """What all rights are worth, in cents.
+
+        Rights are kept as sums by month of birth, which do not change with time: each change of a right is one
+        addition, and each valuation one product of sums and factors, whatever the number of clients.
+        """
+        if self._provisions is None:
+            youngest = self.world.month
+            self._provisions = sum(map(mul, self._rights[youngest : youngest + OLDEST], self._factors))
+        return self._provisions
+
+    def coverage(self) -> float:
+        """Assets by provisions, at present; without provisions it is 2."""
+        provisions = self.provisions()
+        return self.cents / provisions if provisions > 0 else 2.0
+
+    def policy_coverage(self) -> float:
+        """The mean of the coverage over the last twelve months, by which it is judged."""
+        return self._policy_coverage
+
+    def shortfall(self) -> float:
+        """The share of all rights that would have to be cut to reach the minimum."""
+        return max(0.0, 1 - self.policy_coverage() / MINIMUM)
+
+    def cost_rate(self, client: Client) -> float:
+        """The share of the wage that a client's standard accrual costs."""
+        return ACCRUAL * self.factor(client.age)
+
+    def lawful_premium(self, client: Client) -> tuple[float, float]:
+        """The lowest and the highest premium that is lawful for a client, as shares of the wage."""
+        cost = min(self.cost_rate(client) * (1 + client.extra), HIGHEST_PREMIUM)
+        return cost * (0.8 if self.policy_coverage() >= REQUIRED else 1.0), min(1.3 * cost, HIGHEST_PREMIUM)
+
+    def repair(self) -> float:
+        """By how much rights may grow beyond inflation, where coverage is as high as required in the long run.
+
+        Returns:
+            A fifth of what they are behind prices.
+        """
+        behind = self.market.price_level / max(self.indexed, 1e-9) - 1
+        return max(0.0, behind) / 5 if self.policy_coverage() >= REQUIRED else 0.0
+
+    def lawful_indexation(self) -> float:
+        """The highest indexation that is lawful: inflation and repair, if coverage is high enough."""
+        return max(0.0, self.market.inflation) + self.repair() if self.policy_coverage() >= INDEXING else 0.0
+
+    # decisions
+
+    def set_premium(self, client: Client) -> float:
+        """Decide which share of the wage a client pays for a year.
+
+        Returns:
+            What the accrual costs and 5 % of it for solvency; 15 % in a shortfall; less a tenth where coverage is
+            well above what is required.
+        """
+        coverage = self.policy_coverage()
+        surcharge = 1.15 if coverage < MINIMUM else 0.9 if coverage > REQUIRED + 0.15 else 1.05
+        return surcharge * self.cost_rate(client) * (1 + client.extra)
+
+    def choose_indexation(self) -> float:
+        """Decide by how much rights grow: the policy ladder, from nothing at 110 % to all that is lawful at 130 %."""
+        step = (self.policy_coverage() - INDEXING) / 0.2
+        return self.lawful_indexation() * min(max(step, 0.0), 1.0)
+
+    def choose_cut(self) -> float:
+        """Decide by how much rights are cut in a shortfall: a tenth of it, from the third measurement on."""
+        return self.shortfall() / SPREAD if self.measured_short >= 3 else 0.0
+
+    # what it does
+
+    def book_right(self, born: int, cents: int) -> None:
+        """Note that rights of those born in a month have changed."""
+        place = born + OLDEST - 1
+        rights = self._rights
+        if place >= len(rights):
+            rights += [0] * (place + 1 - len(rights))
+        rights[place] += cents
+        self._provisions = None
+
+    def review(self, client: Client) -> None:
+        """Set premium and accrual for a client's next year, and amend the contract.
+
+        What is paid and accrued beyond the standard ends where it costs more than can be asked for.
+        """
+        if self.cost_rate(client) * (1 + client.extra) > HIGHEST_PREMIUM:
+            client.extra = 0.0
+        lowest, highest = self.lawful_premium(client)
+        client.premium = min(max(self.set_premium(client), lowest), highest)
+        client.accrual = round(ACCRUAL * (1 + client.extra) * client.wage / 12)
+        client.disposable = round(DISPOSABLE * client.wage / 12)
+        assert client.contract is not None
+        client.contract.cents = round(client.premium * client.wage / 12)
+        client.contract.missed = 0
+
+    def change_rights(self, by: float) -> None:
+        """Let all rights grow or shrink by a share of them."""
+        for client in clients_of(self.world):
+            if client.accrued:
+                client.accrue(round(client.accrued * by))
+                if client.status == "retired" and client.contract is not None:
+                    client.contract.cents = client.accrued // 12
+        self.indexed *= 1 + by
+
+    def invest(self) -> None:
+        """Earn, or lose, what the market has done to the assets in a month, and value rights anew."""
+        share_of_equities, market = self.manager.equities, self.market
+        rate = share_of_equities * market.equity_return + (1 - share_of_equities) * market.bond_return
+        change = round(self.cents * rate)
+        outside, ledger = self.world.outside, self.world.ledger
+        if change >= 0:
+            ledger.move(outside, self, change, "returns")
+        else:
+            ledger.move(self, outside, -change, "losses")
+        self._factors = annuity_factors(self.tables, market.yield_steps, RETIREMENT)
+        self._provisions = None
+
+    def ration(self) -> dict[int, int]:
+        """See, once a month, whether there is enough for the pensions; if not, divide what there is.
+
+        Returns:
+            Cents by the number of the contract; nothing, where there is enough.
+        """
+        month, contracts = self.world.month, self.world.contracts.items()
+        if self._rationed == month:
+            return self.rations
+        self._rationed = month
+        due = {number: contract.cents for number, contract in contracts if isinstance(contract, PensionContract)}
+        short = self.cents < sum(due.values())
+        self.rations = dict(zip(due, share(self.cents, list(due.values())), strict=True)) if short else {}
+        self.world.counts["pensions rationed"] += short
+        return self.rations
+
+    def measure(self) -> None:
+        """Note the coverage of the month."""
+        history = self._history
+        history.append(self.coverage())
+        self._policy_coverage = sum(history) / len(history)
+
+    def conclude_year(self) -> None:
+        """Measure, index rights or cut them, after the regulator has looked at the plan."""
+        counts = self.world.counts
+        if self.policy_coverage() >= MINIMUM:
+            self.measured_short = 0
+            indexation = min(max(self.choose_indexation(), 0.0), self.lawful_indexation())
+            if indexation > 0:
+                self.change_rights(indexation)
+                counts["indexed"] += 1
+            return
+        self.measured_short += 1
+        counts["short"] += 1
+        most = self.shortfall()
+        demand = min(max(self.regulator.choose_demand(self), 0.0), most)
+        cut = min(max(self.choose_cut(), 0.0), most)
+        if RecoveryPlan(self, cut, demand).submit() is not None:
+            cut = demand
+            self.change_rights(-cut)
+        if cut > 0:
+            counts["cut"] += 1

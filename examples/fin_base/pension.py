@@ -17,8 +17,8 @@ against these rights; its *coverage* is its assets by its *provisions*, what all
 ``Client.choose_to_leave`` with a new job       whether to take the value along
 ========================= ==================== =====================================================================
 
-``people`` has the clients, ``company`` the company with its manager and its regulator, and ``law`` what they must and may
-do; here is the fund, month by month. Run on its own, it tells how the fund fares, and how fast it was computed::
+``people`` has the clients, ``company`` the company with its manager and its regulator, and ``law`` what they must and
+may do; here is the fund, month by month. Run on its own, it tells how the fund fares, and how fast it was computed::
 
     python -m examples.fin_base.pension --clients 10000 --years 40
 """

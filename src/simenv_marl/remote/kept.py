@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Hashable
 from contextvars import ContextVar, Token
 from typing import Final
+from weakref import ref
 
 from .child import Child
 
 Kept = dict[Hashable, list[Child]]
-
-_KEPT: Final[ContextVar[Kept | None]] = ContextVar("simenv_marl.processes_kept", default=None)
-"""Those that are kept, by how they were started; None where none are."""
+"""By how they were started."""
 
 
 class processes_kept:  # noqa: N801 - it is used as a function
@@ -20,35 +19,49 @@ class processes_kept:  # noqa: N801 - it is used as a function
     To start a process takes longer than many an episode. Within another such block it does nothing.
     """
 
-    __slots__ = ("_token",)
+    __slots__ = ("__weakref__", "_token", "kept")
+
+    def __init__(self) -> None:
+        self.kept: Kept = {}
+        self._token: Token[ref[processes_kept] | None] | None = None
 
     def __enter__(self) -> None:
-        self._token: Token[Kept | None] | None = _KEPT.set({}) if _KEPT.get() is None else None
+        if _block() is None:
+            self._token = _BLOCK.set(ref(self))
 
     def __exit__(self, *raised: object) -> None:
         if self._token is None:
             return
-        kept = _KEPT.get() or {}
-        _KEPT.reset(self._token)
-        children = [child for alike in kept.values() for child in alike]
+        _BLOCK.reset(self._token)
+        children = [child for alike in self.kept.values() for child in alike]
         for child in children:  # first, so that they end side by side
             child.close_input()
         for child in children:
             child.end()
 
 
+_BLOCK: Final[ContextVar[ref[processes_kept] | None]] = ContextVar("simenv_marl.processes_kept", default=None)
+"""The block. Weak: an interrupt may come before a block is entered, and it is never left then."""
+
+
+def _block() -> processes_kept | None:
+    found = _BLOCK.get()
+    return None if found is None else found()
+
+
 def keep(key: Hashable, child: Child) -> bool:
     """Keep a process, if such are kept here; return whether it is."""
-    kept = _KEPT.get()
-    if kept is None or not child.usable:
+    block = _block()
+    if block is None or not child.usable:
         return False
-    kept.setdefault(key, []).append(child)
+    block.kept.setdefault(key, []).append(child)
     return True
 
 
 def take(key: Hashable) -> Child | None:
     """A process that was started like that and has been kept; None where there is none."""
-    alike = (_KEPT.get() or {}).get(key, [])
+    block = _block()
+    alike = [] if block is None else block.kept.get(key, [])
     while alike:
         child = alike.pop()
         if child.usable:

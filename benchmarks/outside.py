@@ -17,18 +17,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from benchmarks.branches import on
 from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE
-from benchmarks.measure import ROOT, Contender, Section, Times, alone, ratio, side_by_side
-from benchmarks.noop import Model, Turns, aec
+from benchmarks.measure import ROOT, Section, Times, alone, ratio, side_by_side, timed
+from benchmarks.noop import Model, Turns, aec, last_and_step
 from simenv_marl import ProcessSimulation, aec_env, make_step
 
 COMPILER = shutil.which("g++") or shutil.which("clang++")
-
-Loop = Callable[[int], None]
-"""Goes round as often as it is told."""
 
 TURN = make_step(
     observation_space=OBSERVATION_SPACE,
@@ -76,19 +72,6 @@ def compiled(name: str, folder: str) -> Path:
     return program
 
 
-def turns(env: Any) -> Loop:
-    """A loop of ``last`` and ``step``."""
-    env.reset(seed=0)
-
-    def loop(number: int) -> None:
-        last, step = env.last, env.step
-        for _ in range(number):
-            last()
-            step(1)
-
-    return loop
-
-
 def children() -> set[int]:
     """The processes that this one has started."""
     return {int(process) for process in Path(f"/proc/self/task/{os.getpid()}/children").read_text("ascii").split()}
@@ -100,17 +83,6 @@ def processors(process: int) -> Callable[[], float]:
     return lambda: time.process_time() + time.clock_gettime(clock)
 
 
-def timed_by(clock: Callable[[], float], loop: Loop, number: int) -> Contender:
-    """Make a contender of a loop."""
-
-    def run() -> float:
-        start = clock()
-        loop(number)
-        return (clock() - start) / number * 1e6
-
-    return run
-
-
 def compared(rounds: int, number: int, *, wall: bool = False) -> Times:
     """Compare the AEC view of the process that asks with the other process, and with the same program by itself."""
     with TemporaryDirectory() as folder:
@@ -118,12 +90,12 @@ def compared(rounds: int, number: int, *, wall: bool = False) -> Times:
         env = aec_env(ProcessSimulation([noop], {"noop.turn": TURN}))
         here = aec_env(Turns, [Model.left, Model.right])
         before = children()
-        loop = turns(env)
+        loop = last_and_step(env)
         (asking,) = children() - before
         clocks = [time.perf_counter] * 2 if wall else [processors(asking), processors(bare.number)]
         contenders = {
-            OURS: timed_by(clocks[0], loop, number),
-            BARE: timed_by(clocks[1], bare.play, number),
+            OURS: timed(loop, number, clocks[0]),
+            BARE: timed(bare.play, number, clocks[1]),
             "AEC, in this process": aec(here, number),
             PLAIN: lambda: float(subprocess.run([noop], check=True, capture_output=True, timeout=60).stdout.split()[0]),
         }

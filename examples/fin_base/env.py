@@ -41,8 +41,11 @@ from simenv_marl import (
     single_env,
 )
 
+from .company import Company, Manager, Regulator
+from .law import MINIMUM, REQUIRED, SPREAD
 from .observations import CLIENT_SPACE, HIGH, LOW, SPACE, company_of, look_at, observe, observe_client
-from .pension import MINIMUM, REQUIRED, SPREAD, Client, Company, Fund, Manager, Parameters
+from .pension import Fund, Parameters
+from .people import Client
 
 YEARS: Final = 40
 """After how many years an episode is truncated."""
@@ -61,8 +64,6 @@ CUTS: Final = (0.0, 0.5 / SPREAD, 1 / SPREAD, 3 / SPREAD, 1.0)
 
 MIXES: Final = (0.0, 0.2, 0.3, 0.4, 0.6, 0.8)
 """Shares of equities."""
-
-MODEL: Final = Fund.__module__
 
 
 # -- what it is worth -----------------------------------------------------------------------------
@@ -179,7 +180,7 @@ def lawful_mixes(manager: Manager) -> list[bool]:
 
 
 PREMIUMS: Final[dict[Any, Definition]] = {
-    f"{MODEL}.Company.set_premium": make_step(
+    f"{Company.__module__}.Company.set_premium": make_step(
         observation_space=CLIENT_SPACE,
         observation_space_mapping=observe_client,
         action_space=Discrete(len(SURCHARGES)),
@@ -189,15 +190,15 @@ PREMIUMS: Final[dict[Any, Definition]] = {
         reward_mapping=premium_reward,
         agent=lambda company, client: client.name,
         removed_by={
-            f"{MODEL}.Client.vanish": lambda client, *rest, **more: client.name,
-            f"{MODEL}.Client.retire": lambda client: client.name,
+            f"{Client.__module__}.Client.vanish": lambda client, *rest, **more: client.name,
+            f"{Client.__module__}.Client.retire": lambda client: client.name,
         },
     )
 }
 """The premium of each client, by an agent of its own."""
 
 COMPANY: Final[dict[Any, Definition]] = {
-    f"{MODEL}.Company.choose_indexation": make_step(
+    f"{Company.__module__}.Company.choose_indexation": make_step(
         observation_space=SPACE,
         observation_space_mapping=observe,
         action_space=Discrete(len(INDEXATIONS)),
@@ -207,7 +208,7 @@ COMPANY: Final[dict[Any, Definition]] = {
         reward_mapping=company_reward,
         agent="indexer_0",
     ),
-    f"{MODEL}.Company.choose_cut": make_step(
+    f"{Company.__module__}.Company.choose_cut": make_step(
         observation_space=SPACE,
         observation_space_mapping=observe,
         action_space=Discrete(len(CUTS)),
@@ -220,7 +221,7 @@ COMPANY: Final[dict[Any, Definition]] = {
 """What the company decides once a year: indexation in good years, cuts in a shortfall."""
 
 MANAGER: Final[dict[Any, Definition]] = {
-    f"{MODEL}.Manager.choose_mix": make_step(
+    f"{Manager.__module__}.Manager.choose_mix": make_step(
         observation_space=SPACE,
         observation_space_mapping=observe,
         action_space=Discrete(len(MIXES)),
@@ -234,7 +235,7 @@ MANAGER: Final[dict[Any, Definition]] = {
 """The asset mix, each quarter."""
 
 REGULATOR: Final[dict[Any, Definition]] = {
-    f"{MODEL}.Regulator.choose_demand": make_step(
+    f"{Regulator.__module__}.Regulator.choose_demand": make_step(
         observation_space=SPACE,
         observation_space_mapping=observe,
         action_space=Discrete(len(CUTS)),

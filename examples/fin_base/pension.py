@@ -32,62 +32,10 @@ from random import Random
 from time import perf_counter
 
 from .blocks import World
-from .company import Company, Manager, Regulator
+from .company import Company
 from .economy import OLDEST, Climate, Market, Mortality
-from .law import (
-    ACCRUAL,
-    CRITICAL,
-    DISPOSABLE,
-    EXTRAS,
-    HIGHEST_PREMIUM,
-    INDEXING,
-    LATEST_ENTRY,
-    MEASUREMENTS,
-    MINIMUM,
-    REQUIRED,
-    RETIREMENT,
-    SPREAD,
-    TRANSFERABLE,
-)
-from .people import (
-    Admission,
-    Client,
-    Contribution,
-    PensionContract,
-    PremiumContract,
-    RecoveryPlan,
-    Transfer,
-    clients_of,
-)
-
-__all__ = [
-    "ACCRUAL",
-    "CRITICAL",
-    "DISPOSABLE",
-    "EXTRAS",
-    "HIGHEST_PREMIUM",
-    "INDEXING",
-    "LATEST_ENTRY",
-    "MEASUREMENTS",
-    "MINIMUM",
-    "REQUIRED",
-    "RETIREMENT",
-    "SPREAD",
-    "TRANSFERABLE",
-    "Admission",
-    "Client",
-    "Company",
-    "Contribution",
-    "Fund",
-    "Manager",
-    "Parameters",
-    "PensionContract",
-    "PremiumContract",
-    "RecoveryPlan",
-    "Regulator",
-    "Transfer",
-    "clients_of",
-]
+from .law import ACCRUAL, RETIREMENT
+from .people import Admission, Client, Contribution, PensionContract, PremiumContract, Transfer, clients_of
 
 
 @dataclass(frozen=True)

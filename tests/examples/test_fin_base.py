@@ -12,20 +12,16 @@ from random import Random
 import pytest
 from examples.fin_base import blocks, company, economy, law, pension, people
 from examples.fin_base.blocks import Calendar, Contract, Entity, Request, Shortage, World, share
+from examples.fin_base.company import Company, Manager, Regulator
 from examples.fin_base.economy import OLDEST, STEP, Climate, Market, Mortality, annuity_factors
-from examples.fin_base.pension import (
-    MINIMUM,
-    RETIREMENT,
+from examples.fin_base.law import MINIMUM, RETIREMENT
+from examples.fin_base.pension import Fund, Parameters
+from examples.fin_base.people import (
     Admission,
     Client,
-    Company,
     Contribution,
-    Fund,
-    Manager,
-    Parameters,
     PensionContract,
     RecoveryPlan,
-    Regulator,
     Transfer,
     clients_of,
 )
@@ -73,7 +69,7 @@ def decide_at_random(monkeypatch, seed):
     wild = lambda *_: draw.choice((-1.0, 0.0, 0.01, 0.3, 0.9, 1.0, 7.0))  # noqa: E731
     for kind, name in DECISIONS:
         monkeypatch.setattr(kind, name, wild)
-    monkeypatch.setattr(Client, "choose_extra", lambda client: draw.choice(pension.EXTRAS))
+    monkeypatch.setattr(Client, "choose_extra", lambda client: draw.choice(law.EXTRAS))
     monkeypatch.setattr(Client, "choose_to_join", lambda client: draw.random() < 0.8)
     monkeypatch.setattr(Client, "choose_to_leave", lambda client: draw.random() < 0.5)
 
@@ -505,7 +501,7 @@ def test_a_request_that_is_denied_changes_nothing():
 def test_who_pays_more_can_pay_less_again_and_has_to_where_it_becomes_too_dear():
     fund = Fund(1, Parameters(clients=400))
     company = fund.company
-    client = next(c for c in clients_of(fund.world) if c.works and company.cost_rate(c) * 1.5 > pension.HIGHEST_PREMIUM)
+    client = next(c for c in clients_of(fund.world) if c.works and company.cost_rate(c) * 1.5 > law.HIGHEST_PREMIUM)
     client.extra = 0.5
     assert Contribution(client, 0.25).submit() is None
     assert client.extra == 0.25

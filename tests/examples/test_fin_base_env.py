@@ -23,7 +23,9 @@ from examples.fin_base.env import (
     premium_env,
     team_env,
 )
-from examples.fin_base.pension import MINIMUM, Client, Parameters, clients_of
+from examples.fin_base.law import MINIMUM
+from examples.fin_base.pension import Parameters
+from examples.fin_base.people import Client, clients_of
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, seed_test
 

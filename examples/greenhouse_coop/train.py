@@ -31,6 +31,7 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from simenv_marl import RULE, SimulationAECEnv
 
+from ..evolution import evolve
 from .env import DAYS, MOST_WATER, OBSERVED, raw_env
 
 WATERER, VENTILATOR = "waterer_0", "ventilator_0"
@@ -277,8 +278,6 @@ def learn(rate: Rate, start: Mapping[str, Constant], generations: int, rng: np.r
         generations: For how long.
         rng: Draws everything that is drawn.
     """
-    import cma  # here, and not where a policy is loaded: a process that has imported much is forked slowly
-
     size = len(OBSERVED) + 1
     first = np.zeros((len(start), size))
     for weights, constant in zip(first, start.values(), strict=True):
@@ -288,19 +287,10 @@ def learn(rate: Rate, start: Mapping[str, Constant], generations: int, rng: np.r
     def team(weights: NDArray[np.float64]) -> dict[str, Linear]:
         return dict(zip(start, map(Linear, weights.reshape(-1, size)), strict=True))
 
-    options: dict[str, Any] = {"popsize": POPULATION, "verbose": -9, "verb_log": 0}
-    # Without these two it would seed and use NumPy's global generator.
-    options |= {"seed": math.nan, "randn": lambda *shape: rng.standard_normal(shape)}
-    evolution = cma.CMAEvolutionStrategy(first.ravel(), 0.3, options)
-    means = []
-    for _ in range(generations):
-        candidates = evolution.ask()
-        # The same greenhouses for all of a generation: none is to be chosen for its good weather.
-        returns = rate([team(weights) for weights in candidates], draw_seeds(rng, EPISODES_EACH))
-        evolution.tell(candidates, (-returns).tolist())
-        means.append(evolution.result.xfavorite)
-    # The mean sways with the weather by which it was judged; that of the last quarter hardly does.
-    return team(np.mean(means[-max(1, generations // 4) :], axis=0))
+    def rated(candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        return rate([team(weights) for weights in candidates], draw_seeds(rng, EPISODES_EACH))
+
+    return team(evolve(rated, first.ravel(), generations, rng, POPULATION))
 
 
 def draw_seeds(rng: np.random.Generator, number: int) -> list[int]:

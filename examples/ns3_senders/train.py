@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-import cma
 import numpy as np
 from numpy.typing import NDArray
 
 from simenv_marl import Evaluation, evaluate
 
+from ..evolution import evolve
 from .env import OBSERVED, POINTS, program, senders
 
 POINT: Final = next(iter(POINTS))
@@ -63,21 +64,14 @@ def learn(generations: int, workers: int, seed: int = 0, episodes: int = EPISODE
         episodes: By how many each candidate of a generation is judged.
     """
     rng = np.random.default_rng(seed)
-    options: dict[str, Any] = {"popsize": POPULATION, "verbose": -9, "verb_log": 0}
-    # Without these two it would seed and use NumPy's global generator.
-    options |= {"seed": math.nan, "randn": lambda *shape: rng.standard_normal(shape)}
-    evolution = cma.CMAEvolutionStrategy(np.zeros(len(OBSERVED) + 1), 0.3, options)
-    means = []
-    for number in range(generations):
-        candidates = evolution.ask()
-        seeds = rng.integers(HELD_OUT, size=episodes).tolist()  # the same for all of a generation
+    def rate(candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+        seeds = rng.integers(HELD_OUT, size=episodes).tolist()
         contenders = {str(number): {POINT: Linear(tuple(each))} for number, each in enumerate(candidates)}
-        returns = compare(contenders, seeds, workers).values().mean()
-        evolution.tell(candidates, (-returns).tolist())
-        means.append(evolution.result.xfavorite)
-        print(f"generation {number + 1}: {returns.mean():.1f}, the best {returns.max():.1f}", flush=True)
-    # The mean sways with the seeds by which it was judged; that of the last quarter hardly does.
-    return Linear(tuple(np.mean(means[-max(1, generations // 4) :], axis=0).tolist()))
+        returns: NDArray[np.float64] = compare(contenders, seeds, workers).values().mean().to_numpy()
+        print(f"this generation: {returns.mean():.1f}, the best {returns.max():.1f}", flush=True)
+        return returns
+
+    return Linear(tuple(evolve(rate, np.zeros(len(OBSERVED) + 1), generations, rng, POPULATION).tolist()))
 
 
 def main() -> None:

@@ -1,0 +1,48 @@
+"""Learning by evolution (CMA-ES), as several examples do it: whatever weights a policy has, by their returns alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Weights = NDArray[np.float64]
+
+
+def evolve(
+    rate: Callable[[Sequence[Weights]], NDArray[np.float64]],
+    first: Weights,
+    generations: int,
+    rng: np.random.Generator,
+    population: int,
+) -> Weights:
+    """Find weights with high returns.
+
+    Args:
+        rate: Returns the mean return of each candidate of a generation. It should play the same seeds for all of them,
+            so that no candidate is chosen for its luck.
+        first: ``(weights,)``: where the search begins.
+        generations: How many generations are tried.
+        rng: The source of all random numbers; ``rate`` may draw its seeds from it.
+        population: How many candidates a generation has.
+
+    Returns:
+        ``(weights,)``: the mean of the best weights found so far, over the last quarter of the generations. The best of
+        a single generation varies with the seeds of that generation; this mean hardly does.
+    """
+    import cma  # here, and not where a policy is loaded: a process that has imported much is forked slowly
+
+    options: dict[str, Any] = {"popsize": population, "verbose": -9, "verb_log": 0}
+    # Without these two it would seed and use NumPy's global generator.
+    options |= {"seed": math.nan, "randn": lambda *shape: rng.standard_normal(shape)}
+    evolution = cma.CMAEvolutionStrategy(first, 0.3, options)
+    best = []
+    for _ in range(generations):
+        candidates = evolution.ask()
+        evolution.tell(candidates, (-rate(candidates)).tolist())
+        best.append(evolution.result.xfavorite)
+    mean: Weights = np.mean(best[-max(1, generations // 4) :], axis=0)
+    return mean

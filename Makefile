@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix test test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension test test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -17,6 +17,10 @@ matrix: .venv/.matrix
 
 test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random
+
+# The same for the pension fund. PENSION="--quick --out /tmp/pension"
+pension: .venv/.matrix
+	$(BIN)/python -m examples.fin_base.study $(PENSION)
 
 coverage: .venv/.test
 	$(BIN)/python -m pytest --cov --cov-report=term

@@ -5,7 +5,7 @@ The model knows nothing of this: its methods are named as decision points from h
 - ``COMPANY``, ``MANAGER``, ``REGULATOR``: single agents. ``indexer_0`` and ``planner_0`` decide once a year on
   indexation and cuts, ``manager_0`` each quarter on the assets, ``regulator_0`` on what recovery plans must contain.
   Their rewards differ, and partly oppose each other: see ``REWARDS``.
-- ``TEAM``: the same agents, all with the reward of the company.
+- ``TEAM``: the same agents, all with the same reward: what ``welfare`` says the members gain.
 - ``PREMIUMS``: each client is an agent, which decides once a year on its own premium *for the company*; one policy can
   be shared by all. The agent ends when the client retires, leaves or dies.
 - ``FundSim``: the simulation, some years of a fund; its time is in years, so that infos tell how many have gone by.
@@ -46,6 +46,7 @@ from .law import MINIMUM, REQUIRED, SPREAD
 from .observations import CLIENT_SPACE, HIGH, LOW, SPACE, company_of, look_at, observe, observe_client
 from .pension import Fund, Parameters
 from .people import Client
+from .welfare import Account
 
 YEARS: Final = 40
 """After how many years an episode is truncated."""
@@ -80,6 +81,12 @@ def purchasing_power(*call: Any) -> float:
 def gain_of_coverage(*call: Any) -> float:
     """The coverage."""
     return company_of(*call).coverage()
+
+
+@difference
+def welfare(*call: Any, _simulation: FundSim) -> float:
+    """The welfare of the members: see the module ``welfare``."""
+    return _simulation.welfare()
 
 
 def sound(company: Company) -> float:
@@ -251,9 +258,9 @@ BOARD: Final[dict[Any, Definition]] = COMPANY | MANAGER | REGULATOR
 """All single agents, each with a reward of its own."""
 
 TEAM: Final[dict[Any, Definition]] = {
-    point: replace(definition, reward_mapping=company_reward) for point, definition in BOARD.items()
+    point: replace(definition, reward_mapping=welfare) for point, definition in BOARD.items()
 }
-"""The same, with the company's reward for all of them."""
+"""The same, with the members' welfare as the reward of all of them."""
 
 GOALS: Final = Box(0.0, 10.0, (1,), np.float32)
 
@@ -290,6 +297,7 @@ class FundSim(SimulationInterface):
 
     Attributes:
         fund: The fund of the present episode.
+        account: How its members have lived.
     """
 
     points = BOARD
@@ -304,12 +312,14 @@ class FundSim(SimulationInterface):
         self.years = years
         self.parameters = parameters or Parameters(clients=CLIENTS)
         self.fund = Fund(0, replace(self.parameters, clients=0))
+        self.account = Account(self.fund)
         self._stopped = False
 
     def reset(self, seed: int | None = None) -> None:
         """Found another fund."""
         self._stopped = False
         self.fund = Fund(seed, self.parameters)
+        self.account = Account(self.fund)
 
     def run(self) -> Any:
         """Let month after month go by.
@@ -319,9 +329,14 @@ class FundSim(SimulationInterface):
         """
         fund = self.fund
         while fund.world.month < 12 * self.years:
-            if self._stopped or fund.company.rations:
+            if self._stopped:
+                return None
+            if fund.company.rations:
+                self.account.close_for_ever(self.years - self.time())
                 return None
             fund.advance()
+            if fund.world.month % 12 == 0:
+                self.account.close_year()
         fund.world.check()
         return TRUNCATED
 
@@ -332,6 +347,10 @@ class FundSim(SimulationInterface):
     def time(self) -> float:
         """The time in years."""
         return self.fund.world.month / 12
+
+    def welfare(self) -> float:
+        """The utility of what the members have lived on, and can expect."""
+        return self.account.welfare()
 
     def reseed(self, seed: int) -> None:
         """Draw anew what lies ahead, of the market and of the people."""

@@ -1,0 +1,217 @@
+"""Pictures and tables of the pension study, made of its tables of runs and of what was learned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import seaborn
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+from pandas import DataFrame
+
+from simenv_marl import Evaluation, effects, simulate
+
+from .env import INDEXATIONS, MIXES, SURCHARGES
+from .law import INDEXING, MINIMUM, REQUIRED
+from .observations import OBSERVED, OF_A_CLIENT
+from .policies import USUAL
+from .study import FACTORS, HELD_OUT, HOME, INDEXER, MANAGER, POINTS, PREMIUM, YEARS, Policies, world
+
+COLOURS: Final = {
+    "rule": "#8c8c8c",
+    "constant pair": "#d1812c",
+    "constant premium": "#e3b778",
+    "trained pair": "#1b6f5f",
+    "trained premiums": "#7fb3d3",
+    "both trained": "#2b4c7e",
+    "planned": "#9c4f96",
+}
+
+DRAWN: Final = 64
+"""How many funds the pictures of years are drawn from."""
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def compared(table: Any) -> str:
+    """Who does how well in one world, by how much better than the rule, and what becomes of the fund."""
+    summary = _against_rule(table).summary("welfare")
+    others = table.groupby("contender")[["right", "coverage", "premium", "short", "cuts"]].mean()
+    rows = []
+    for name, found in summary.iterrows():
+        own = others.loc[name]
+        better = "" if name == "rule" else _difference(found, "+.1f")
+        told = (f"{own.right:.1%}", f"{own.coverage:.0%}", f"{own.premium:.1%}", f"{own.short:.1f}", f"{own.cuts:.1f}")
+        rows.append((name, f"{found['mean']:.0f}", better, *told))
+    columns = ("who decides", "welfare", "more than the rule", "a right buys", "coverage", "premium", "short", "cuts")
+    return _markdown(columns, rows)
+
+
+def everywhere(table: Any) -> str:
+    """By how much each contender is better than the rule, in each world."""
+    rows = []
+    for levels, own in table.groupby(list(FACTORS), sort=False):
+        summary = _against_rule(own).summary("welfare")
+        differences = [_difference(found, "+.0f") for name, found in summary.iterrows() if name != "rule"]
+        rows.append((", ".join(levels), f"{summary.loc['rule', 'mean']:.0f}", *differences))
+    names = [name for name in COLOURS if name != "rule" and name in set(table.contender)]
+    return _markdown((", ".join(FACTORS), "rule", *names), rows)
+
+
+def moved(table: Any) -> str:
+    """By how much each factor moves the mean welfare that a contender comes to."""
+    rows = []
+    for name in dict.fromkeys(table.contender):
+        found = effects(table, of="welfare", contender=name).main["mean"].groupby("factor", sort=False)
+        rows.append((name, *(f"{own.iloc[1] - own.iloc[0]:+.0f}" for _, own in found)))
+    return _markdown(("who decides", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
+
+
+def _against_rule(table: Any) -> Evaluation:
+    order = {name: number for number, name in enumerate(COLOURS)}
+    return Evaluation(table.sort_values("contender", key=lambda names: names.map(order), kind="stable"), "rule", 0.95)
+
+
+def _difference(found: Any, form: str) -> str:
+    low, high = found["difference_low"], found["difference_high"]
+    return f"{found['difference']:{form}} ({low:{form}} to {high:{form}})"
+
+
+def _markdown(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
+
+
+# -- pictures -------------------------------------------------------------------------------------
+
+
+def draw_worlds(table: Any) -> Figure:
+    """Draw by how much each contender is better than the rule in each world, with intervals."""
+    rows = []
+    for levels, own in table.groupby(list(FACTORS), sort=False):
+        for name, found in _against_rule(own).summary("welfare").iterrows():
+            if name != "rule":
+                rows.append((", ".join(levels), name, found["difference"], _difference(found, "+.0f")))
+    cells = DataFrame(rows, columns=["world", "who", "better", "told"])
+    order = list(dict.fromkeys(cells.world)), list(dict.fromkeys(cells.who))
+    better, told = (cells.pivot(index="world", columns="who", values=of).loc[order] for of in ("better", "told"))
+    figure = _figure(11, 4.2)
+    axes = figure.subplots()
+    most = float(np.nanmax(abs(better.to_numpy())))
+    seaborn.heatmap(
+        better, annot=told, fmt="", vmin=-most, vmax=most, cmap="BrBG", linewidths=1.5, ax=axes, cbar=False,
+        annot_kws={"fontsize": 8},
+    )  # fmt: skip
+    axes.set(xlabel="", ylabel="", title="welfare, more than the rule's: per cent of a year's income")
+    axes.tick_params(left=False, bottom=False, labelrotation=0)
+    return figure
+
+
+def draw_learned(found: Mapping[str, Policies]) -> Figure:
+    """Draw what the trained policies do, all else being as usual, beside the model's rules."""
+    figure = _figure(11, 3.4)
+    mix, by, premium = figure.subplots(1, 3)
+    coverage = np.linspace(0.8, 1.8, 101)
+    pair, shared = found["trained pair"], found["trained premiums"][PREMIUM]
+    observed = np.tile(USUAL[: len(OBSERVED)], (len(coverage), 1))
+    observed[:, 0] = observed[:, 1] = coverage
+    for axes, who, levels, rule in (
+        (mix, MANAGER, MIXES, np.where(coverage >= 1, 0.4, 0.3)),
+        (by, INDEXER, INDEXATIONS, np.clip((coverage - INDEXING) / 0.2, 0, 1)),
+    ):
+        chosen = [levels[round(pair[who].share(own) * (len(levels) - 1))] for own in observed]
+        axes.plot(coverage, rule, color=COLOURS["rule"], label="rule")
+        axes.plot(coverage, chosen, color=COLOURS["trained pair"], label="trained pair")
+        axes.xaxis.set_major_formatter(PercentFormatter(1))
+        axes.yaxis.set_major_formatter(PercentFormatter(1))
+        axes.set(xlabel="coverage", ylim=(-0.03, 1.03))
+    mix.axvspan(0.8, MINIMUM, color="#f3e3e3", lw=0)
+    by.axvspan(0.8, INDEXING, color="#f3e3e3", lw=0)
+    mix.set_title("in equities (red: no more risk than before)", fontsize=9)
+    by.set_title("of lawful indexation (red: none is lawful)", fontsize=9)
+    ages = np.arange(25, 67)
+    for of, style in ((1.0, ":"), (1.2, "-"), (1.5, "--")):
+        asked = [_surcharge(shared, age, of) for age in ages]
+        premium.plot(ages, asked, style, color=COLOURS["trained premiums"], label=f"trained, coverage {of:.0%}")
+    premium.axhline(1.05, color=COLOURS["rule"])
+    premium.set_title("premium, by what the accrual costs", fontsize=9)
+    premium.set(xlabel="age")
+    for axes in (mix, by, premium):
+        axes.legend(fontsize=8, frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _surcharge(policy: Any, age: int, coverage: float) -> float:
+    """What a policy asks of a client of an age who is otherwise as usual."""
+    observed = USUAL.copy()
+    names = (*OBSERVED, *OF_A_CLIENT)
+    observed[0] = observed[1] = coverage
+    observed[names.index("age, by 100 years")] = age / 100
+    observed[names.index("rights, by the wage")] = 0.0175 * (age - 25)
+    # the cost of an accrual falls with the years until retirement: at 2.5 % a year, 14 years' worth from 67 on
+    observed[names.index("what the standard accrual costs, by the wage")] = 0.0175 * 14 * 1.025 ** (age - 67)
+    lowest = SURCHARGES[0] if coverage >= REQUIRED else 1.0
+    return max(SURCHARGES[round(policy.share(observed) * (len(SURCHARGES) - 1))], lowest)
+
+
+def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
+    """Draw how rights and coverage develop over the years: medians, and the middle eight of ten funds."""
+    figure = _figure(9.5, 3.4)
+    rights, coverages = figure.subplots(1, 2)
+    for name, policies in (("rule", {}), ("trained pair", found["trained pair"])):
+        years = [
+            simulate(world(), policies, seed=HELD_OUT + seed, points=POINTS).account.years for seed in range(seeds)
+        ]
+        for axes, of in ((rights, "right"), (coverages, "coverage")):
+            values = np.array([[getattr(year, of) for year in own] for own in years if len(own) == YEARS])
+            low, middle, high = np.quantile(values, (0.1, 0.5, 0.9), axis=0)
+            axes.fill_between(range(1, YEARS + 1), low, high, color=COLOURS[name], alpha=0.2, lw=0)
+            axes.plot(range(1, YEARS + 1), middle, color=COLOURS[name], label=name)
+    rights.set_title("what a right buys, by first prices", fontsize=9)
+    coverages.set_title("coverage", fontsize=9)
+    for axes in (rights, coverages):
+        axes.yaxis.set_major_formatter(PercentFormatter(1))
+        axes.set_xlabel("year")
+        axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
+        axes.spines[["top", "right"]].set_visible(False)
+    rights.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    return figure
+
+
+def show(table: Any, large: Any, found: Mapping[str, Policies], folder: Path) -> None:
+    """Write all pictures and tables into a folder, and print the tables.
+
+    Args:
+        table: The table of runs in all worlds.
+        large: The table of runs with 10,000 clients, or None.
+        found: What was learned.
+        folder: Is made if need be.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    at_home = table[(table[list(HOME)] == list(HOME.values())).all(axis=1)]
+    texts = {"compared": compared(at_home), "worlds": everywhere(table), "moved": moved(table)}
+    if large is not None:
+        texts["large"] = compared(large)
+    for name, text in texts.items():
+        (folder / f"pension-{name}.md").write_text(text, encoding="utf-8")
+        print(text)
+    few = len(at_home[at_home.contender == "rule"]) < 16
+    drawn = {
+        "worlds": draw_worlds(table),
+        "learned": draw_learned(found),
+        "years": draw_years(found, 4 if few else DRAWN),
+    }
+    for name, figure in drawn.items():
+        figure.savefig(folder / f"pension-{name}.png", dpi=110, bbox_inches="tight")

@@ -19,7 +19,7 @@ from .env import INDEXATIONS, MIXES, SURCHARGES
 from .law import INDEXING, MINIMUM, REQUIRED
 from .observations import OBSERVED, OF_A_CLIENT
 from .policies import USUAL
-from .study import FACTORS, HELD_OUT, HOME, INDEXER, MANAGER, POINTS, PREMIUM, YEARS, Policies, world
+from .study import FACTORS, HELD_OUT, HOME, INDEXER, MANAGER, POINTS, PREMIUM, Policies, world
 
 COLOURS: Final = {
     "rule": "#8c8c8c",
@@ -136,7 +136,7 @@ def draw_learned(found: Mapping[str, Policies]) -> Figure:
     by.set_title("of lawful indexation (red: none is lawful)", fontsize=9)
     ages = np.arange(25, 67)
     for of, style in ((1.0, ":"), (1.2, "-"), (1.5, "--")):
-        asked = [_surcharge(shared, age, of) for age in ages]
+        asked = [_surcharge(shared, int(age), of) for age in ages]
         premium.plot(ages, asked, style, color=COLOURS["trained premiums"], label=f"trained, coverage {of:.0%}")
     premium.axhline(1.05, color=COLOURS["rule"])
     premium.set_title("premium, by what the accrual costs", fontsize=9)
@@ -165,14 +165,16 @@ def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
     figure = _figure(9.5, 3.4)
     rights, coverages = figure.subplots(1, 2)
     for name, policies in (("rule", {}), ("trained pair", found["trained pair"])):
-        years = [
-            simulate(world(), policies, seed=HELD_OUT + seed, points=POINTS).account.years for seed in range(seeds)
-        ]
+        funds = [simulate(world(), policies, seed=HELD_OUT + seed, points=POINTS) for seed in range(seeds)]
         for axes, of in ((rights, "right"), (coverages, "coverage")):
-            values = np.array([[getattr(year, of) for year in own] for own in years if len(own) == YEARS])
+            # a fund that could not pay all pensions has ended before; nothing is left of it
+            values = np.zeros((seeds, funds[0].years))
+            for row, fund in zip(values, funds, strict=True):
+                row[: len(fund.account.years)] = [getattr(year, of) for year in fund.account.years]
             low, middle, high = np.quantile(values, (0.1, 0.5, 0.9), axis=0)
-            axes.fill_between(range(1, YEARS + 1), low, high, color=COLOURS[name], alpha=0.2, lw=0)
-            axes.plot(range(1, YEARS + 1), middle, color=COLOURS[name], label=name)
+            years = range(1, len(middle) + 1)
+            axes.fill_between(years, low, high, color=COLOURS[name], alpha=0.2, lw=0)
+            axes.plot(years, middle, color=COLOURS[name], label=name)
     rights.set_title("what a right buys, by first prices", fontsize=9)
     coverages.set_title("coverage", fontsize=9)
     for axes in (rights, coverages):

@@ -64,6 +64,7 @@ def learn(generations: int, workers: int, seed: int = 0, episodes: int = EPISODE
         episodes: By how many each candidate of a generation is judged.
     """
     rng = np.random.default_rng(seed)
+
     def rate(candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
         seeds = rng.integers(HELD_OUT, size=episodes).tolist()
         contenders = {str(number): {POINT: Linear(tuple(each))} for number, each in enumerate(candidates)}

@@ -1,20 +1,22 @@
 """What a pension company must and may do: the law, and what is agreed with its clients.
 
-The law is after the Dutch financial assessment framework (FTK, in force from 2015), simplified:
+The law follows the Dutch financial assessment framework (FTK, in force from 2015), simplified:
 
-- Premiums cover the cost of what they buy; a discount takes a coverage well above what is required (Pensions Act,
-  articles 128 and 129; the discount of a fifth from 125 % on is our round number).
-- Coverage is judged by its mean over twelve months, the *policy* coverage. Below 110 % there is no indexation. Above
-  what is required in the long run (125 % here), missed indexation may be repaired (a fifth of it a year: our number).
-- The minimum is 104.3 %. A fund that is below it at six yearly measurements in a row has to cut rights; so has,
-  at once, one that cannot recover otherwise within ten years, for which 90 % stands here. Cuts may be spread over
-  ten years.
-- The risk of the assets may not be raised in a shortfall. Values are not transferred while coverage is below 100 %.
+- A premium covers the cost of the rights that it buys. A discount takes a coverage well above the required one
+  (Pensions Act, articles 128 and 129; the discount of a fifth from 125 % on is our own round number).
+- The *policy coverage*, by which a fund is judged, is the mean of the coverage over twelve months. Below 110 % there is
+  no indexation. Above the level required in the long run (125 % here), missed indexation may be repaired (by a fifth a
+  year: our number).
+- The minimum is 104.3 %. A fund has to cut rights if it is below the minimum at six yearly measurements in a row. It has
+  to cut at once if it cannot recover within ten years without; 90 % stands for that here. Cuts may be spread over ten
+  years.
+- In a shortfall, a fund may not raise the risk of its assets. Below 100 %, it may not transfer values to other funds.
 
 Sources: Pensioenfederatie, The Financial Assessment Framework; De Brauw, Pension funds with >90 % cover ratio do not
-have to cut pensions (2019: the sixth measurement, 104.3 %); IPE, Implications of FTK (2014: policy coverage) and Dutch
-government considers extending pension fund recovery periods (2016: ten years, the critical level of 90 to 95 %). What
-is not modelled: partners' pensions, tax, the state's pension, costs, the yield curve.
+have to cut pensions (2019: the sixth measurement, 104.3 %); IPE, Implications of FTK (2014: policy coverage), Dutch
+government considers extending pension fund recovery periods (2016: ten years, the critical level of 90 to 95 %) and
+Funding drop blocks pension transfers (2015). Not modelled: partners' pensions, tax, the state's pension, costs, the
+yield curve.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ class Transfer(Request):
         client = self.applicant
         if client.status == "retired":
             return "retired"
-        if client.company.coverage() < TRANSFERABLE:
+        if client.company.policy_coverage() < TRANSFERABLE:
             return "coverage is too low"
         return None if client.value() <= client.company.cents else "the money is lacking"
 

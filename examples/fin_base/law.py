@@ -7,8 +7,8 @@ The law follows the Dutch financial assessment framework (FTK, in force from 201
 - The *policy coverage*, by which a fund is judged, is the mean of the coverage over twelve months. Below 110 % there is
   no indexation. Above the level required in the long run (125 % here), missed indexation may be repaired (by a fifth a
   year: our number).
-- The minimum is 104.3 %. A fund has to cut rights if it is below the minimum at six yearly measurements in a row. It has
-  to cut at once if it cannot recover within ten years without; 90 % stands for that here. Cuts may be spread over ten
+- The minimum is 104.3 %. A fund that is below it at six yearly measurements in a row has to cut rights. A fund that
+  cannot recover within ten years otherwise has to cut at once; 90 % stands for that here. Cuts may be spread over ten
   years.
 - In a shortfall, a fund may not raise the risk of its assets. Below 100 %, it may not transfer values to other funds.
 

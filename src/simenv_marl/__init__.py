@@ -1,4 +1,19 @@
-"""Reinforcement learning environments out of simulations that know nothing of reinforcement learning.
+"""Turns a simulation into reinforcement learning environments, without a change to its main loop.
+
+The simulation stays as it is. The functions in which it decides something become the agents of a PettingZoo
+environment, or one of them becomes a Gymnasium environment::
+
+    from simenv_marl import RULE, aec_env, make_step
+
+    env = aec_env(Simulation, {"package.module.Model.decide": make_step(...)})
+
+To begin with:
+
+- ``make_step`` says what an agent observes, may do and is rewarded with, where a function of the model decides;
+- ``aec_env``, ``parallel_env``, ``single_env``, ``joint_env`` and ``vector_env`` make environments;
+- ``RULE`` as an action lets the model's own function decide;
+- ``simulate`` and ``evaluate`` run the simulation with policies in it, and compare these with the rule;
+- ``python -m simenv_marl check MODULE:SIMULATION`` checks a simulation.
 
 The rooms of the package; each imports only from those below it::
 
@@ -6,7 +21,7 @@ The rooms of the package; each imports only from those below it::
     planning                            what actions are worth, and policies that decide by that
     testing, registration, branching    checks of a simulation; registries; exact continuations of an episode
     callbacks                           what is raised in callbacks of C code
-    experiments                         contenders on the same seeds; designs; sweeps that resume; what factors do
+    experiments                         policies compared on the same seeds; designs; experiments that resume; effects
     envs                                views: an episode read as a PettingZoo or Gymnasium environment
     many                                policies back in the model, in one simulation or in many at once; pictures
     core                                what happens when: plans, stacks, sessions, episodes, agents

@@ -14,10 +14,9 @@ import os
 import pkgutil
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import Any
 
-from .errors import SimEnvError, told
+from .errors import SimEnvError, meant, told
 
 
 class _UsageError(Exception):
@@ -200,8 +199,7 @@ def _module(name: str) -> Any:
         if where is None and parent == "":
             where = [os.getcwd()]
         known = [module.name for module in pkgutil.iter_modules(where)]
-        close = get_close_matches(last, known, n=3)
-        hint = f"; did you mean {' or '.join(f'{parent}.{other}'.lstrip('.') for other in close)}?" if close else ""
+        hint = meant(last, known, f"{parent}." if parent else "")
         raise _UsageError(
             f"there is no module {error.name!r}{hint} (looked for in {os.getcwd()} and on Python's path)"
         ) from None
@@ -210,9 +208,9 @@ def _module(name: str) -> Any:
 
 
 def _alternatives(name: str, owner: Any) -> str:
-    close = get_close_matches(name, dir(owner), n=3)
-    if close:
-        return f"; did you mean {' or '.join(close)}?"
+    hint = meant(name, dir(owner))
+    if hint:
+        return hint
     runnable = [
         other
         for other, value in vars(owner).items()

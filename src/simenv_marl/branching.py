@@ -1,7 +1,5 @@
 """Exact continuations of an episode that is going on, for planning, counterfactuals and studies of variance."""
 
-from __future__ import annotations
-
 import copy
 import os
 import pickle
@@ -21,7 +19,7 @@ from .core.forking import Standing, end_with
 from .core.processes import pack_error, pack_plainly, unpack, unpack_error
 from .core.rng import is_seed, process_kept, seed_process
 from .envs import View
-from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, shown, told
+from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, meant, shown, told
 from .remote.kept import processes_kept
 
 Result = TypeVar("Result")
@@ -107,7 +105,10 @@ def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
     if isinstance(n, bool) or not isinstance(n, int) or n < 0:
         raise OptionValueError(f"n must be a number of continuations, not {shown(n)}")
     if method not in (None, *METHODS):
-        raise OptionValueError(f"method must be None or one of {', '.join(map(repr, METHODS))}, not {shown(method)}")
+        raise OptionValueError(
+            f"method must be None or one of {', '.join(map(repr, METHODS))}, not {shown(method)}"
+            f"{meant(method, METHODS)}"
+        )
     if method == "fork" and not _can_fork(view):
         raise OptionValueError(
             'method="fork" needs a platform that can fork, and driver="greenlet": a forked process has none of the'

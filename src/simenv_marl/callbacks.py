@@ -1,7 +1,5 @@
 """Callbacks that C code calls: what is raised in them surfaces where C was called."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from functools import wraps

@@ -6,8 +6,6 @@ where the simulation that calls it runs behind one. What is asked is the ``Decis
 rule, however many definitions there are of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import KW_ONLY, dataclass
@@ -265,7 +263,7 @@ def inverse(definition: Definition) -> dict[Any, Any] | None:
 BY_NAME: Final = "simenv_marl_point"
 """An attribute of functions that are found by a name of a simulation's own, and not in a module: that name."""
 
-_REGISTRY: WeakValueDictionary[str, DecisionPoint] = WeakValueDictionary()
+_REGISTRY: "WeakValueDictionary[str, DecisionPoint]" = WeakValueDictionary()
 """The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
 
 
@@ -332,12 +330,12 @@ class DecisionPoint:
         """Make a decision function of this point, which stands for a definition where it is named as a point."""
         return self.hook.stand_in(definition)
 
-    def family(self) -> list[DecisionPoint]:
+    def family(self) -> "list[DecisionPoint]":
         """The other points of the same rule."""
         return [hook.point for hook in MADE_OF[self.rule] if hook.point is not None and hook is not self.hook]
 
 
-def point_for(hook: Hook) -> DecisionPoint:
+def point_for(hook: Hook) -> "DecisionPoint":
     """The decision point of a hook, whether it was one before or not."""
     if hook.point is None:
         hook.point = DecisionPoint(hook)
@@ -345,7 +343,7 @@ def point_for(hook: Hook) -> DecisionPoint:
     return point
 
 
-def point_of(function: Any) -> tuple[DecisionPoint, Definition | None] | None:
+def point_of(function: Any) -> "tuple[DecisionPoint, Definition | None] | None":
     """The point of a decision function and the definition that it was made with; None for anything else."""
     hook = hook_of(function)
     if hook is None:
@@ -361,7 +359,7 @@ def unwrapped(function: Any) -> Any:
     return beneath(getattr(function, "__func__", function))
 
 
-def registered(name: str) -> DecisionPoint | None:
+def registered(name: str) -> "DecisionPoint | None":
     """The decorated decision point of that dotted name."""
     return _REGISTRY.get(name)
 
@@ -371,7 +369,7 @@ def decision_points() -> list[str]:
     return list(_REGISTRY)
 
 
-def _redefined(point: DecisionPoint, definition: Definition | None) -> None:
+def _redefined(point: "DecisionPoint", definition: Definition | None) -> None:
     """Give a point that was restored its definition, which may lead back to it, unless it has one of this process."""
     if point.definition is None and definition is not None:
         point.definition = definition

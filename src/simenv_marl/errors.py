@@ -43,8 +43,9 @@ Every error is raised with its message alone, so that it survives pickling.
 import reprlib
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final
 
@@ -102,6 +103,21 @@ def shown(value: Any, longest: int = LONGEST) -> str:
     except Exception:  # as of an integer of many thousand digits
         text = object.__repr__(value)
     return text if len(text) <= longest else f"{text[: longest - 23]}...{text[-20:]}"
+
+
+def meant(name: object, known: Iterable[str], beneath: str = "") -> str:
+    """A hint for messages about an unknown name.
+
+    Args:
+        name: The unknown name.
+        known: The names that exist.
+        beneath: What is put before each of these, such as "package.".
+
+    Returns:
+        "; did you mean this or that?", or nothing where no known name is close.
+    """
+    close = get_close_matches(name, known, n=3) if isinstance(name, str) else []
+    return f"; did you mean {' or '.join(beneath + other for other in close)}?" if close else ""
 
 
 def text_of(error: BaseException) -> str:

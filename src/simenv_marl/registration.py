@@ -1,18 +1,18 @@
 """Into the registries of Gymnasium and PettingZoo, with entry points that specs can be written down with."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import sys
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import gymnasium
 import pettingzoo
 from gymnasium.wrappers import HumanRendering, RenderCollection
 
+from .core.options import ViewOptions
 from .core.plan import Plan
+from .core.points import Points
 from .core.variant import Variant
 from .envs import aec_env, parallel_env, vector_env, view_class
 from .errors import OptionValueError, UnknownPointError, shown
@@ -33,7 +33,7 @@ _RECIPES: dict[str, _Recipe] = {}
 
 
 def register_simulation(
-    simulation: Any, points: Any = None, *, name: str | None = None, version: int = 0, **options: Any
+    simulation: Any, points: Points = None, *, name: str | None = None, version: int = 0, **options: Unpack[ViewOptions]
 ) -> list[str]:
     """Register the environments of a simulation.
 
@@ -71,7 +71,7 @@ def register_simulation(
         simulation = replace(simulation, options=others)
     plan = Plan.draw_up(simulation, points, options)
     where = {"recipe": f"{name}-v{version}", "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
-    _RECIPES[where["recipe"]] = _Recipe(simulation, points, options, flatten, [b.point.name for b in plan.active])
+    _RECIPES[where["recipe"]] = _Recipe(simulation, points, dict(options), flatten, [b.point.name for b in plan.active])
     made: list[str] = []
     named = [b.point.name for b in plan.active if b.agent is not None or plan.one_agent is not None]
     for point, title in zip(named, _titles(named), strict=True):

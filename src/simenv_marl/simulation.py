@@ -1,7 +1,5 @@
 """What a simulation is to this library, and the two words that it and its user may say."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """Simulations of models that are made with a seed and then stepped, as Mesa's are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

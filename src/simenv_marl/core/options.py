@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from difflib import get_close_matches
-from typing import Any
+from inspect import cleandoc
+from textwrap import indent
+from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
 from gymnasium import spaces
@@ -13,9 +15,45 @@ from gymnasium import spaces
 from ..errors import (
     OptionValueError,
     UnknownOptionError,
+    meant,
     shown,
 )
 from ..simulation import RULE
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class _CommonOptions(TypedDict, total=False):
+    driver: Literal["greenlet", "thread"]
+    possible_agents: Iterable[str] | Mapping[Any, Iterable[str]] | None
+    undeclared: Literal["error", "rule"]
+    agent: str | None
+    padded: bool
+    skip_forced: bool
+    clip_actions: bool
+    plugins: Iterable[Any]
+    global_rng: bool
+    flatten: bool
+    state_space: spaces.Space[Any] | Literal["observations"] | None
+    render_mode: str | None
+
+
+class EpisodeOptions(_CommonOptions, total=False):
+    """The options of functions that run whole episodes, for editors and type checkers. ``Options`` explains each."""
+
+    max_steps: int | None
+
+
+class CheckOptions(_CommonOptions, total=False):
+    """The options of functions that check a simulation and have a ``max_steps`` of their own."""
+
+    policies: Mapping[Any, Any] | None
+
+
+class ViewOptions(EpisodeOptions, total=False):
+    """The options of functions that make environments."""
+
+    policies: Mapping[Any, Any] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,31 +61,31 @@ class Options:
     """The options that every view takes.
 
     Attributes:
-        driver: What switches between the simulation and its user: "greenlet", or "thread" for what cannot live
-            on a greenlet and for environments that are used from changing threads.
-        possible_agents: The roster, where agents are named by a callable: their names, or a dict from
-            decision point to names. Declared agents are there from ``reset`` on.
-        undeclared: What a decision of an agent outside the roster becomes: "error", or "rule".
-        agent: The one agent of a single view, all others being left to their policies or their rule; None: the one
-            agent of the one active decision point.
-        padded: Whether all agents of the roster stand in ``agents`` from the reset to the end of an episode: also those
-            who are yet to be born or whom the model has removed, as agents that do not decide.
-        skip_forced: Whether decisions with one legal choice are answered with it, without asking for an action.
-        clip_actions: Whether actions of ``Box`` spaces that lie outside are clipped, and not refused.
-        max_steps: After how many calls of ``step`` with an action an episode is truncated; None: never.
-        policies: Who decides without being an agent of the environment: from the name of an agent, or from a
-            decision point (dotted name or decision function), to a callable of the observation, or of the
-            observation and the info, that returns an action. ``RULE`` in place of the callable stands for the
-            model's own rule.
-        plugins: Handlers for this environment's simulation alone: of each the handler, the target and the position,
-            as ``attach_handler`` takes them.
-        global_rng: Whether the simulation gets a state of its own of the global generators of ``random`` and
-            ``numpy.random``, which each reset seeds with the seed of the episode.
-        flatten: Whether the joint view has one vector in place of dicts.
-        state_space: The space to whose shape and dtype the environment's ``state()`` is cast; None: what the
-            simulation's own ``state()`` returns is taken as it is. "observations": the state is what all possible
-            agents observe, in one vector, and the simulation needs no ``state()``.
-        render_mode: What ``render`` returns; one of the simulation's ``render_modes``.
+        driver: How control switches between the simulation and its user. "greenlet" is fast. "thread" is for models
+            that cannot run on a greenlet, and for environments that several threads use.
+        possible_agents: The names of all agents, where a callable names them: a list, or a dict from decision point to
+            names. These agents are in ``agents`` from ``reset`` on.
+        undeclared: What to do when an agent decides that is not in ``possible_agents``: "error" raises, "rule" lets the
+            model's own rule decide.
+        agent: The agent of a single view. All other agents are left to their policies or their rule. None: the only
+            agent of the only active decision point.
+        padded: Whether ``agents`` has all possible agents from the reset to the end of the episode, also those that
+            are not born yet and those that the model has removed. These do not decide.
+        skip_forced: Whether a decision with one legal choice is taken without asking for an action.
+        clip_actions: Whether an action outside a ``Box`` space is clipped instead of refused.
+        max_steps: The number of calls of ``step`` with an action after which an episode is truncated. None: no limit.
+        policies: Policies that decide instead of the environment's user: a dict from the name of an agent, or from a
+            decision point (dotted name or function), to a callable. The callable gets the observation, or the
+            observation and the info, and returns an action. ``RULE`` instead of a callable is the model's own rule.
+        plugins: Handlers for the simulation of this environment alone. Each is a tuple of the handler, the target and
+            the position, as ``attach_handler`` takes them.
+        global_rng: Whether the simulation gets its own state of the global generators of ``random`` and
+            ``numpy.random``. Each reset seeds them with the seed of the episode.
+        flatten: Whether the joint view has vectors instead of dicts.
+        state_space: The space whose shape and dtype ``state()`` has. None: ``state()`` returns what the simulation's
+            own ``state()`` returns. "observations": the state is the observations of all possible agents in one
+            vector, and the simulation needs no ``state()``.
+        render_mode: What ``render`` returns: one of the simulation's ``render_modes``.
     """
 
     driver: str = "greenlet"
@@ -109,10 +147,20 @@ class Options:
         known = [field.name for field in fields(self)]
         for name in options:
             if name not in known:
-                close = get_close_matches(name, known, n=1)
-                hint = f"; did you mean {close[0]!r}?" if close else ""
-                raise UnknownOptionError(f"there is no option {name!r}{hint} (the options are {', '.join(known)})")
+                listed = ", ".join(known)
+                raise UnknownOptionError(f"there is no option {name!r}{meant(name, known)} (the options are {listed})")
         return replace(self, **options)
+
+
+def explain_options(function: Function) -> Function:
+    """Decorate a function whose docstring has a line ``{options}``: put the explanations of ``Options`` there."""
+    if function.__doc__ and Options.__doc__:  # neither is there under ``python -OO``
+        _, _, attributes = cleandoc(Options.__doc__).partition("Attributes:\n")
+        listed = re.sub(r"^    (\w+):", r"- ``\1``:", attributes, flags=re.MULTILINE).replace("\n        ", "\n  ")
+        function.__doc__ = re.sub(
+            r"^( +)\{options\}$", lambda line: indent(listed, line[1]), function.__doc__, flags=re.MULTILINE
+        )
+    return function
 
 
 def _listed(names: Any) -> Any:

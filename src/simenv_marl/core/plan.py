@@ -19,6 +19,7 @@ from ..errors import (
     OptionValueError,
     UnknownOptionError,
     UnknownPointError,
+    meant,
     shown,
     warn_user,
 )
@@ -108,7 +109,7 @@ class Plan:
         if options.render_mode is not None and options.render_mode not in render_modes:
             raise OptionValueError(
                 f"render_mode {shown(options.render_mode)} is not one of the simulation's:"
-                f" {render_modes or 'it has none'}"
+                f" {render_modes or 'it has none'}{meant(options.render_mode, render_modes)}"
             )
         self.unanswered, self.rewarded, self._ends_agents = unanswered, rewarded, ends_agents
         self._others = others
@@ -116,6 +117,7 @@ class Plan:
         if options.agent is not None and options.agent not in agents and None not in agents:
             raise AgentError(
                 f"agent={shown(options.agent)} names no agent; the agents are {', '.join(filter(None, agents))}"
+                f"{meant(options.agent, filter(None, agents))}"
             )
         by_point, self.policies, extra = assign(options.policies or {}, named, agents, own)
         self._everything, self._by_point = [*named, *extra], by_point
@@ -237,6 +239,7 @@ class Plan:
         if self.complete and agent not in self.roster:
             raise AgentError(
                 f"agent={shown(agent)} names no agent of the environment; its agents are {', '.join(self.roster)}"
+                f"{meant(agent, self.roster)}"
             )
         points = [self.roster[agent]] if self.complete else self.active
         if len(points) > 1:

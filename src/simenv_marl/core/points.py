@@ -6,7 +6,7 @@ needs it: for all others the function stays what it was.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from sys import modules
@@ -29,6 +29,9 @@ from ..hooks.places import (
     resolve,
     unbind,
 )
+
+Points = str | Callable[..., Any] | Iterable[str | Callable[..., Any]] | Mapping[Any, Definition | None] | None
+"""What names decision points: see ``generate_env``."""
 
 POINT: Final = Purpose("decision point", UnknownPointError, decision_points)
 

@@ -1,24 +1,25 @@
 """What an environment was made of, in a form that can be written into a results file."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import platform
 import sys
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache, partial
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
-from .options import Options
+from .options import Options, ViewOptions
 from .plan import Plan
+from .points import Points
 
 DEPENDENCIES = ("greenlet", "gymnasium", "numpy", "pettingzoo", "simenv-marl")
 
 
-def provenance(simulation: Any, points: Any = None, *, seed: int | None = None, **options: Any) -> dict[str, Any]:
+def provenance(
+    simulation: Any, points: Points = None, *, seed: int | None = None, **options: Unpack[ViewOptions]
+) -> dict[str, Any]:
     """Say what an environment of these arguments is made of, as ``env.unwrapped.provenance()`` does.
 
     Args:

@@ -1,7 +1,5 @@
 """Finding the random generators that a simulation holds, for futures that are drawn anew."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from gc import get_referents

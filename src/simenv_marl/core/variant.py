@@ -5,8 +5,6 @@ definitions of decision points, and policies that decide in place of others. It 
 asked for. What is given beside it there comes on top of it.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
@@ -15,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import OptionValueError, SimulationError, shown
-from .points import portable
+from .points import Points, portable
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class Variant:
     simulation: Any
     _: KW_ONLY
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    points: Any = None
+    points: Points = None
     plugins: Iterable[Any] = ()
     policies: Mapping[Any, Any] = field(default_factory=dict)
     options: Mapping[str, Any] = field(default_factory=dict)

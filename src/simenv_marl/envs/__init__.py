@@ -1,14 +1,14 @@
 """Views: thin readings of an episode as PettingZoo and Gymnasium environments."""
 
-from __future__ import annotations
-
 import sys
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 from gymnasium.vector import AutoresetMode
 
+from ..core.options import ViewOptions, explain_options
 from ..core.plan import Plan
-from ..errors import OptionValueError, shown
+from ..core.points import Points
+from ..errors import OptionValueError, meant, shown
 from . import asked  # noqa: F401 - the environments that policies are given
 from .aec import SimulationAECEnv
 from .base import View
@@ -54,12 +54,17 @@ def view_class(plan: Plan, view: str | None) -> Any:
         return single_view(plan)
     found: dict[Any, Any] = {"aec": SimulationAECEnv, "parallel": SimulationParallelEnv, "joint": SimulationJointEnv}
     if not isinstance(view, str) or view not in found:
-        raise OptionValueError(f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {shown(view)}")
+        raise OptionValueError(
+            f"view must be None or one of {', '.join(map(repr, VIEWS))}, not {shown(view)}{meant(view, VIEWS)}"
+        )
     found[view].check(plan)
     return found[view]
 
 
-def generate_env(simulation: Any, points: Any = None, *, view: str | None = None, **options: Any) -> Any:
+@explain_options
+def generate_env(
+    simulation: Any, points: Points = None, *, view: str | None = None, **options: Unpack[ViewOptions]
+) -> Any:
     """Make an environment class of a simulation (paper, section 3.3).
 
     Args:
@@ -69,7 +74,9 @@ def generate_env(simulation: Any, points: Any = None, *, view: str | None = None
             simulation's attribute ``points``, else all decorated points of the one package that has any.
         view: "aec", "parallel", "single" or "joint". None: single where one point with one agent is active, or one
             agent is named with ``agent=``, AEC otherwise.
-        **options: As ``aec_env`` takes them.
+        **options: Any of these:
+
+            {options}
 
     Returns:
         A class, whose instances take options as keywords to change those given here.
@@ -96,14 +103,16 @@ def generate_env(simulation: Any, points: Any = None, *, view: str | None = None
     )
 
 
-def aec_env(simulation: Any, points: Any = None, **options: Any) -> SimulationAECEnv:
+@explain_options
+def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationAECEnv:
     """Make a PettingZoo AEC environment, in which decision points are agents.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
-        **options: ``driver``, ``max_steps``, ``policies``, ``possible_agents``, ``undeclared``,
-            ``state_space``, ``render_mode``: see the page on options.
+        **options: Any of these:
+
+            {options}
 
     Raises:
         SimEnvError: Something in it cannot work; the leaf says what.
@@ -111,13 +120,16 @@ def aec_env(simulation: Any, points: Any = None, **options: Any) -> SimulationAE
     return SimulationAECEnv(Plan.draw_up(simulation, points, options))
 
 
-def parallel_env(simulation: Any, points: Any = None, **options: Any) -> SimulationParallelEnv:
+@explain_options
+def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationParallelEnv:
     """Make a PettingZoo parallel environment, in which decision points are agents.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
-        **options: As ``aec_env`` takes them.
+        **options: Any of these:
+
+            {options}
 
     Raises:
         SimEnvError: Something in it cannot work; the leaf says what.
@@ -125,7 +137,8 @@ def parallel_env(simulation: Any, points: Any = None, **options: Any) -> Simulat
     return SimulationParallelEnv(Plan.draw_up(simulation, points, options))
 
 
-def single_env(simulation: Any, points: Any = None, **options: Any) -> SimulationEnv:
+@explain_options
+def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationEnv:
     """Make a Gymnasium environment of the one agent that is active.
 
     Where its decision point has a goal, the environment is goal-based: its observations are dicts of
@@ -134,7 +147,9 @@ def single_env(simulation: Any, points: Any = None, **options: Any) -> Simulatio
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
-        **options: ``agent`` for the name of the one agent, where several decide; else as ``aec_env`` takes them.
+        **options: Any of these:
+
+            {options}
 
     Raises:
         ViewError: Not just one agent is active.
@@ -144,13 +159,16 @@ def single_env(simulation: Any, points: Any = None, **options: Any) -> Simulatio
     return single_view(plan)(plan)
 
 
-def joint_env(simulation: Any, points: Any = None, **options: Any) -> SimulationJointEnv:
+@explain_options
+def joint_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationJointEnv:
     """Make a Gymnasium environment whose one agent takes all decisions.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
-        **options: ``flatten=True`` for one vector in place of dicts; else as ``aec_env`` takes them.
+        **options: Any of these:
+
+            {options}
 
     Raises:
         ViewError: Not all agents are known beforehand, or the spaces cannot be flattened.
@@ -159,9 +177,10 @@ def joint_env(simulation: Any, points: Any = None, **options: Any) -> Simulation
     return SimulationJointEnv(Plan.draw_up(simulation, points, options))
 
 
+@explain_options
 def vector_env(
     simulation: Any,
-    points: Any = None,
+    points: Points = None,
     *,
     num_envs: int,
     workers: int = 0,
@@ -169,7 +188,7 @@ def vector_env(
     copy: bool = True,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     context: Any = None,
-    **options: Any,
+    **options: Unpack[ViewOptions],
 ) -> SimulationVectorEnv:
     """Make a Gymnasium vector environment: many simulations of a kind, stepped together.
 
@@ -187,7 +206,9 @@ def vector_env(
             ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
         context: How workers are started: "spawn" (what None means), "forkserver", "fork", or a context of
             ``multiprocessing``.
-        **options: ``flatten=True`` for one vector in place of dicts in the joint view; else as ``aec_env`` takes them.
+        **options: Any of these:
+
+            {options}
 
     Raises:
         SimEnvError: Something in it cannot work; the leaf says what.

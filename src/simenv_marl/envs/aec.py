@@ -1,7 +1,5 @@
 """The AEC view: agents are selected in the order in which the simulation calls their decision functions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numpy import ndarray

@@ -1,7 +1,5 @@
 """What all views have in common: a session, spaces of their own, a picture and a state."""
 
-from __future__ import annotations
-
 import copy
 import weakref
 from collections.abc import Callable

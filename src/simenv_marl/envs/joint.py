@@ -1,7 +1,5 @@
 """The joint view: one agent that takes all decisions, and so a Gymnasium environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any

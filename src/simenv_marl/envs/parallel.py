@@ -1,7 +1,5 @@
 """The parallel view: rounds, in which every agent has at most one action."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

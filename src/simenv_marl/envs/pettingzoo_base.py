@@ -12,7 +12,7 @@ from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.session import checked_seed, seed_space
 from ..core.spaces import duplicate
-from ..errors import OptionValueError, UnknownAgentError, ViewError, shown
+from ..errors import OptionValueError, UnknownAgentError, ViewError, meant, shown
 from .base import View
 
 
@@ -113,7 +113,10 @@ class AgentsView(View):
             episode = self._session.episode
             found = None if episode is None else episode.agent(agent)
             if found is None:
-                raise UnknownAgentError(f"there is no agent {shown(agent)}; the agents now are {self.agents[:10]}")
+                raise UnknownAgentError(
+                    f"there is no agent {shown(agent)}; the agents now are {self.agents[:10]}"
+                    f"{meant(agent, self.agents)}"
+                )
             point = found.point
         return point
 

@@ -1,7 +1,5 @@
 """The single view: one agent, and so a Gymnasium environment."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 from typing import Any

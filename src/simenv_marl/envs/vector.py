@@ -1,7 +1,5 @@
 """The vector view: many simulations of a kind, stepped together."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Iterable, Sequence
 from threading import Lock

@@ -1,7 +1,5 @@
 """Designs: which combinations of factors are worth a run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, isfinite, prod
@@ -12,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.rng import is_seed
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, meant, shown
 from .extras import needed
 
 if TYPE_CHECKING:
@@ -80,7 +78,7 @@ class Factor:
 
 def design(
     factors: Mapping[str, Any], method: str = "full_factorial", n: int | None = None, *, seed: int | None = None
-) -> DataFrame:
+) -> "DataFrame":
     """Say which combinations of factors are to be run.
 
     Args:
@@ -112,7 +110,9 @@ def design(
     pandas = needed("pandas", "design")
     found = _checked(factors)
     if method not in list(METHODS):
-        raise OptionValueError(f"method must be one of {', '.join(METHODS)}, not {shown(method)}")
+        raise OptionValueError(
+            f"method must be one of {', '.join(METHODS)}, not {shown(method)}{meant(method, METHODS)}"
+        )
     if n is not None and (isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1):
         raise OptionValueError(f"n must be a positive integer, not {shown(n)}")
     if seed is not None and not is_seed(seed):

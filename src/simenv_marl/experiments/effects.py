@@ -1,7 +1,5 @@
 """What factors do: main effects, interactions, and shares of the variance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -10,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, meant, shown
 from .extras import needed
 from .playing import TEAM
 from .statistics import check_confidence, interval, numbers
@@ -40,13 +38,13 @@ class Effects:
         levels: Those of each factor, as they are: in an index, 1 and True and 1.0 are the same.
     """
 
-    main: DataFrame
-    interactions: DataFrame
+    main: "DataFrame"
+    interactions: "DataFrame"
     of: str
     levels: dict[str, list[Any]]
-    _cells: dict[tuple[str, str], DataFrame]
+    _cells: "dict[tuple[str, str], DataFrame]"
 
-    def cells(self, one: str, other: str) -> DataFrame:
+    def cells(self, one: str, other: str) -> "DataFrame":
         """The mean of the value in each combination of two factors: a row for each level of the one.
 
         Raises:
@@ -59,7 +57,7 @@ class Effects:
                 return table.T
         raise OptionValueError(f"{shown(one)} and {shown(other)} are no two factors of {list(self.levels)}")
 
-    def plot(self, *, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
+    def plot(self, *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw the main effects of all factors and, below them, the strongest interactions.
 
         Args:
@@ -78,7 +76,7 @@ class Effects:
 
 
 def effects(
-    frame: DataFrame,
+    frame: "DataFrame",
     of: str = "return",
     *,
     contender: str | None = None,
@@ -139,7 +137,7 @@ def _by_seed(values: NDArray[np.float64], seeds: NDArray[Any]) -> NDArray[np.flo
     return np.bincount(place, values) / np.bincount(place)
 
 
-def _taken(frame: DataFrame, of: str, contender: str | None, agent: str) -> tuple[DataFrame, list[str]]:
+def _taken(frame: "DataFrame", of: str, contender: str | None, agent: str) -> "tuple[DataFrame, list[str]]":
     """The rows that count, and the names of the factors.
 
     Raises:
@@ -151,10 +149,11 @@ def _taken(frame: DataFrame, of: str, contender: str | None, agent: str) -> tupl
     factors = columns[: columns.index("contender")]
     if of not in columns or of in (*factors, "contender", "seed", "agent", "status", "error"):
         values = columns[columns.index("return") : columns.index("status")]
-        raise OptionValueError(f"of={shown(of)} is no column with values; there are {values}")
+        raise OptionValueError(f"of={shown(of)} is no column with values; there are {values}{meant(of, values)}")
     for what, value in (("contender", contender), ("agent", agent)):
         if value is not None and value not in set(frame[what]):
-            raise OptionValueError(f"there is no {what} {shown(value)}; there are {sorted(set(frame[what]))}")
+            known = sorted(set(frame[what]))
+            raise OptionValueError(f"there is no {what} {shown(value)}; there are {known}{meant(value, known)}")
     chosen = (frame["agent"] == agent) & (frame["status"] == "ok")
     table = frame[chosen if contender is None else chosen & (frame["contender"] == contender)]
     if not len(table):
@@ -187,7 +186,7 @@ def _at(levels: Any, level: Any) -> NDArray[np.bool_]:
     return np.array([own == level or (_is_nan(own) and _is_nan(level)) for own in levels.tolist()], np.bool_)
 
 
-def _cells(pair: tuple[str, str], levels: Any, at: Any, values: NDArray[np.float64]) -> DataFrame:
+def _cells(pair: tuple[str, str], levels: Any, at: Any, values: NDArray[np.float64]) -> "DataFrame":
     """The means in all combinations of two factors."""
     pandas, (one, other) = needed("pandas", "effects"), pair
     means = [[values[a & b].mean() if (a & b).any() else np.nan for b in at[other]] for a in at[one]]
@@ -206,13 +205,13 @@ def _strength(means: NDArray[np.float64]) -> float:
 
 
 def sobol_indices(
-    frame: DataFrame,
+    frame: "DataFrame",
     of: str = "return",
     *,
     contender: str = "rule",
     agent: str = TEAM,
     confidence: float = 0.95,
-) -> DataFrame:
+) -> "DataFrame":
     """Say which share of a value's variance is due to which factor, by SALib.
 
     Args:

@@ -1,18 +1,18 @@
 """Contenders on the same seeds: who does better, by how much, and how sure that is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.options import EpisodeOptions
 from ..core.plan import Plan
+from ..core.points import Points
 from ..core.processes import pack
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, meant, shown
 from ..many.collect import check_numbers, checked_seeds
 from ..many.spread import progress_bar, spread
 from ..remote.kept import processes_kept
@@ -58,7 +58,7 @@ class Evaluation:
         confidence: Of the intervals.
     """
 
-    frame: DataFrame
+    frame: "DataFrame"
     baseline: str | None
     confidence: float
 
@@ -66,7 +66,7 @@ class Evaluation:
         values = self.values()
         return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
 
-    def values(self, of: str = "return") -> DataFrame:
+    def values(self, of: str = "return") -> "DataFrame":
         """The team's values: a row for each seed, a column for each contender.
 
         Args:
@@ -76,13 +76,14 @@ class Evaluation:
             OptionValueError: There is no such column.
         """
         if of not in self.frame.columns or of in ("contender", "seed", "agent"):
-            raise OptionValueError(f"of={shown(of)} is no column with values; there are {list(self.frame.columns[3:])}")
+            known = list(self.frame.columns[3:])
+            raise OptionValueError(f"of={shown(of)} is no column with values; there are {known}{meant(of, known)}")
         team = self.frame[self.frame["agent"] == TEAM]
         names = list(dict.fromkeys(team["contender"]))
         seeds = list(dict.fromkeys(team["seed"]))
         return team.pivot(index="seed", columns="contender", values=of).loc[seeds, names]
 
-    def summary(self, of: str = "return") -> DataFrame:
+    def summary(self, of: str = "return") -> "DataFrame":
         """The mean of the team's values for each contender, with its interval.
 
         Args:
@@ -108,7 +109,7 @@ class Evaluation:
         table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=columns)
         return table.rename_axis("contender")
 
-    def improvement(self, of: str = "return") -> DataFrame:
+    def improvement(self, of: str = "return") -> "DataFrame":
         """The probability that a contender does better than the baseline on a seed, where ties count half.
 
         Args:
@@ -126,7 +127,7 @@ class Evaluation:
         table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=["probability", "low", "high"])
         return table.rename_axis("contender")
 
-    def seeds_needed(self, difference: float, *, power: float = 0.8, of: str = "return") -> Series[float]:
+    def seeds_needed(self, difference: float, *, power: float = 0.8, of: str = "return") -> "Series[float]":
         """How many seeds would tell a difference from the baseline, as far as the seeds that there are can say.
 
         Args:
@@ -159,7 +160,7 @@ class Evaluation:
         base = values[self.baseline].to_numpy()
         return {name: values[name].to_numpy() - base for name in values.columns if name != self.baseline}
 
-    def plot(self, of: str = "return", *, figure: Figure | SubFigure | None = None) -> Figure | SubFigure:
+    def plot(self, of: str = "return", *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw each seed as a line from contender to contender and, with a baseline, the differences seed by seed.
 
         Args:
@@ -186,7 +187,7 @@ def evaluate(
     contenders: Mapping[str, Policies],
     *,
     seeds: Iterable[int],
-    points: Any = None,
+    points: Points = None,
     baseline: str | None = None,
     metric: Any = None,
     team: Callable[[Returns], Any] | None = None,
@@ -196,7 +197,7 @@ def evaluate(
     batch_size: int = 1024,
     workers: int = 0,
     progress: bool = False,
-    **options: Any,
+    **options: Unpack[EpisodeOptions],
 ) -> Evaluation:
     """Have contenders meet the same seeds.
 
@@ -236,10 +237,10 @@ def evaluate(
     _check(found, baseline, confidence, width, team)
     places = distinct_seeds(seeds)
     check_numbers(batch_size, workers)
-    options = checked_options(options)
+    chosen = checked_options(options)
     metrics, size = checked_metrics(metric), int(batch_size) if batched else 0
     points = list(points) if isinstance(points, Iterator) else points
-    common = (simulation, points, options, points_of(found), metrics, size, team)
+    common = (simulation, points, chosen, points_of(found), metrics, size, team)
     plans = _plans(found, *common[:4])  # made here also where the work is done elsewhere, so that errors come before
     if workers:
         pack((found, common))  # as here what cannot be sent there
@@ -350,7 +351,7 @@ def _frame(seeds: Sequence[int], outcomes: Mapping[str, Sequence[Outcome]], metr
     return typed(columns)
 
 
-def typed(columns: Mapping[str, Sequence[Any]]) -> DataFrame:
+def typed(columns: Mapping[str, Sequence[Any]]) -> "DataFrame":
     """A table whose columns keep their values as they are; numbers of which some are missing are floats."""
     pandas = needed("pandas", "a table")
     table: DataFrame = pandas.DataFrame(
@@ -399,7 +400,10 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: An
     if not contenders:
         raise OptionValueError("contenders must be some, such as {'rule': {}}: there are none")
     if baseline is not None and baseline not in list(contenders):
-        raise OptionValueError(f"the baseline {shown(baseline)} is none of the contenders: {', '.join(contenders)}")
+        raise OptionValueError(
+            f"the baseline {shown(baseline)} is none of the contenders: {', '.join(contenders)}"
+            f"{meant(baseline, contenders)}"
+        )
     check_confidence(confidence)
     if width is not None:
         check_number("width", width)

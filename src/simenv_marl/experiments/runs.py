@@ -1,7 +1,5 @@
 """Experiments: every row of a design, every contender, every seed; stored as they are run, and resumed."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -11,10 +9,12 @@ from contextlib import nullcontext, suppress
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 
 import numpy as np
 
+from ..core.options import EpisodeOptions
+from ..core.points import Points
 from ..core.processes import pack
 from ..errors import OptionValueError, SimEnvError, StoreError, shown, told
 from ..many.collect import check_numbers
@@ -79,7 +79,7 @@ def run_experiment(
     *,
     policies: Mapping[str, Policies] | None = None,
     seeds: Iterable[int],
-    points: Any = None,
+    points: Points = None,
     metric: Any = None,
     team: Callable[[Returns], Any] | None = None,
     store: str | os.PathLike[str],
@@ -88,8 +88,8 @@ def run_experiment(
     workers: int = 0,
     progress: bool = False,
     retry_errors: bool = False,
-    **options: Any,
-) -> DataFrame:
+    **options: Unpack[EpisodeOptions],
+) -> "DataFrame":
     """Run every row of a design with every contender on every seed; what was run before is not run again.
 
     Each run is stored as soon as it is known. A process that is killed loses what it was running, and nothing else:
@@ -130,9 +130,9 @@ def run_experiment(
     metrics, size = checked_metrics(metric, list(table.columns)), int(batch_size) if batched else 0
     places = distinct_seeds(seeds)
     _check(make, rows, batch_size, workers, team)
-    options = checked_options(options)
+    chosen = checked_options(options)
     points = list(points) if isinstance(points, Iterator) else points
-    workshop = (make, contenders, points, options, points_of(contenders))
+    workshop = (make, contenders, points, chosen, points_of(contenders))
     folder, keys, factors = _folder(store), [written(row) for row in rows], list(table.columns)
     trying = Workshop(*workshop)
     tried = _try(trying, rows, contenders)
@@ -202,7 +202,7 @@ def _contenders(policies: Any, *, batched: bool) -> dict[str, Policies]:
     return {BY_RULE: {}, **found}
 
 
-def checked_design(design: Any) -> tuple[DataFrame, list[Row]]:
+def checked_design(design: Any) -> "tuple[DataFrame, list[Row]]":
     """A design as a table, and its rows in values that JSON knows.
 
     Raises:
@@ -405,14 +405,14 @@ def _do_many(
 
 
 def _frame(
-    table: DataFrame,
+    table: "DataFrame",
     keys: Sequence[str],
     contenders: Sequence[str],
     seeds: Sequence[int],
     stored: Stored,
     metrics: Sequence[str],
     team: Any,
-) -> DataFrame:
+) -> "DataFrame":
     """The table of all runs, in the order of the design, the contenders and the seeds."""
     pandas = needed("pandas", "run_experiment")
     places: list[int] = []

@@ -1,12 +1,10 @@
 """One handler at one position, made ready to be called, and what it may return."""
 
-from __future__ import annotations
-
 import inspect
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from ..errors import HandlerError, annotate, notes_of, shown
+from ..errors import HandlerError, annotate, meant, notes_of, shown
 from ..simulation import takes
 
 CALLS: Final = ("before", "after", "instead")
@@ -62,7 +60,7 @@ class Call:
     result: str | None = field(default=None)
 
     @classmethod
-    def of(cls, target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
+    def of(cls, target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> "Call":
         """The entry of a call that begins."""
         given = [shown(value, 60) for value in args] + [f"{name}={shown(value, 60)}" for name, value in kwargs.items()]
         return cls(target, ", ".join(given))
@@ -90,7 +88,7 @@ class Attached:
             why = f"{target.name} {target.nature}" if known else "there is no such position"
             raise HandlerError(
                 f"no handler can be attached {shown(position)} {target.name}: {why}; its positions are"
-                f" {', '.join(target.positions)}"
+                f" {', '.join(target.positions)}{meant(position, target.positions)}"
             )
         if not callable(handler):
             raise HandlerError(f"the handler of {target.name} must be callable, not {shown(handler)}")

@@ -11,13 +11,12 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from difflib import get_close_matches
 from sys import modules
 from types import FunctionType, MethodType, ModuleType
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
-from ..errors import PatchError, shown
+from ..errors import PatchError, meant, shown
 from .attached import title
 from .hook import Hook, beneath, hook_of
 from .stacks import LOCK
@@ -39,9 +38,7 @@ class Purpose:
 
     def unknown(self, name: str, why: str) -> Exception:
         """The error that says that a name leads to nothing."""
-        close = get_close_matches(name, self.known(), n=3, cutoff=0.6)
-        hint = f"; did you mean {' or '.join(close)}?" if close else ""
-        return self.error(f"the {self.noun} {name!r} is not to be found: {why}{hint}")
+        return self.error(f"the {self.noun} {name!r} is not to be found: {why}{meant(name, self.known())}")
 
 
 # -- names ----------------------------------------------------------------------------------------

@@ -5,8 +5,6 @@ instances iterate; for the whole process (``attach_handler``), for a while (``ha
 alone (the option ``plugins``). What has none costs nothing, or, exposed by ``expose_to_plugins``, one test.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from types import MappingProxyType
@@ -217,11 +215,11 @@ class Plugins(_Added):
         super().__init__([(attached.target, attached) for attached in self._attached])
 
     @property
-    def _key(self) -> Plugins:
+    def _key(self) -> "Plugins":
         return self
 
     @property
-    def plugins(self) -> Plugins:
+    def plugins(self) -> "Plugins":
         """Themselves: they take part in what is evaluated for their environment."""
         return self
 

@@ -1,7 +1,5 @@
 """Finding what handlers are attached to: functions, iterables, and classes whose instances iterate."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterable
 from contextlib import suppress

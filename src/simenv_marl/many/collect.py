@@ -1,15 +1,15 @@
 """Many simulations at once: policies that answer the decisions of all of them together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
+from ..core.options import EpisodeOptions
 from ..core.plan import Plan
+from ..core.points import Points
 from ..core.session import checked_seed
 from ..errors import OptionValueError, shown
 from ..simulation import RULE
@@ -25,12 +25,12 @@ def simulate_many(
     policies: Mapping[Any, Any] | None = None,
     *,
     seeds: Iterable[int],
-    points: Any = None,
+    points: Points = None,
     collect: Callable[[Any], Any] | None = None,
     batch_size: int = 1024,
     workers: int = 0,
     progress: bool = False,
-    **options: Any,
+    **options: Unpack[EpisodeOptions],
 ) -> list[Any]:
     """Run one simulation per seed, with policies that answer the decisions of many simulations at once.
 
@@ -123,12 +123,12 @@ def collect_episodes(
     policies: Mapping[Any, Any],
     *,
     seeds: Iterable[int],
-    points: Any = None,
+    points: Points = None,
     collect: Callable[[Any], Any] | None = None,
     batch_size: int = 1024,
     workers: int = 0,
     progress: bool = False,
-    **options: Any,
+    **options: Unpack[EpisodeOptions],
 ) -> dict[Any, Trajectories]:
     """Play one episode per seed, with policies that answer many at once, and keep what learners learn from.
 

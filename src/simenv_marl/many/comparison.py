@@ -1,15 +1,15 @@
 """The model's own rule and policies, decision by decision."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.asking import AskingPolicy, asks_for_environment
+from ..core.options import EpisodeOptions
+from ..core.points import Points
 from ..core.spaces import same as alike
 from ..core.stacking import stacker
 from ..errors import OptionValueError, shown
@@ -53,10 +53,10 @@ def compare_with_rule(
     policies: Mapping[Any, Any],
     *,
     seeds: Iterable[int],
-    points: Any = None,
+    points: Points = None,
     others: Mapping[Any, Any] | None = None,
     tolerance: float = 0.0,
-    **options: Any,
+    **options: Unpack[EpisodeOptions],
 ) -> dict[Any, Comparison]:
     """Let the model's own rule decide, and ask policies what they would have done instead.
 

@@ -4,18 +4,18 @@ Everything here is ``collect_episodes`` and what is made of its ``Trajectories``
 set is written.
 """
 
-from __future__ import annotations
-
 import shutil
 import warnings
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
+from ..core.options import EpisodeOptions
+from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
-from ..errors import MissingExtraError, OptionValueError, shown
+from ..errors import MissingExtraError, OptionValueError, meant, shown
 from .collect import collect_episodes
 from .mixture import name_of
 from .rule_actions import check_knowable, check_known
@@ -30,12 +30,12 @@ def record_dataset(
     policies: Mapping[Any, Any],
     *,
     seeds: Iterable[int],
-    points: Any = None,
+    points: Points = None,
     metadata: Mapping[str, Any] | None = None,
     batch_size: int = 1024,
     workers: int = 0,
     progress: bool = False,
-    **options: Any,
+    **options: Unpack[EpisodeOptions],
 ) -> Any:
     """Play one episode per seed, and write what was decided as a Minari data set, for offline learners.
 
@@ -107,7 +107,9 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]
         raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {shown(dataset_id)}")
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
-        raise OptionValueError(f"dataset_id names {shown(unknown[0])}, for whom there is no policy")
+        raise OptionValueError(
+            f"dataset_id names {shown(unknown[0])}, for whom there is no policy{meant(unknown[0], map(str, policies))}"
+        )
     if len(set(dataset_id.values())) < len(dataset_id):
         raise OptionValueError(f"each policy needs a data set of its own: {shown(dict(dataset_id))}")
     return dict(dataset_id)

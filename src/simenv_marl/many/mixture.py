@@ -1,7 +1,5 @@
 """Mixtures of policies, and what else is to be known of policies that learners give."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite
 from typing import Any

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionValueError, UnknownAgentError, shown
+from ..errors import OptionValueError, UnknownAgentError, meant, shown
 from .trajectories import Trajectories
 
 CHARTED: Final = 6
@@ -233,8 +233,11 @@ def coloured_by(panels: Sequence[Panel], component: str | None) -> list[tuple[Le
         for panel in panels
     ]
     if component is not None and not any(component in own for own in known):
-        names = ", ".join(repr(name) for name in dict.fromkeys(name for own in known for name in own))
-        raise OptionValueError(f"no action has a component {shown(component)}; there are {names}")
+        components = dict.fromkeys(name for own in known for name in own)
+        names = ", ".join(map(repr, components))
+        raise OptionValueError(
+            f"no action has a component {shown(component)}; there are {names}{meant(component, components)}"
+        )
     return [own.get(component or "", next(iter(own.values()))) for own in known]
 
 

@@ -4,8 +4,6 @@ Matplotlib is only imported where something is drawn. Figures are made without p
 behind when their user lets them go, and no window opens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BytesIO
@@ -78,7 +76,7 @@ def style(what: str) -> Iterator[Any]:
         yield new_figure
 
 
-def _png(figure: Figure) -> bytes:
+def _png(figure: "Figure") -> bytes:
     """What a notebook shows of a figure."""
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
@@ -95,8 +93,8 @@ def plot_timeline(
     agents: Sequence[str] | None = None,
     action_names: Any = None,
     component: str | None = None,
-    figure: Figure | SubFigure | None = None,
-) -> Figure | SubFigure:
+    figure: "Figure | SubFigure | None" = None,
+) -> "Figure | SubFigure":
     """Draw one episode: who decided when, what, with which reward, and who was born and ended when.
 
     From left to right runs the simulation's time where it has a clock, else the number of the decision among all that
@@ -183,7 +181,7 @@ def _draw_charts(panels: Sequence[Panel], figure: Any, begin: float, end: float)
     return list(drawn)
 
 
-def _chart_actions(axes: Axes, row: Row, leaf: Leaf, values: NDArray[Any]) -> None:
+def _chart_actions(axes: "Axes", row: Row, leaf: Leaf, values: NDArray[Any]) -> None:
     hollow: dict[str, Any] = {"color": "white", "linewidths": 0.9, "zorder": 3}
     for place, colour in enumerate(COLOURS[: min(leaf.width, DRAWN)]):
         heights, size = values[:, place].astype(float), 14 if len(row.at) <= 150 else 5
@@ -209,7 +207,7 @@ def _chart_actions(axes: Axes, row: Row, leaf: Leaf, values: NDArray[Any]) -> No
         axes.legend(title=more, fontsize=8, title_fontsize=8, **beside)
 
 
-def _chart_rewards(axes: Axes, row: Row) -> None:
+def _chart_rewards(axes: "Axes", row: Row) -> None:
     rewards = row.found.rewards[row.rows]
     axes.vlines(row.at, 0.0, rewards, color=INK, linewidth=1.4 if len(rewards) <= 150 else 0.7)
     axes.axhline(0.0, color=PALE, linewidth=0.8, zorder=1)
@@ -217,7 +215,7 @@ def _chart_rewards(axes: Axes, row: Row) -> None:
     beside(axes, f"sum {rewards.sum():.4g}", 0.5, axes.transAxes)
 
 
-def beside(axes: Axes, text: str, height: float, at: Any) -> None:
+def beside(axes: "Axes", text: str, height: float, at: Any) -> None:
     """Write something to the right of axes."""
     axes.annotate(text, (1.0, height), (6, 0), at, "offset points", va="center", fontsize=8.5, annotation_clip=False)
 
@@ -260,14 +258,14 @@ def _draw_rows(panels: Sequence[Panel], figure: Any, component: str | None) -> l
     return columns
 
 
-def _coloured(axes: Axes, cells: NDArray[np.float64], **colours: Any) -> Any:
+def _coloured(axes: "Axes", cells: NDArray[np.float64], **colours: Any) -> Any:
     from matplotlib.collections import PolyCollection
 
     # In files of vectors, many cells are an image.
     return axes.add_collection(PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours))
 
 
-def _colour_actions(figure: Any, axes: Axes, rows: Sequence[Row], leaf: Leaf, values: NDArray[Any]) -> None:
+def _colour_actions(figure: Any, axes: "Axes", rows: Sequence[Row], leaf: Leaf, values: NDArray[Any]) -> None:
     from matplotlib.patches import Patch
 
     known = np.concatenate([row.known for row in rows])
@@ -286,7 +284,7 @@ def _colour_actions(figure: Any, axes: Axes, rows: Sequence[Row], leaf: Leaf, va
     axes.legend(handles=patches, loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=0.9, handleheight=0.9)
 
 
-def _colour_rewards(figure: Any, axes: Axes, rows: Sequence[Row]) -> None:
+def _colour_rewards(figure: Any, axes: "Axes", rows: Sequence[Row]) -> None:
     from matplotlib.colors import LinearSegmentedColormap
 
     rewards = np.concatenate([row.found.rewards[row.rows] for row in rows])
@@ -301,13 +299,13 @@ def _colour_rewards(figure: Any, axes: Axes, rows: Sequence[Row]) -> None:
     _bar(figure, axes, scale, beyond)
 
 
-def _bar(figure: Any, axes: Axes, scale: Any, extend: str) -> None:
+def _bar(figure: Any, axes: "Axes", scale: Any, extend: str) -> None:
     bar = figure.colorbar(scale, ax=axes, extend=extend, fraction=0.04, pad=0.01, aspect=30)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, colors=INK, color=PALE)
 
 
-def _mark_legend(axes: Axes, rows: Sequence[Row], *, charts: bool) -> None:
+def _mark_legend(axes: "Axes", rows: Sequence[Row], *, charts: bool) -> None:
     """Say what marks mean, above the first axes, as far as there are such."""
     from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
@@ -340,8 +338,8 @@ def plot_returns(
     collected: Trajectories | Mapping[Any, Trajectories | Mapping[Any, Trajectories]],
     *,
     per: Literal["policy", "agent", "team"] = "policy",
-    ax: Axes | None = None,
-) -> Figure | SubFigure:
+    ax: "Axes | None" = None,
+) -> "Figure | SubFigure":
     """Draw the returns of many episodes, of one collection or of several side by side.
 
     The return of an agent is the sum of its rewards in an episode, undiscounted. Each point is an episode. The bar is
@@ -401,7 +399,7 @@ def plot_returns(
     return ax.figure
 
 
-def _draw_returns(axes: Axes, height: float, returns: NDArray[np.float64], colour: str) -> None:
+def _draw_returns(axes: "Axes", height: float, returns: NDArray[np.float64], colour: str) -> None:
     number, mean = len(returns), float(returns.mean())
     low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
     heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)  # spread evenly, in no order

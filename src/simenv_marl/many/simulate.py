@@ -1,12 +1,12 @@
 """Policies back in the model: a simulation runs its own loop, and policies answer its decisions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Unpack
 
 from ..core.episode import When
+from ..core.options import EpisodeOptions
 from ..core.plan import Plan
+from ..core.points import Points
 from ..core.session import Session, checked_seed
 from ..errors import close_after
 from ..remote.kept import processes_kept
@@ -16,9 +16,9 @@ def simulate(
     simulation: Any,
     policies: Mapping[Any, Any] | None = None,
     *,
-    points: Any = None,
+    points: Points = None,
     seed: int | None = None,
-    **options: Any,
+    **options: Unpack[EpisodeOptions],
 ) -> Any:
     """Run a simulation's own loop to its end, with policies answering and all else on its rule.
 

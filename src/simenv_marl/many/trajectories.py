@@ -4,8 +4,6 @@ While the episodes run, a *ledger* has a page for each group of decisions, on wh
 they were answered. What learners get are the same rows by policy, episode, agent and step, whatever that order was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
@@ -181,7 +179,7 @@ class _Life:
         terminated, truncated: How it ended.
     """
 
-    page: _Page
+    page: "_Page"
     number: int
     policy: int
     episode: int
@@ -349,7 +347,7 @@ class Ledger:
 class _Sorted:
     """A page, for its rows to be taken by policy, in the order in which learners get them."""
 
-    def __init__(self, page: _Page) -> None:
+    def __init__(self, page: "_Page") -> None:
         _check_extras(page.extras)
         self.page, lives = page, page.lives
         self.policies = np.array([life.policy for life in lives])

@@ -18,7 +18,7 @@ from ..core.asking import AskingPolicy, base_of
 from ..core.roster import two_arguments
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv, View
-from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, ViewError, shown
+from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, ViewError, meant, shown
 from ..simulation import RULE
 
 
@@ -119,7 +119,9 @@ class Player:
         for name in base if isinstance(base, Mapping) else ():
             if not self._may_be(name):
                 known = [*self.episode.agents, *self.episode.answered]
-                raise UnknownAgentError(f"base names {shown(name)}, which is no agent here; these are: {known}")
+                raise UnknownAgentError(
+                    f"base names {shown(name)}, which is no agent here; these are: {known}{meant(name, known)}"
+                )
 
     def _may_be(self, name: Any) -> bool:
         """Whether there is an agent of that name, or may be one."""

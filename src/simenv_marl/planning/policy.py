@@ -1,7 +1,5 @@
 """Policies that try out candidates before they decide."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from math import ceil, log2
 from typing import Any

@@ -1,7 +1,5 @@
 """A policy that looks several decisions ahead."""
 
-from __future__ import annotations
-
 from math import inf, log, sqrt
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """What candidate actions of a pending decision are worth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A simulation whose model runs in a process of its own, and calls for decisions over a pair of pipes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 import numpy as np
 
+from ..core.options import CheckOptions
+from ..core.points import Points
 from ..errors import OptionValueError, SimEnvError, shown
 from .checks import check_plain_runs, check_repeated_run, check_views
 from .conformance import check_conformance, check_timing
@@ -39,14 +41,14 @@ TOLD: Final = {
 
 def check_simulation(
     simulation: Any,
-    points: Any = None,
+    points: Points = None,
     *,
     seeds: Iterable[int] = (0, 1, 2),
     episodes: int = 10,
     max_steps: int = 1000,
     time_limit: float = 60.0,
     fingerprint: Callable[[Any], Any] | None = None,
-    **options: Any,
+    **options: Unpack[CheckOptions],
 ) -> CheckReport:
     """Check all that is to be known of a simulation before its environments are trusted.
 

@@ -6,8 +6,10 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, Unpack
 
+from ..core.options import CheckOptions
+from ..core.points import Points
 from ..simulation import TRUNCATED
 from .inside import VIEWS, ActivePoint, Plan, active_points, make_environment
 from .report import Inspection, PointDescription, order_of
@@ -16,12 +18,12 @@ from .runs import Run, TimeUp, error_in_words, plain_run, play_rules, quietly, s
 
 def inspect_simulation(
     simulation: Any,
-    points: Any = None,
+    points: Points = None,
     *,
     seed: int = 0,
     max_steps: int = 10_000,
     time_limit: float = 30.0,
-    **options: Any,
+    **options: Unpack[CheckOptions],
 ) -> Inspection:
     """Tell what there is to be decided in a simulation, and in what order, by running one episode of its own rules.
 

@@ -2,7 +2,7 @@
 
 Run with ``python -m tools.mutants``, or ``make mutants``. What is found goes to a file as it comes, one JSON object a
 line. Started once more, the script goes on where it was stopped; with ``--again`` it tries the survivors anew, which
-is what one wants when tests have been added. It draws from all modules except ``testing`` and ``many/plots.py``.
+is what one wants when tests have been added. It draws from all modules except ``testing``, ``many/plots.py`` and the models among ``templates``.
 
 Before the first mutant, the tests run once and it is measured which of them execute which lines, and how long they
 take. A mutant is only shown to tests that execute its function: first those that execute its line, some quick ones of
@@ -39,7 +39,7 @@ from .mutants_draw import Mutant, candidates
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path("src/simenv_marl")
-LEFT_OUT = ("testing/", "many/plots.py")
+LEFT_OUT = ("testing/", "many/plots.py", *(f"templates/{name}" for name in ("mesa", "plain", "simpy", "test_")))
 COPIED = ("src", "tests", "tools", "examples", "benchmarks", "docs", "README.md", "CHANGELOG.md", "pyproject.toml")
 TEST_LIMIT = 20.0
 """Seconds that any test may take, beyond ten times what it took when nothing was wrong."""

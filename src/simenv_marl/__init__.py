@@ -18,6 +18,7 @@ To begin with:
 The rooms of the package; each imports only from those below it::
 
     __main__                            the command line
+    templates                           models to begin with: the command line copies them
     planning                            what actions are worth, and policies that decide by that
     testing, registration, branching    checks of a simulation; registries; exact continuations of an episode
     callbacks                           what is raised in callbacks of C code

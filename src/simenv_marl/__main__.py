@@ -1,7 +1,7 @@
-"""The command line: ``python -m simenv_marl`` with ``check``, ``inspect`` or ``wire-check``.
+"""The command line: ``python -m simenv_marl`` with ``new``, ``check``, ``inspect`` or ``wire-check``.
 
 Exit codes: 0 where all is well, 1 where a check has found errors (or the model fails in ``inspect``), 2 where nothing
-could be looked at.
+could be looked at or written.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import os
 import pkgutil
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from .errors import SimEnvError, meant, told
+from .templates import KINDS, write_template
 
 
 class _UsageError(Exception):
@@ -47,9 +49,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m simenv_marl",
-        description="Check a simulation before its environments are trusted, or see what there is to be decided in it.",
+        description="Begin with a template, check a simulation before its environments are trusted, or see what is"
+        " decided in it.",
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="check | inspect | wire-check")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="new | check | inspect | wire-check")
+    _add_new(commands)
     check = commands.add_parser(
         "check",
         help="run it plainly and behind environments, and say what is wrong",
@@ -81,6 +85,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_wire_check(commands)
     return parser
+
+
+def _add_new(commands: Any) -> None:
+    new = commands.add_parser(
+        "new",
+        help="write a model to begin with, its environment, training and tests",
+        description="Write one file with a model, its environment and its training, and a file with its tests.",
+    )
+    new.set_defaults(look=lambda options: write_template(options.kind, options.name, options.folder), json=False)
+    new.add_argument("kind", choices=KINDS, help="a plain loop, processes of SimPy, or agents of Mesa")
+    new.add_argument("name", metavar="NAME", help="of the module; its class is called likewise")
+    new.add_argument("--folder", type=Path, metavar="DIR", help="where to write (default: a new folder NAME)")
 
 
 def _add_wire_check(commands: Any) -> None:

@@ -1,0 +1,121 @@
+"""Models to begin with: one file each, from the model's class to a trained policy, and the tests that belong to it.
+
+``python -m simenv_marl new plain|simpy|mesa NAME`` copies one of the modules of this package, with ``NAME`` in it. They
+run as they are, too: ``python -m simenv_marl.templates.plain``.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import keyword
+import sys
+from dataclasses import dataclass
+from importlib.machinery import PathFinder
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+
+from ..errors import OptionValueError, shown
+
+KINDS: Final = {
+    "plain": "stable-baselines3",
+    "simpy": "simpy cma",
+    "mesa": "mesa",
+}
+"""The kinds of templates, and the packages that each needs besides ``simenv-marl[experiments]``."""
+
+PLACEHOLDER: Final = "MyModel"
+"""What stands in the templates for the class of the model; their module stands for the name itself."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written.
+
+    Attributes:
+        kind: Of the template.
+        files: The module, and its tests.
+    """
+
+    kind: str
+    files: tuple[Path, Path]
+
+    def __str__(self) -> str:
+        module, tests = self.files
+        return "\n".join(
+            [
+                f"wrote {module}",
+                f"wrote {tests}",
+                "",
+                "Next:",
+                f'  pip install "simenv-marl[experiments]" pytest {KINDS[self.kind]}',
+                f"  cd {module.parent}",
+                f"  python -m {module.stem}    # trains, and compares with the model's own rule",
+                "  python -m pytest",
+            ]
+        )
+
+
+def write_template(kind: str, name: str, folder: Path | None = None) -> Written:
+    """Write a template and its tests into a folder.
+
+    Args:
+        kind: One of ``KINDS``.
+        name: Of the new module. Its class is called likewise: ``water_tank`` has a ``WaterTank``.
+        folder: Where to write; made if it does not exist. None: a folder of that name in the current one.
+
+    Returns:
+        What was written.
+
+    Raises:
+        OptionValueError: The name cannot be used, a file is there already, or the folder cannot be written to.
+    """
+    template = _text(kind)
+    class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
+    _check_name(name, class_name, template)
+    folder = Path(name) if folder is None else folder
+    texts = {folder / f"{name}.py": template, folder / f"test_{name}.py": _text(f"test_{kind}")}
+    for path in texts:
+        if path.exists():
+            raise OptionValueError(f"{path} exists already, and is not overwritten; choose another name or folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, text in texts.items():
+            text = text.replace(PLACEHOLDER, class_name).replace(f"{__name__}.{kind}", name)
+            with path.open("x", encoding="utf-8") as file:
+                file.write(text)
+    except OSError as error:
+        raise OptionValueError(f"{error.filename} cannot be written: {error.strerror}") from error
+    module, tests = texts
+    return Written(kind, (module, tests))
+
+
+def _text(module: str) -> str:
+    return (files(__name__) / f"{module}.py").read_text(encoding="utf-8")
+
+
+def _check_name(name: str, class_name: str, template: str) -> None:
+    """Refuse names that are none, that hide another module, or whose class the template has already."""
+    example = "; choose one like water_tank"
+    if not name.isidentifier() or keyword.iskeyword(name) or not class_name.isidentifier():
+        raise OptionValueError(
+            f"{shown(name)} cannot be the name of a module and, as {class_name}, of a class{example}"
+        )
+    tree = ast.parse(template)
+    imported = {node.names[0].name.partition(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import)}
+    if name in sys.stdlib_module_names or name.lower() in imported or _installed(name):
+        raise OptionValueError(
+            f"{shown(name)} is the name of another module, which could not be imported any more{example}"
+        )
+    used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    used |= {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)} - {PLACEHOLDER}
+    if class_name in used or hasattr(builtins, class_name):
+        raise OptionValueError(f"{shown(name)} would name the class {class_name}, and that name is taken{example}")
+
+
+def _installed(name: str) -> bool:
+    """Whether Python finds a module or package of that name anywhere but in the current folder."""
+    here = ("", str(Path.cwd()))
+    spec = PathFinder.find_spec(name, [entry for entry in sys.path if entry not in here])
+    return spec is not None and spec.origin is not None

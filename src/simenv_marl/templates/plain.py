@@ -1,0 +1,141 @@
+"""MyModel: a home battery, and an agent that learns when to charge it.
+
+Run ``python -m simenv_marl.templates.plain`` to train the agent and to compare it with the model's own rule. It needs
+``pip install "simenv-marl[experiments]" stable-baselines3``. ``--quick`` only shows that everything runs.
+
+Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+
+from simenv_marl import TRUNCATED, SimulationEnv, SimulationInterface, difference, evaluate, make_step, single_env
+
+# -- 1. The model: plain Python, with a main loop and a rule of its own ---------------------------
+
+
+class MyModel:
+    """A house with solar panels and a battery. Each hour, the rule decides how much flows into the battery."""
+
+    capacity, power, losses = 10.0, 3.0, 0.1  # kWh, kWh in an hour, share of what is charged
+
+    def __init__(self, seed: int | None = None) -> None:
+        self.random = random.Random(seed)  # the model's own generator: the same seed brings the same run
+        self.hour, self.charge, self.cost = 0, 5.0, 0.0
+        self.update_weather()
+
+    def update_weather(self) -> None:
+        """Draw what the sun brings, what the house uses, and what a kWh costs in this hour."""
+        clock = self.hour % 24
+        daylight = max(0.0, math.sin((clock - 6) / 12 * math.pi))
+        self.sun = 3.5 * daylight * self.random.uniform(0.2, 1.0)
+        self.use = (1.8 if 17 <= clock < 22 else 0.7) * self.random.uniform(0.7, 1.3)
+        self.price = (0.45 if 17 <= clock < 22 else 0.12 if clock < 6 else 0.28) * self.random.uniform(0.9, 1.1)
+
+    def choose_flow(self) -> float:
+        """The rule, as sold with most batteries: store what the sun leaves over, and give what the house lacks."""
+        return self.sun - self.use
+
+    def update_hour(self) -> None:
+        """Let one hour go by."""
+        wanted = min(max(self.choose_flow(), -self.power), self.power)
+        flow = min(max(wanted, -self.charge), self.capacity - self.charge)
+        self.charge += flow * (1 - self.losses) if flow > 0 else flow
+        bought = self.use - self.sun + flow
+        self.cost += bought * (self.price if bought > 0 else 0.05)  # what is fed into the grid earns little
+        self.hour += 1
+        self.update_weather()
+
+
+# -- 2. The decision: what the agent sees, what it can do, and what it is rewarded for ------------
+
+
+def observe(model: MyModel) -> list[float]:
+    """See the time of day on a circle, and the hour's numbers, each of them between -1 and 1 or so."""
+    angle = model.hour % 24 / 24 * 2 * math.pi
+    return [math.sin(angle), math.cos(angle), model.charge / 10, model.sun / 4, model.use / 4, model.price]
+
+
+flow = make_step(
+    observation_space=Box(-1, 1, (6,), np.float32),
+    observation_space_mapping=observe,  # gets the arguments of the decision call: of a method, self
+    action_space=Discrete(3),
+    apply=lambda action, model: (model.sun - model.use, 0.0, model.power)[action],  # as the rule, nothing, all it can
+    reward_mapping=difference(lambda model: -model.cost),  # what was saved since the last decision
+    agent="battery_0",
+)
+
+# -- 3. The simulation: what an episode is --------------------------------------------------------
+
+
+class MyModelSimulation(SimulationInterface):
+    """A week."""
+
+    points = {MyModel.choose_flow: flow}  # the model's class stays as it is
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin a week."""
+        self.model = MyModel(seed)
+
+    def run(self) -> Any:
+        """Run the model's own loop. It is suspended at each decision; nothing here has to be stepped."""
+        while self.model.hour < 7 * 24:
+            self.model.update_hour()
+        return TRUNCATED  # time is up, but the house goes on: no end of the task
+
+    def time(self) -> float:
+        """The hour, for ``info["time"]``."""
+        return float(self.model.hour)
+
+
+# -- 4. The environment ---------------------------------------------------------------------------
+
+
+def env(**options: Any) -> SimulationEnv:
+    """Make the environment: a ``gymnasium.Env``, as all of Gymnasium's learners and wrappers take it."""
+    return single_env(MyModelSimulation, **options)
+
+
+# -- 5. Training, and what it is worth ------------------------------------------------------------
+
+
+def train(steps: int) -> Any:
+    """Train with PPO of Stable-Baselines3.
+
+    Returns:
+        A policy: a callable of the observation that returns an action.
+    """
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+
+    learner = PPO("MlpPolicy", make_vec_env(env, n_envs=8, seed=1), n_steps=168, batch_size=168, n_epochs=5,
+        gamma=0.97, learning_rate=2e-3, seed=1, device="cpu")  # fmt: skip
+    learner.learn(steps)
+    return lambda observation: int(learner.predict(observation, deterministic=True)[0])
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train, and print how much the policy saves on weeks that it was not trained on."""
+    parser = argparse.ArgumentParser(description="Train an agent, and compare it with the model's own rule.")
+    parser.add_argument("--quick", action="store_true", help="train for a moment only, to see that everything runs")
+    quick = parser.parse_args(arguments).quick
+    policy = train(1500 if quick else 100_000)
+    contenders: dict[str, Any] = {"rule": {}, "trained": {"battery_0": policy}}  # {}: the model as it is
+    seeds = range(100_000, 100_005 if quick else 100_030)
+    found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule")
+    print("What a week earns (the costs, negative); the difference is paired by seed, with its 95 % interval:")
+    print(found.summary().round(2).to_string())
+    print("Next: put your model into section 1, and run pytest. What else may be wrong with it:")
+    print("python -m simenv_marl check simenv_marl.templates.plain:MyModelSimulation")
+
+
+if __name__ == "__main__":
+    main()

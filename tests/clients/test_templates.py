@@ -1,0 +1,19 @@
+"""The template of a plain loop, with Stable-Baselines3: it trains where it was written, in half a minute, and gains."""
+
+from simenv_marl.templates import write_template
+
+from .commands import python
+
+
+def test_training_is_worth_something(tmp_path):
+    write_template("plain", "tank", tmp_path)
+    printed = python(tmp_path / "tank.py")
+    row = next(line.split() for line in printed.splitlines() if line.startswith("trained "))
+    difference, difference_low, difference_high = map(float, row[4:])
+    assert 1 < difference_low <= difference <= difference_high
+    assert "python -m simenv_marl check tank:TankSimulation" in printed
+
+
+def test_a_moment_of_training(tmp_path):
+    write_template("plain", "tank", tmp_path)
+    assert "trained " in python(tmp_path / "tank.py", "--quick")

@@ -1,0 +1,136 @@
+"""Templates: what the command line writes runs where it stands, and what it cannot write it says."""
+
+import ast
+import os
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from simenv_marl.__main__ import main
+from simenv_marl.templates import KINDS
+
+SOURCE = Path(__file__).parent.parent / "src"
+
+
+def run(folder, *arguments):
+    """Another Python in a folder, with this library and nothing else of the repository."""
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(SOURCE)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_written_passes_its_own_tests(kind, tmp_path):
+    done = run(tmp_path, "-m", "simenv_marl", "new", kind, "water_tank")
+    assert (done.returncode, done.stderr) == (0, "")
+    written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert written == {"water_tank/water_tank.py", "water_tank/test_water_tank.py"}
+    assert f"pytest {KINDS[kind]}\n" in done.stdout
+    for name in written:
+        text = (tmp_path / name).read_text()
+        assert "simenv_marl.templates" not in text
+        assert "MyModel" not in text
+        assert "WaterTankSimulation" in text
+    tested = run(tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error")
+    assert tested.returncode == 0, tested.stdout
+    checked = run(tmp_path / "water_tank", "-m", "simenv_marl", "check", "water_tank:WaterTankSimulation")
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+@pytest.mark.parametrize("kind", ["simpy", "mesa"])  # plain needs Stable-Baselines3: tests/clients/test_templates.py
+def test_training_is_worth_something(kind, tmp_path):
+    assert run(tmp_path, "-m", "simenv_marl", "new", kind, "tank", "--folder", ".").returncode == 0
+    done = run(tmp_path, "-W", "error::DeprecationWarning:tank", "-m", "tank", "--quick")
+    assert done.returncode == 0, done.stderr
+    table = [line.split() for line in done.stdout.splitlines()]
+    assert ["contender"] in table
+    mean, low, high, difference, difference_low, difference_high = map(
+        float, next(line for line in table if line[:1] == ["trained"])[1:]
+    )
+    assert low <= mean <= high
+    assert 0 < difference_low <= difference <= difference_high
+    assert "python -m simenv_marl check tank:TankSimulation" in done.stdout
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_templates_import_nothing_but_packages_that_the_user_is_told_of(kind):
+    told = {"simenv_marl", "numpy", "gymnasium", *(package.replace("-", "_") for package in KINDS[kind].split())}
+    tree = ast.parse((SOURCE / f"simenv_marl/templates/{kind}.py").read_text())
+    imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    imported |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    packages = {name.partition(".")[0] for name in imported} - set(sys.stdlib_module_names)
+    assert packages <= told
+    assert packages >= told - {"gymnasium"}
+
+
+@pytest.mark.parametrize("kind", ["simpy", "mesa"])
+def test_policies_answer_one_observation_as_they_answer_many(kind):
+    template = import_module(f"simenv_marl.templates.{kind}")
+    policy = template.train(1, 1)
+    env = template.env()
+    env.reset(seed=3)
+    seen = env.last()[0] if kind == "mesa" else env.step(0)[0]
+    assert policy(seen) == policy(np.stack([seen, seen]))[1]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("water tank", "cannot be the name of a module"),
+        ("2nd", "cannot be the name of a module"),
+        ("class", "cannot be the name of a module"),
+        ("none", "the class None"),
+        ("_", "cannot be the name of a module"),
+        ("json", "is the name of another module"),
+        ("pytest", "is the name of another module"),
+        ("simenv_marl", "is the name of another module"),
+        ("Mesa", "is the name of another module"),
+        ("rabbit", "the class Rabbit"),
+        ("box", "the class Box"),
+        ("exception", "the class Exception"),
+    ],
+)
+def test_names_that_cannot_be_used(name, told, tmp_path, capsys):
+    assert main(["new", "mesa", name, "--folder", str(tmp_path / "new")]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert "choose one like water_tank" in error
+    assert len(error.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("existing", ["tank.py", "test_tank.py"])
+def test_nothing_is_overwritten(existing, tmp_path, capsys):
+    (tmp_path / existing).write_text("mine")
+    (tmp_path / "other.txt").write_text("mine")
+    assert main(["new", "plain", "tank", "--folder", str(tmp_path)]) == 2
+    assert f"{existing} exists already" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([existing, "other.txt"])
+    assert (tmp_path / existing).read_text() == "mine"
+
+
+def test_a_folder_that_cannot_be_made(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["new", "plain", "tank", "--folder", str(tmp_path / "file" / "new")]) == 2
+    error = capsys.readouterr().err
+    assert "cannot be written" in error
+    assert len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [["new"], ["new", "plain"], ["new", "netlogo", "tank"]])
+def test_wrong_arguments(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage" in capsys.readouterr().err

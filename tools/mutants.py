@@ -2,7 +2,8 @@
 
 Run with ``python -m tools.mutants``, or ``make mutants``. What is found goes to a file as it comes, one JSON object a
 line. Started once more, the script goes on where it was stopped; with ``--again`` it tries the survivors anew, which
-is what one wants when tests have been added. It draws from all modules except ``testing``, ``many/plots.py`` and the models among ``templates``.
+is what one wants when tests have been added. It draws from all modules except ``testing``, ``many/plots.py`` and the
+models among ``templates``.
 
 Before the first mutant, the tests run once and it is measured which of them execute which lines, and how long they
 take. A mutant is only shown to tests that execute its function: first those that execute its line, some quick ones of

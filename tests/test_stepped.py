@@ -50,6 +50,13 @@ class Unseeded(Walk):
         super().__init__(drift, seed=1)
 
 
+class Planned(Walk):
+    """Takes a scenario, which holds its seed, as Mesa's own models do."""
+
+    def __init__(self, scenario=None):
+        super().__init__(**(scenario or {}))
+
+
 STRIDE = {
     f"{__name__}.Walk.stride": make_step(
         observation_space=spaces.Box(-100, 100, (1,), np.float64),
@@ -98,6 +105,15 @@ def test_the_seed_goes_where_the_model_takes_it():
     assert simulate(SteppedSimulation(ByRng, 5), seed=2).model.place == walked(2, 5)
     assert simulate(SteppedSimulation(Unseeded, 5), seed=2).model.place == walked(1, 5)
     assert simulate(SteppedSimulation(Walk, 5, seed=9), seed=2).model.place == walked(9, 5)  # by the user's own seed
+
+
+def test_a_model_whose_scenario_holds_the_seed_is_not_left_unseeded():
+    with pytest.raises(SimulationError, match=r"Planned'> takes a scenario.*lambda seed, \*\*parameters"):
+        SteppedSimulation(Planned, 5)
+    made = SteppedSimulation(lambda seed, **parameters: Planned({"seed": seed, **parameters}), 5, drift=0.1)
+    assert simulate(made, seed=2).model.place == walked(2, 5, drift=0.1)
+    fixed = SteppedSimulation(Planned, 5, scenario={"seed": 4})  # by the user's own scenario
+    assert simulate(fixed, seed=2).model.place == walked(4, 5)
 
 
 def test_it_is_a_row_of_an_experiment(tmp_path):

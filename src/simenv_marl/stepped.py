@@ -12,11 +12,15 @@ class SteppedSimulation(SimulationInterface):
 
     ::
 
-        sheep = SteppedSimulation(WolfSheep, 200, width=30)
-        env = aec_env(sheep, {"mesa.examples.advanced.wolf_sheep.agents.Sheep.move": make_step(...)})
+        prison = SteppedSimulation(PdGrid, 200, width=30)
+        env = aec_env(prison, {"mesa.examples.advanced.pd_grid.agents.PDAgent.step": make_step(...)})
 
-    Each ``reset`` makes a new model, with its seed as the argument ``seed``, or ``rng`` where it takes no ``seed``. The
-    loop ends when the model says that it does not go on (its attribute ``running`` is false), or is truncated.
+    Each ``reset`` makes a new model, with its seed as the argument ``seed``, or ``rng`` where it takes no ``seed``. For
+    a model that takes a scenario, give a function::
+
+        SteppedSimulation(lambda seed, **given: WolfSheep(WolfSheepScenario(rng=seed, **given)), 200, width=30)
+
+    The loop ends when the attribute ``running`` of the model is false, or is truncated.
 
     Attributes:
         model: The model of the episode; None before the first.
@@ -35,7 +39,7 @@ class SteppedSimulation(SimulationInterface):
             **parameters: With what the model is made besides.
 
         Raises:
-            SimulationError: ``model`` cannot be called.
+            SimulationError: ``model`` cannot be called, or takes a scenario that would hold its seed.
             OptionValueError: ``steps`` is no positive integer.
         """
         if not callable(model):
@@ -44,6 +48,11 @@ class SteppedSimulation(SimulationInterface):
             raise OptionValueError(f"steps must be a positive integer or None, not {shown(steps)}")
         self._make, self._steps, self.parameters = model, steps, parameters
         self._seed = next((name for name in ("seed", "rng") if takes(model, name) and name not in parameters), None)
+        if self._seed is None and takes(model, "scenario") and "scenario" not in parameters:
+            raise SimulationError(
+                f"{shown(model)} takes a scenario, and that holds the seed; give a function that makes both:"
+                " lambda seed, **parameters: Model(Scenario(rng=seed, **parameters))"
+            )
         self._done = 0
         self.model: Any = None
 

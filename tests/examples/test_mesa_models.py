@@ -1,0 +1,57 @@
+"""Mesa's example models as environments: with RULE throughout the plain run, with actions another one."""
+
+import inspect
+import re
+from pathlib import Path
+
+import mesa
+import pytest
+from mesa.examples import WolfSheep
+
+from examples import mesa_models
+
+pytestmark = pytest.mark.filterwarnings("ignore:Random number generator not specified")  # Mesa's own, before 3.5
+
+PAGE = Path(__file__).parents[2] / "docs" / "mesa.md"
+NEW = "simulator" not in inspect.signature(WolfSheep).parameters
+"""Whether models keep their own time, as from Mesa 3.5 on. Before, one of them was run by a simulator."""
+
+
+def told_of(model):
+    """The cells of a model's row in the table of the page."""
+    line = re.search(rf"^\| `{model}` \|.*$", PAGE.read_text(), re.MULTILINE)
+    return [cell.strip() for cell in line[0].strip("|").split("|")]
+
+
+@pytest.mark.parametrize("example", mesa_models.EXAMPLES, ids=lambda example: example.__name__)
+def test_rules_are_the_plain_run_and_actions_are_carried_out(example):
+    if example is mesa_models.wolf_sheep and not NEW:
+        pytest.skip("this Mesa runs it by a simulator: tests/contract/test_mesa.py")
+    outcome = mesa_models.outcome(example)
+    assert outcome.same
+    assert outcome.moved
+    assert outcome.agents == 1 or outcome.asked > 5 * outcome.agents
+    printed = [cell.strip() for cell in mesa_models.table([outcome]).splitlines()[-1].strip("|").split("|")]
+    if mesa.__version__ in PAGE.read_text():
+        assert printed == told_of(outcome.model)
+    else:  # chance is drawn in another order
+        assert printed[:3] == told_of(outcome.model)[:3]
+
+
+def test_what_is_compared_tells_runs_apart():
+    """Two seeds, and one step more or less; otherwise equal fingerprints would say nothing."""
+    for example in (mesa_models.boid_flockers, mesa_models.sugarscape, mesa_models.conways_game_of_life):
+        model = example()
+        assert mesa_models.run_plainly(model, 5) == mesa_models.run_plainly(model, 5)
+        assert mesa_models.run_plainly(model, 5) != mesa_models.run_plainly(model, 6)
+        held = []
+        for steps in (2, 3):
+            simulation = mesa_models.stepped(model[0], steps)
+            simulation.reset(5)
+            simulation.run()
+            held.append(mesa_models.fingerprint(simulation))
+        assert held[0] != held[1]
+
+
+def test_every_model_of_mesa_is_there():
+    assert {example()[0].__name__ for example in mesa_models.EXAMPLES} >= set(mesa.examples.__all__)

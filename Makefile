@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix pension test test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension test test-clients test-rllib test-wrappers test-oldest test-clusters test-outside test-wheel coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -80,6 +80,10 @@ test-outside: .venv/.test
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[energyplus]' || \
 	    echo "EnergyPlus cannot be installed; its tests are skipped" >&2
 	$(BIN)/python -m pytest -n 2 -rs tests/outside
+
+# The built wheel, on the newest Python that is there: templates from an empty folder, and the newest Mesa.
+test-wheel:
+	sh tools/wheel.sh
 
 lint: .venv/.test
 	$(BIN)/ruff check .

@@ -1,0 +1,33 @@
+#!/bin/sh
+# Builds the wheel and begins with each template in an empty folder, where nothing but the wheel is installed. The newest
+# Python that is there serves, and with it the newest Mesa, whose example models are tried as well.
+set -eu
+cd "$(dirname "$0")/.."
+venv=$PWD/.venv-wheel
+quiet="--quiet --disable-pip-version-check"
+
+for python in python3.13 python3.12 "$HOME"/.pyenv/versions/3.13.*/bin/python "$HOME"/.pyenv/versions/3.12.*/bin/python python3; do
+    if "$python" -c "" 2> /dev/null; then break; fi
+done
+test -x "$venv/bin/python" || "$python" -m venv "$venv"
+"$venv/bin/python" --version
+
+rm -rf "$venv/dist"
+"$venv/bin/pip" wheel $quiet --no-deps --wheel-dir "$venv/dist" .
+wheel=$(echo "$venv"/dist/*.whl)
+"$venv/bin/pip" install $quiet "$wheel[experiments]" pytest hypothesis simpy cma "mesa[network]"
+"$venv/bin/pip" install $quiet --force-reinstall --no-deps "$wheel" # of the same version, and yet another one
+
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+for kind in plain simpy mesa; do
+    (
+        cd "$folder"
+        "$venv/bin/python" -m simenv_marl new $kind "my_$kind"
+        cd "my_$kind"
+        "$venv/bin/python" -m pytest -q
+        # The plain one is trained by Stable-Baselines3: tests/clients/test_templates.py.
+        test $kind = plain || "$venv/bin/python" -m "my_$kind" --quick
+    )
+done
+"$venv/bin/python" -m pytest -q tests/examples/test_mesa_models.py tests/contract/test_mesa.py

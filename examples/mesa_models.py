@@ -303,7 +303,6 @@ class Outcome:
     Attributes:
         model: Its name.
         decisions: The names of its decision points.
-        options: Of its environments.
         lines: How many lines of code its definition has, without comments and empty lines.
         agents: How many agents have decided in an episode.
         asked: How many decisions there were in it.
@@ -313,7 +312,6 @@ class Outcome:
 
     model: str
     decisions: str
-    options: str
     lines: int
     agents: int
     asked: int
@@ -323,12 +321,11 @@ class Outcome:
 
 def outcome(function: Callable[[], Example], seed: int = 5) -> Outcome:
     """Run an example plainly, by rule, and with random actions."""
-    model, points, options = function()
+    model, points, _ = function()
     agents, asked, by_rules = play(function(), seed, by_rule)
     return Outcome(
         model=model.__name__,
-        decisions=", ".join(".".join(name.split(".")[-2:]) for name in points),
-        options=", ".join(f"{name}={value}" for name, value in options.items()),
+        decisions=", ".join(".".join(name.split(".")[-2:]).removeprefix(f"{model.__name__}.") for name in points),
         lines=sum(bool(line.strip()) for line in inspect.getsource(function).splitlines()) - 1,  # its docstring
         agents=agents,
         asked=asked,
@@ -340,12 +337,12 @@ def outcome(function: Callable[[], Example], seed: int = 5) -> Outcome:
 def table(outcomes: Iterable[Outcome]) -> str:
     """Make the table, in Markdown."""
     lines = [
-        "| model | decision | lines | agents | decisions | with `RULE`, the plain run | options |",
-        "| --- | --- | ---: | ---: | ---: | --- | --- |",
+        "| model | decision | lines | agents | decisions | same |",
+        "| --- | --- | ---: | ---: | ---: | --- |",
     ]
     lines += [
         f"| `{one.model}` | `{one.decisions}` | {one.lines} | {one.agents} | {one.asked} |"
-        f" {'yes' if one.same else 'NO'} | {f'`{one.options}`' if one.options else ''} |"
+        f" {'yes' if one.same else 'NO'} |"
         for one in outcomes
     ]
     return "\n".join(lines)

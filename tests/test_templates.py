@@ -14,6 +14,7 @@ from simenv_marl.__main__ import main
 from simenv_marl.templates import KINDS
 
 SOURCE = Path(__file__).parent.parent / "src"
+PAGE = (SOURCE.parent / "docs/templates.md").read_text()
 
 
 def run(folder, *arguments):
@@ -36,6 +37,7 @@ def test_what_is_written_passes_its_own_tests(kind, tmp_path):
     written = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     assert written == {"water_tank/water_tank.py", "water_tank/test_water_tank.py"}
     assert f"pytest {KINDS[kind]}\n" in done.stdout
+    assert kind != "plain" or f"$ python -m simenv_marl new plain water_tank\n{done.stdout}" in PAGE
     for name in written:
         text = (tmp_path / name).read_text()
         assert "simenv_marl.templates" not in text
@@ -54,6 +56,7 @@ def test_training_is_worth_something(kind, tmp_path):
     assert done.returncode == 0, done.stderr
     table = [line.split() for line in done.stdout.splitlines()]
     assert ["contender"] in table
+    assert f"{done.stdout.splitlines()[0]}\n" in PAGE
     mean, low, high, difference, difference_low, difference_high = map(
         float, next(line for line in table if line[:1] == ["trained"])[1:]
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import builtins
 import keyword
+import shlex
 import sys
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -50,7 +51,7 @@ class Written:
                 "",
                 "Next:",
                 f'  pip install "simenv-marl[experiments]" pytest {KINDS[self.kind]}',
-                f"  cd {module.parent}",
+                f"  cd {shlex.quote(str(module.parent))}",
                 f"  python -m {module.stem}    # trains, and compares with the model's own rule",
                 "  python -m pytest",
             ]

@@ -80,11 +80,11 @@ def observe(rabbit: Rabbit) -> list[float]:
 
 move = make_step(
     observation_space=Box(-1, 5, (11,), np.float32),
-    observation_space_mapping=observe,  # gets the arguments of the decision call: of a method, self
+    observation_space_mapping=observe,  # gets the arguments of the decision call
     action_space=Discrete(5),
-    choices=lambda rabbit: rabbit.places(),  # the action is an index into what can be returned
-    reward_mapping=difference(lambda rabbit: rabbit.eaten),  # its own bites; for a common good, write another
-    agent=lambda rabbit: f"rabbit_{rabbit.unique_id}",  # an agent for each rabbit, from its birth ...
+    choices=lambda rabbit: rabbit.places(),  # the action is an index
+    reward_mapping=difference(lambda rabbit: rabbit.eaten),  # since its last decision
+    agent=lambda rabbit: f"rabbit_{rabbit.unique_id}",  # from its birth ...
     removed_by="mesa.agent.Agent.remove",  # ... to its death
 )
 
@@ -158,10 +158,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seeds = range(100_000, 100_005 if quick else 100_030)
     metric = {"alive": lambda simulation: len(simulation.model.agents)}
     found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule", metric=metric, batched=True)
-    for of, title in (("return", "What all rabbits have eaten"), ("alive", "How many are alive in the end")):
-        print(f"{title}; the difference is paired by seed, with its 95 % interval:")
+    for of, title in (("return", "What all rabbits have eaten"), ("alive", "Rabbits alive in the end")):
+        print(f"{title}; differences are paired by seed, with 95 % intervals:")
         print(found.summary(of).round(1).to_string())
-    print("Next: put your model into section 1, and run pytest. What else may be wrong with it:")
+    print("Next: put your model into section 1, and run pytest. For a full report:")
     print("python -m simenv_marl check simenv_marl.templates.mesa:MyModelSimulation")
 
 

@@ -66,10 +66,11 @@ def observe(model: MyModel) -> list[float]:
 
 flow = make_step(
     observation_space=Box(-1, 1, (6,), np.float32),
-    observation_space_mapping=observe,  # gets the arguments of the decision call: of a method, self
+    observation_space_mapping=observe,  # gets the arguments of the decision call
     action_space=Discrete(3),
-    apply=lambda action, model: (model.sun - model.use, 0.0, model.power)[action],  # as the rule, nothing, all it can
-    reward_mapping=difference(lambda model: -model.cost),  # what was saved since the last decision
+    # As the rule, nothing, or as much as the battery takes:
+    apply=lambda action, model: (model.sun - model.use, 0.0, model.power)[action],
+    reward_mapping=difference(lambda model: -model.cost),  # since the last decision
     agent="battery_0",
 )
 
@@ -131,9 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     contenders: dict[str, Any] = {"rule": {}, "trained": {"battery_0": policy}}  # {}: the model as it is
     seeds = range(100_000, 100_005 if quick else 100_030)
     found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule")
-    print("What a week earns (the costs, negative); the difference is paired by seed, with its 95 % interval:")
+    print("Minus the costs of a week; differences are paired by seed, with 95 % intervals:")
     print(found.summary().round(2).to_string())
-    print("Next: put your model into section 1, and run pytest. What else may be wrong with it:")
+    print("Next: put your model into section 1, and run pytest. For a full report:")
     print("python -m simenv_marl check simenv_marl.templates.plain:MyModelSimulation")
 
 

@@ -106,7 +106,7 @@ dispatch = make_step(
     observation_space=Box(-10, 10, (SLOTS, 5), np.float32),
     observation_space_mapping=observe,  # gets the arguments of the decision call
     action_space=Discrete(SLOTS),
-    choices=lambda shop, machine, waiting: waiting[:SLOTS],  # the action is an index; infos have the mask
+    choices=lambda shop, machine, waiting: waiting[:SLOTS],  # the action is an index
     reward_mapping=difference(lambda shop, machine, waiting: -shop.minutes_late() / 60),
     agent="dispatcher_0",
 )
@@ -181,9 +181,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     seeds = range(100_000, 100_005 if quick else 100_050)
     found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule", batched=True, **OPTIONS)
-    print("Hours late in a day (negative); the difference is paired by seed, with its 95 % interval:")
+    print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")
     print(found.summary().round(1).to_string())
-    print("Next: put your model into section 1, and run pytest. What else may be wrong with it:")
+    print("Next: put your model into section 1, and run pytest. For a full report:")
     print("python -m simenv_marl check simenv_marl.templates.simpy:MyModelSimulation")
 
 

@@ -1,0 +1,209 @@
+"""The agency of ``collections`` as environments. The model knows nothing of this.
+
+- ``CASES``: each debtor is an agent, from the first decision on its case until the case is closed. All have the same
+  spaces, so that one policy can serve them all. The reward is what the debtor has paid less what the case has cost.
+- ``COLLECTOR``: one agent, ``collector_0``, decides on all cases. The reward is the agency's gain.
+- ``NAMED_CASES`` and ``NAMED_COLLECTOR``: the same with fixed actions, those of ``CHOICES``, and a mask.
+- ``CollectionSim``: the simulation, some days of an agency.
+
+In the first two the action is an index into the lawful choices that arrive with the call, so 2 can mean "call" today
+and "sue" tomorrow. The last three numbers of an observation tell which choices are lawful, and ``lawful`` lists them.
+In the parallel view the choices can change between the observation and the decision: take fixed actions there.
+
+Rewards are in hundreds of dollars.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+
+from simenv_marl import TRUNCATED, Definition, SimulationInterface, difference, make_step, reseed_generators
+
+from .collections import ACTIVE, CHOICES, KEPT, Agency, Debtor, Parameters
+
+DAYS: Final = 720
+"""After how many days an episode is truncated."""
+
+POINT: Final = f"{Agency.__module__}.Agency.choose_contact"
+"""The decision point."""
+
+OBSERVED: Final = {
+    "what is owed, in thousands": 100,
+    "age of the debt, in years": 20,
+    "years until the case is written off": 1,
+    "letters sent": 50,
+    "calls made": 500,
+    "weeks since the latest letter or call": 10,
+    "whether there was a conversation": 1,
+    "whether a plan was broken": 1,
+    "share of today's calls that is left": 1,
+    "other cases that are due today": 1000,
+    "whether to write is lawful": 1,
+    "whether to call is lawful": 1,
+    "whether to sue is lawful": 1,
+}
+"""What is observed of a case, with the highest values: what a collector can know."""
+
+HIGH: Final = np.array(list(OBSERVED.values()), np.float32)
+SPACE: Final = Box(np.zeros(len(HIGH), np.float32), HIGH)
+
+
+def observe(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> NDArray[np.float32]:
+    """Observe what ``OBSERVED`` lists."""
+    day, latest = agency.world.month, debtor.contacted
+    seen = (
+        debtor.balance / 1000_00,
+        debtor.age / 365,
+        max(1 - (day - debtor.arrived) / KEPT, 0.0),
+        debtor.letters,
+        debtor.attempts,
+        HIGH[5] if latest is None else (day - latest) / 7,
+        debtor.talked is not None,
+        debtor.contract is not None,
+        agency.calls_left / max(agency.parameters.calls, 1),
+        len(agency.queue),
+        *(choice in choices for choice in CHOICES[1:]),
+    )
+    return np.minimum(np.array(seen, np.float32), HIGH)
+
+
+def lawful(observation: Any) -> list[str]:
+    """The lawful choices that an observation tells, in the order in which actions number them."""
+    flags = (1.0, *observation[1 - len(CHOICES) :])
+    return [choice for choice, flag in zip(CHOICES, flags, strict=True) if flag]
+
+
+@difference
+def gain_of_case(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> float:
+    """What the debtor has paid less what the case has cost."""
+    return (debtor.collected - debtor.spent) / 100_00
+
+
+@difference
+def gain(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> float:
+    """The agency's profit."""
+    return agency.profit / 100_00
+
+
+CASE: Final = make_step(
+    observation_space=SPACE,
+    observation_space_mapping=observe,
+    action_space=Discrete(len(CHOICES)),
+    choices=lambda agency, debtor, choices: choices,
+    rule_action_mapping=lambda choice, agency, debtor, choices: choices.index(choice),
+    reward_mapping=gain_of_case,
+    agent=lambda agency, debtor, choices: debtor.name,
+    removed_by={f"{Debtor.__module__}.Debtor.close": lambda debtor, reason: debtor.name},
+)
+
+
+def named(definition: Definition) -> Definition:
+    """Make the actions those of ``CHOICES``, of which the lawful ones are legal."""
+    return replace(
+        definition,
+        choices=None,
+        action_space_mapping=CHOICES.__getitem__,
+        rule_action_mapping={choice: action for action, choice in enumerate(CHOICES)},
+        action_mask_mapping=lambda agency, debtor, choices: [choice in choices for choice in CHOICES],
+    )
+
+
+CASES: Final[dict[Any, Definition]] = {POINT: CASE}
+"""An agent for each debtor."""
+
+COLLECTOR: Final[dict[Any, Definition]] = {
+    POINT: replace(CASE, reward_mapping=gain, agent="collector_0", removed_by={}),
+}
+"""One agent for all cases."""
+
+NAMED_CASES: Final[dict[Any, Definition]] = {POINT: named(CASES[POINT])}
+"""An agent for each debtor, with fixed actions."""
+
+NAMED_COLLECTOR: Final[dict[Any, Definition]] = {POINT: named(COLLECTOR[POINT])}
+"""One agent for all cases, with fixed actions."""
+
+
+class CollectionSim(SimulationInterface):
+    """Some days of an agency.
+
+    Attributes:
+        agency: The agency of the present episode.
+    """
+
+    points = CASES
+
+    def __init__(self, days: int = DAYS, parameters: Parameters | None = None) -> None:
+        """Make a simulation.
+
+        Args:
+            days: After how many days it is truncated.
+            parameters: What the agency is like; None: the model's defaults.
+        """
+        self.days = days
+        self.parameters = parameters or Parameters()
+        self.agency = Agency(0, self.parameters)
+        self._stopped = False
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin with another agency."""
+        self._stopped = False
+        self.agency = Agency(seed, self.parameters)
+
+    def run(self) -> Any:
+        """Let day after day go by, until all cases are closed and no debts are bought.
+
+        Returns:
+            ``TRUNCATED`` if the last day comes first.
+        """
+        agency = self.agency
+        while agency.world.month < self.days and not self._stopped:
+            if not agency.cases and agency.world.month >= self.parameters.buying:
+                break
+            agency.advance()
+        else:
+            return None if self._stopped else TRUNCATED
+        return None
+
+    def stop(self) -> None:
+        """Ask the loop to end after the present day."""
+        self._stopped = True
+
+    def time(self) -> int:
+        """The time in days."""
+        return self.agency.world.month
+
+    def reseed(self, seed: int) -> None:
+        """Draw anew what lies ahead: of the debtors that are there, and, by the world's seed, of those to come."""
+        self.agency.world.seed = seed
+        reseed_generators(self, seed)
+
+    def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
+        """Whose cases are still due today."""
+        return [(self.agency, debtor, self.agency.lawful(debtor)) for debtor in self.agency.queue]
+
+    def state(self) -> NDArray[np.float32]:
+        """What the agency knows of all its cases together, and what it does not: what debtors have and want."""
+        agency = self.agency
+        cases = list(agency.cases.values())
+        statuses = [debtor.status for debtor in cases]
+        numbers = (
+            self.time() / self.days,
+            agency.profit / 10_000_00,
+            agency.calls_left / max(agency.parameters.calls, 1),
+            len(agency.queue) / 10,
+            *(statuses.count(status) / 100 for status in ACTIVE),
+            sum(debtor.balance for debtor in cases) / 100_000_00,
+            sum(debtor.cents for debtor in cases) / 100_000_00,
+            sum(debtor.willingness for debtor in cases) / 100,
+        )
+        return np.array(numbers, np.float32)
+
+
+STATE_SPACE: Final = Box(-np.inf, np.inf, (12,), np.float32)
+"""The space of the state: pass it as ``state_space=``."""

@@ -96,6 +96,25 @@ def test_the_seed_determines_everything():
     assert state(plain(5)) == state(plain(5)) != state(plain(6))
 
 
+def test_debts_are_bought_for_a_while_alone():
+    agency = Agency(1, Parameters(stock=0, buying=30))
+    for _ in range(60):
+        agency.advance()
+    days = [debtor.arrived for debtor in agency.cases.values()]
+    assert 15 < max(days) < 30
+
+
+def test_decisions_do_not_change_the_lives_of_debtors(monkeypatch):
+    decided = plain(1, 90).cases
+    monkeypatch.setattr(Agency, "choose_contact", lambda *call: "leave")
+    left_alone = plain(1, 90).cases
+    common = [(decided[number], left_alone[number]) for number in decided.keys() & left_alone.keys()]
+    assert len(common) > 50
+    assert all(one.life.getstate() == other.life.getstate() for one, other in common)
+    assert all(one.employed == other.employed for one, other in common)
+    assert any(one.draw.getstate() != other.draw.getstate() for one, other in common)
+
+
 class Audit:
     """Has an agency choose at random among what is lawful, and checks the law and the staff by the record alone."""
 

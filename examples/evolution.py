@@ -18,6 +18,7 @@ def evolve(
     generations: int,
     rng: np.random.Generator,
     population: int,
+    spread: float = 0.3,
 ) -> Weights:
     """Find weights with high returns.
 
@@ -28,6 +29,7 @@ def evolve(
         generations: How many generations are tried.
         rng: The source of all random numbers; ``rate`` may draw its seeds from it.
         population: How many candidates a generation has.
+        spread: The standard deviation of the weights of the first generation.
 
     Returns:
         ``(weights,)``: the mean of the best weights found so far, over the last quarter of the generations. The best of
@@ -38,7 +40,7 @@ def evolve(
     options: dict[str, Any] = {"popsize": population, "verbose": -9, "verb_log": 0}
     # Without these two it would seed and use NumPy's global generator.
     options |= {"seed": math.nan, "randn": lambda *shape: rng.standard_normal(shape)}
-    evolution = cma.CMAEvolutionStrategy(first, 0.3, options)
+    evolution = cma.CMAEvolutionStrategy(first, spread, options)
     best = []
     for _ in range(generations):
         candidates = evolution.ask()

@@ -339,7 +339,17 @@ def test_a_space_that_chokes_has_no_such_element():
 
 
 @pytest.mark.parametrize(
-    "given", [[1, 0, 1], (True, False, True), np.array([1.0, 0.0, 1.0]), np.array([1, 0, 1], np.int8)]
+    "given",
+    [
+        [1, 0, 1],
+        (True, False, True),
+        np.array([1.0, 0.0, 1.0]),
+        np.array([1, 0, 1], np.int8),
+        np.array([1, 0, 1], np.uint8),
+        np.array([[1, 9], [0, 9], [1, 9]], np.int8)[:, 0],
+        np.array([True, False, True]),
+    ],
+    ids=repr,
 )
 def test_masks_are_new_arrays(given):
     found = mask_cast(DIAL)(given)
@@ -359,8 +369,14 @@ def test_masks_are_new_arrays(given):
         ([1, 2, 0], "other than 0 and 1"),
         ([0.5, 1, 0], "other than 0 and 1"),
         ([0, 0, 0], "no legal action"),
+        ([1, np.nan, 0], "other than 0 and 1"),
+        ([1, 256, 0], "other than 0 and 1"),
+        (np.array([1, 2, 1], np.int8), "other than 0 and 1"),
+        (np.array([0, -1, 0], np.int8), "other than 0 and 1"),
+        (np.array([1, 255, 1], np.uint8), "other than 0 and 1"),
+        (np.array([False, False, False]), "no legal action"),
     ],
-    ids=str,
+    ids=repr,
 )
 def test_what_is_no_mask_is_refused(given, match):
     with pytest.raises(MaskError, match=match):

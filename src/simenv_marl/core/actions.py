@@ -23,6 +23,7 @@ Check = Callable[[Any], Any]
 MASK: Final = "action_mask"
 """Where PettingZoo and Gymnasium look for the legal actions, in infos and in observations."""
 
+_ONE_BYTE = "?bB"  # the dtypes of which each number is one byte
 _SMALL = 16  # elements up to which comparing python floats beats four numpy calls
 
 
@@ -182,18 +183,22 @@ def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
 
 
 def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[np.int8]]:
+    shape, int8 = (number,), np.dtype(np.int8)
+
     def cast(value: Any) -> NDArray[np.int8]:
         mask = np.asarray(value)
-        if mask.shape != (number,):
-            raise MaskError(
-                f"the mask {shown(value)} has shape {mask.shape} and not ({number},), as {shown(space)} asks"
-            )
-        legal = mask.astype(bool)
-        if not (legal == mask).all():
+        if mask.shape != shape:
+            raise MaskError(f"the mask {shown(value)} has shape {mask.shape} and not {shape}, as {shown(space)} asks")
+        if mask.dtype.char not in _ONE_BYTE:
+            given, mask = mask, mask.astype(bool)
+            if not (mask == given).all():
+                raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
+        marks = mask.tobytes()  # comparing bytes beats three numpy calls
+        if marks.strip(b"\0\1"):
             raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
-        if not legal.any():
+        if 1 not in marks:
             raise MaskError(f"the mask {shown(value)} leaves no legal action of {shown(space)}")
-        return legal.astype(np.int8)
+        return mask.astype(int8)
 
     return cast
 

@@ -172,22 +172,6 @@ class Agent:
         episode.pending = self
         return WAIT
 
-    def restrict(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, last: bool = False) -> None:
-        """Find out the legal actions of a call.
-
-        Raises:
-            MaskError: The mask does not fit the action space.
-        """
-        if self.point.legal is None:
-            return
-        try:
-            self.mask, self.choices = self.point.legal(args, kwargs)
-        except MaskError:
-            if not last:
-                raise
-            # At its end an agent is asked nothing more, and so nothing needs to be legal.
-            self.mask, self.choices = self.point.open_mask(), None
-
     def choose(self, action: Any) -> Any:
         """Turn a checked action into the choice that it stands for, in a box, or leave it to ``RULE``."""
         choices, self.choices = self.choices, None
@@ -195,35 +179,28 @@ class Agent:
             self.offered = choices
         return action if action is RULE else [choices[action]]
 
-    def learn_rule_action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """Find out which action a decision of the rule corresponds to.
-
-        Raises:
-            InvalidActionError: It is said to correspond to an action that is not in the action space.
-        """
-        offered, self.offered = self.offered, None
-        self.rule_action = self.point.rule_action(decision, args, kwargs, offered)
-        self.tells = self.point.tells and self.rule_action is not None
-
     # -- infos ------------------------------------------------------------------------------------
 
     def inform(self) -> dict[str, Any]:
         """Make the info of an observation: the time, the mask, the rule's action."""
-        info: dict[str, Any] = {} if self.clock is None else self._tell_time()
-        if self.mask is not None:
-            info[MASK] = duplicate(self.mask)
+        info: dict[str, Any] = {} if self.clock is None else self.tell_time()
+        mask = self.mask
+        if mask is not None:
+            info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
         if self.tells:
-            info["rule_action"], self.tells = duplicate(self.rule_action), False
+            action = self.rule_action
+            info["rule_action"] = action if type(action) is int else duplicate(action)
+            self.tells = False
         return info
 
     def unsee(self) -> None:
         """Have nothing to observe: no reward, and the info of any other agent of its point with all actions legal."""
         self.reward, self.present = 0.0, False
-        self.info = {} if self.clock is None else self._tell_time()
+        self.info = {} if self.clock is None else self.tell_time()
         if self.point.legal is not None:
             self.info[MASK] = self.point.open_mask()
 
-    def _tell_time(self) -> dict[str, Any]:
+    def tell_time(self) -> dict[str, Any]:
         """The simulation's time, and how much of it has gone by since the agent's decision before."""
         clock: Any = self.clock
         time, before = clock(), self.answered_at
@@ -245,8 +222,8 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
         ``RewardError``, ``ObservationError`` and ``MaskError``.
     """
     reward_mapping, observation_mapping, cast = point.reward_mapping, point.observation_mapping, point.cast
-    restricted, masked = point.legal is not None, bool(point.masked_parts)
-    quiet = not (restricted or point.tells)
+    legal, masked = point.legal, bool(point.masked_parts)
+    quiet = legal is None and not point.tells
 
     def settle(
         agent: Agent,
@@ -261,19 +238,30 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
             before, EVALUATING[here] = EVALUATING.get(here), agent
         try:
             if reward and agent.decided:
-                agent.reward = checked_reward(agent, reward_mapping(*args, **kwargs))
+                value = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
+                if type(value) is not float or value - value != 0.0:
+                    value = checked_reward(agent, value)
+                agent.reward = value
             elif reward and not last:  # nothing was done yet that could be rewarded
                 reward_mapping(*args, **kwargs)
                 agent.decided, agent.settle_again = True, again
             if observe:
                 first, agent.present = not agent.present, True
-                if restricted:
-                    agent.restrict(args, kwargs, last=last)
+                if legal is not None:
+                    try:
+                        agent.mask, agent.choices = legal(args, kwargs)
+                    except MaskError:
+                        if not last:
+                            raise
+                        # At its end an agent is asked nothing more, and so nothing needs to be legal.
+                        agent.mask, agent.choices = point.open_mask(), None
                 agent.info = {} if quiet and agent.clock is None else agent.inform()
                 if masked:
                     agent.observation = point.observe(args, kwargs, agent.mask)
                 else:
-                    agent.observation = cast(observation_mapping(*args, **kwargs))
+                    agent.observation = cast(
+                        observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args)
+                    )
                 if first and point.finite is not None:
                     point.finite(agent.observation)
         finally:
@@ -292,7 +280,7 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
             if type(reward) is not float or reward - reward != 0.0:
                 reward = checked_reward(agent, reward)
             agent.reward = reward
-            agent.info = {} if agent.clock is None else agent.inform()
+            agent.info = {} if agent.clock is None else agent.tell_time()
             agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
         finally:
             if here is not None:

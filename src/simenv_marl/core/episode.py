@@ -395,7 +395,7 @@ class Episode(Ending):
     def _decide_in_round(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Answer a decision of an agent of the user's with its action of the round, or wait for the next round."""
         if agent.point.legal is not None:
-            agent.restrict(args, kwargs)
+            agent.mask, agent.choices = agent.point.legal(args, kwargs)
         if self.clock is not None:
             agent.now = float(self.clock())
         return self._answer_in_round(agent)

@@ -144,7 +144,9 @@ class Told:
         agent = (episode.agents.get(name) or episode.answered.get(name)) if type(name) is str else None
         if agent is not None and agent.point is point:
             episode.latest = agent
-            agent.learn_rule_action(decision, call_args, call_kwargs)
+            offered, agent.offered = agent.offered, None
+            agent.rule_action = action = point.rule_action(decision, call_args, call_kwargs, offered)
+            agent.tells = point.tells and action is not None
 
 
 class Finished:

@@ -158,7 +158,8 @@ def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
         return None
 
     def check_numbers(observation: NDArray[Any]) -> None:
-        if not np.isfinite(observation[bounded]).all():
+        # As a rule all numbers are finite, which looking through bytes tells sooner than asking numpy.
+        if 0 in np.isfinite(observation).tobytes() and not np.isfinite(observation[bounded]).all():
             raise ObservationError(
                 f"the observation {shown(observation)} is not finite, where its space {shown(space)} is bounded"
             )

@@ -214,16 +214,16 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             if not self._padded:
                 self._dismiss(agent.name, terminated=True, truncated=False)
         if episode.over:
-            flags = {"terminated": episode.terminated, "truncated": episode.truncated}
+            terminated, truncated = episode.terminated, episode.truncated
             if self._padded:
                 for name in episode.ended:
-                    self._dismiss(name, **flags)
+                    self._dismiss(name, terminated=terminated, truncated=truncated)
             # Those that have never decided come last.
             for agent in sorted(episode.agents.values(), key=lambda agent: not agent.decided):
                 if agent.name not in self.rewards:
                     self._join(agent.name)
                 self._enter_reward(agent)
-                self._dismiss(agent.name, **flags)
+                self._dismiss(agent.name, terminated=terminated, truncated=truncated)
         self._leaving.reverse()
         if episode.pending is not None:
             self._select(episode.pending)

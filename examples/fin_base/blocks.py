@@ -121,10 +121,11 @@ class Entity:
     Attributes:
         world: Where it exists.
         number: Its id among those of its kind in this world.
+        name: Its name, which is unique in its world.
         cents: The money that it owns. Only the ledger changes it.
     """
 
-    __slots__ = ("__weakref__", "cents", "may_owe", "number", "world")
+    __slots__ = ("__weakref__", "cents", "may_owe", "name", "number", "world")
 
     kind: ClassVar[str] = "entity"
 
@@ -132,14 +133,10 @@ class Entity:
         """Come into existence, without money."""
         self.world = world
         self.number = world.next_id(self.kind)
+        self.name = f"{self.kind}_{self.number}"
         self.cents = 0
         self.may_owe = False
         world.entities[self.name] = self
-
-    @property
-    def name(self) -> str:
-        """Its name, which is unique in its world."""
-        return f"{self.kind}_{self.number}"
 
     def vanish(self, heir: Entity, reason: str = "estate") -> None:
         """Cease to exist.

@@ -32,6 +32,7 @@ from .policies import Constant, Linear
 
 YEARS: Final = 20
 CLIENTS: Final = 200
+LARGE: Final = 10_000
 
 HELD_OUT: Final = 1_000_000
 """Seeds from here on are for the comparison; all others may be learned from."""
@@ -250,7 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = run(options.out / "runs", worlds, contenders, options.seeds, options.workers)
     large = None
     if options.large:
-        rows = [{**HOME, "clients": 10_000}]
+        rows = [{**HOME, "clients": LARGE}]
         without_plans = {name: found[name] for name in ("trained pair", "trained premiums", "both trained")}
         large = run(options.out / "large", rows, without_plans, options.large, options.workers)
 

@@ -19,7 +19,7 @@ from .env import INDEXATIONS, MIXES, SURCHARGES
 from .law import INDEXING, MINIMUM, REQUIRED
 from .observations import OBSERVED, OF_A_CLIENT
 from .policies import USUAL
-from .study import FACTORS, HELD_OUT, HOME, INDEXER, MANAGER, POINTS, PREMIUM, Policies, world
+from .study import CLIENTS, FACTORS, HELD_OUT, HOME, INDEXER, LARGE, MANAGER, POINTS, PREMIUM, Policies, world
 
 COLOURS: Final = {
     "rule": "#8c8c8c",
@@ -72,6 +72,14 @@ def moved(table: Any) -> str:
     return _markdown(("who decides", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
 
 
+def sizes(at_home: Any, large: Any) -> str:
+    """By how much contenders are better than the rule in small and in large funds, on the same seeds."""
+    few = at_home[at_home.seed.isin(set(large.seed)) & at_home.contender.isin(set(large.contender))]
+    small, big = (_against_rule(own).summary("welfare") for own in (few, large))
+    rows = [(name, *(_difference(own.loc[name], "+.0f") for own in (small, big))) for name in big.index[1:]]
+    return _markdown((f"{len(set(large.seed))} seeds", f"{CLIENTS} clients", f"{LARGE:,} clients"), rows)
+
+
 def _against_rule(table: Any) -> Evaluation:
     order = {name: number for number, name in enumerate(COLOURS)}
     return Evaluation(table.sort_values("contender", key=lambda names: names.map(order), kind="stable"), "rule", 0.95)
@@ -107,7 +115,7 @@ def draw_worlds(table: Any) -> Figure:
         better, annot=told, fmt="", vmin=-most, vmax=most, cmap="BrBG", linewidths=1.5, ax=axes, cbar=False,
         annot_kws={"fontsize": 8},
     )  # fmt: skip
-    axes.set(xlabel="", ylabel="", title="welfare, more than the rule's: per cent of a year's income")
+    axes.set(xlabel="", ylabel=", ".join(FACTORS), title="welfare, more than the rule's: per cent of a year's income")
     axes.tick_params(left=False, bottom=False, labelrotation=0)
     return figure
 
@@ -132,17 +140,18 @@ def draw_learned(found: Mapping[str, Policies]) -> Figure:
         axes.set(xlabel="coverage", ylim=(-0.03, 1.03))
     mix.axvspan(0.8, MINIMUM, color="#f3e3e3", lw=0)
     by.axvspan(0.8, INDEXING, color="#f3e3e3", lw=0)
-    mix.set_title("in equities (red: no more risk than before)", fontsize=9)
-    by.set_title("of lawful indexation (red: none is lawful)", fontsize=9)
+    mix.set_title("share of equities (in the red: no increase)", fontsize=9)
+    by.set_title("share of full indexation (in the red: none)", fontsize=9)
     ages = np.arange(25, 67)
     for of, style in ((1.0, ":"), (1.2, "-"), (1.5, "--")):
         asked = [_surcharge(shared, int(age), of) for age in ages]
-        premium.plot(ages, asked, style, color=COLOURS["trained premiums"], label=f"trained, coverage {of:.0%}")
+        premium.plot(ages, asked, style, color=COLOURS["trained premiums"], label=f"coverage {of:.0%}")
     premium.axhline(1.05, color=COLOURS["rule"])
-    premium.set_title("premium, by what the accrual costs", fontsize=9)
+    premium.set_title("premium, divided by the cost of the accrual", fontsize=9)
     premium.set(xlabel="age")
+    mix.legend(fontsize=8, frameon=False)
+    premium.legend(fontsize=8, frameon=False, loc=(0.3, 0.1))
     for axes in (mix, by, premium):
-        axes.legend(fontsize=8, frameon=False)
         axes.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -175,11 +184,12 @@ def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
             years = range(1, len(middle) + 1)
             axes.fill_between(years, low, high, color=COLOURS[name], alpha=0.2, lw=0)
             axes.plot(years, middle, color=COLOURS[name], label=name)
-    rights.set_title("what a right buys, by first prices", fontsize=9)
+    rights.set_title("what a right buys, in prices of the first month", fontsize=9)
     coverages.set_title("coverage", fontsize=9)
     for axes in (rights, coverages):
         axes.yaxis.set_major_formatter(PercentFormatter(1))
         axes.set_xlabel("year")
+        axes.set_xticks(range(0, funds[0].years + 1, 5))
         axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)
         axes.spines[["top", "right"]].set_visible(False)
     rights.legend(fontsize=8, frameon=False)
@@ -205,7 +215,7 @@ def show(table: Any, large: Any, found: Mapping[str, Policies], folder: Path) ->
     at_home = table[(table[list(HOME)] == list(HOME.values())).all(axis=1)]
     texts = {"compared": compared(at_home), "worlds": everywhere(table), "moved": moved(table)}
     if large is not None:
-        texts["large"] = compared(large)
+        texts["sizes"] = sizes(at_home, large)
     for name, text in texts.items():
         (folder / f"pension-{name}.md").write_text(text, encoding="utf-8")
         print(text)

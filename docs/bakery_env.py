@@ -1,24 +1,10 @@
-"""The bakery's environments. Importing this module registers them."""
+"""The environments of the bakery. Importing this module registers them."""
 
 import numpy as np
 from bakery import Bakery
 from gymnasium import spaces
 
 from simenv_marl import SimulationInterface, difference, make_step, register_simulation
-
-
-class FourWeeks(SimulationInterface):
-    """Four weeks of a bakery."""
-
-    def reset(self, seed=None):
-        """Open it."""
-        self.shop = Bakery(seed)
-
-    def run(self):
-        """Let day after day go by."""
-        while self.shop.day < 28:
-            self.shop.update_day()
-
 
 batch = make_step(
     observation_space=spaces.Box(0, 100, (2,), np.float32),
@@ -38,8 +24,22 @@ price = make_step(
     agent="seller_0",
 )
 
-register_simulation(
-    FourWeeks,
-    {"bakery.Bakery.choose_batch": batch, "bakery.Bakery.set_price": price},
-    name="bakery",
-)
+decisions = {"bakery.Bakery.choose_batch": batch, "bakery.Bakery.set_price": price}
+
+
+class FourWeeks(SimulationInterface):
+    """Four weeks of a bakery."""
+
+    points = decisions
+
+    def reset(self, seed=None):
+        """Open a new bakery."""
+        self.shop = Bakery(seed)
+
+    def run(self):
+        """Simulate 28 days."""
+        while self.shop.day < 28:
+            self.shop.update_day()
+
+
+register_simulation(FourWeeks, name="bakery")

@@ -1,8 +1,8 @@
-"""A lake and its boats, written to understand a commons."""
+"""A model of fishing boats that share a lake."""
 
 
 class Boat:
-    """Goes out every year, and lives on what it brings home."""
+    """Goes fishing every year and lives on the income."""
 
     def __init__(self, lake, name):
         self.lake = lake
@@ -11,17 +11,17 @@ class Boat:
 
     def choose_catch(self):
         """Decide how many fish to take."""
-        return self.lake.fish // 8  # one part in eight
+        return self.lake.fish // 8  # an eighth of the stock
 
     def go_out(self):
-        """Fish for a year: going out costs 1, each fish earns 1."""
+        """Fish for a year. Going out costs 1, and each fish earns 1."""
         catch = min(self.choose_catch(), self.lake.fish)
         self.lake.fish -= catch
         self.cash += catch - 1
 
 
 class Lake:
-    """Has room for 20 fish, and for any number of boats."""
+    """Holds up to 20 fish and any number of boats."""
 
     def __init__(self):
         self.year = 0
@@ -32,21 +32,21 @@ class Lake:
         self.launch()
 
     def launch(self):
-        """One boat more."""
+        """Add a boat."""
         self.boats.append(Boat(self, f"boat_{self.launched}"))
         self.launched += 1
 
     def lay_up(self, boat):
-        """One boat less."""
+        """Remove a boat."""
         self.boats.remove(boat)
 
     def update_year(self):
-        """Let a year go by."""
+        """Simulate one year."""
         for boat in list(self.boats):
             boat.go_out()
             if boat.cash <= 0:
                 self.lay_up(boat)
         self.fish = min(20, self.fish + self.fish // 2)
-        if self.fish > 12:  # so many fish tempt somebody
+        if self.fish > 12:  # a large stock attracts another boat
             self.launch()
         self.year += 1

@@ -1,8 +1,15 @@
 """Configuration of the documentation; ``make docs`` builds it into ``docs/_build``."""
 
+import sys
+from pathlib import Path
+
 from docutils import nodes
 
 from simenv_marl import __version__
+
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent))
+from tools.notebooks import write_notebooks  # noqa: E402
 
 project = "simenv_marl"
 release = __version__
@@ -38,4 +45,5 @@ def _trim(app, doctree):
 
 def setup(app):
     """Called by Sphinx."""
+    app.connect("builder-inited", lambda app: write_notebooks(DOCS))
     app.connect("doctree-read", _trim)

@@ -1,0 +1,105 @@
+"""Notebooks of pages: the same text and the same code, with the outputs that the page shows.
+
+``docs/conf.py`` calls ``write_notebooks`` when the pages are built. The tests run the code of the pages and of the
+notebooks.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from doctest import DocTestParser
+from pathlib import Path
+from typing import Any
+
+PAGES = ("tutorial", "many-agents", "planning")
+"""The pages that have a notebook."""
+
+FENCE = re.compile(r"^```(\S+)([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[([^]]*)\]\(([\w-]+\.md)?(?:#[\w-]+)?\)")
+DOWNLOAD = re.compile(r"\{download\}`([\w.]+)`")
+NOTEBOOK = re.compile(r"\n[^\n]*\{download\}`[^`]*\.ipynb>`[^\n]*\n")
+
+
+def write_notebooks(docs: Path) -> None:
+    """Write a notebook of each of ``PAGES`` into ``_notebooks``.
+
+    Args:
+        docs: The folder of the pages.
+    """
+    folder = docs / "_notebooks"
+    folder.mkdir(exist_ok=True)
+    for page in PAGES:
+        text = json.dumps(notebook(docs, page), indent=1) + "\n"
+        (folder / f"{page}.ipynb").write_text(text, encoding="utf-8")
+
+
+def notebook(docs: Path, page: str) -> dict[str, Any]:
+    """Make the notebook of a page.
+
+    Args:
+        docs: The folder of the pages.
+        page: The name of the page.
+
+    Returns:
+        The notebook, in format 4.5.
+    """
+    cells = []
+    for number, cell in enumerate(_cells(docs, NOTEBOOK.sub("\n", (docs / f"{page}.md").read_text(encoding="utf-8")))):
+        cells.append(cell | {"id": f"{page}-{number}", "metadata": cell.get("metadata", {})})
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    return {"cells": cells, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
+
+
+def _cells(docs: Path, text: str) -> Iterator[dict[str, Any]]:
+    """The cells of a page, in its order; a file that the page needs is written by a cell before its first use."""
+    position, written = 0, set[str]()
+    for found in [*FENCE.finditer(text), None]:
+        prose = text[position : found.start() if found else None].strip()
+        if prose:
+            yield {"cell_type": "markdown", "source": _prose(docs, prose)}
+        files = set(DOWNLOAD.findall(prose))
+        if found and found[1] == "{literalinclude}":
+            files.add(found[2].strip())
+        for file in sorted(files - written):
+            source = (docs / file).read_text(encoding="utf-8")
+            yield _code(f"%%writefile {file}\n{source.rstrip()}")
+        written |= files
+        if found and found[1] == "python":
+            yield from _examples(found[3])
+        position = found.end() if found else len(text)
+
+
+def _prose(docs: Path, text: str) -> str:
+    """Replace what only the pages know: links to other pages, and files to download."""
+
+    def title(link: re.Match[str]) -> str:
+        if link[1] or not link[2]:
+            return link[1]
+        heading, _ = (docs / link[2]).read_text(encoding="utf-8").split("\n", 1)
+        return f"*{heading.removeprefix('# ')}*"
+
+    return DOWNLOAD.sub(r"`\1`", LINK.sub(title, text))
+
+
+def _examples(session: str) -> Iterator[dict[str, Any]]:
+    """The cells of a session: each ends where the session shows an output."""
+    sources: list[str] = []
+    for example in DocTestParser().get_examples(session):
+        sources.append(example.source)
+        if example.exc_msg is not None:
+            kind, _, message = example.exc_msg.strip().partition(": ")
+            trace = [example.want]
+            error = {"output_type": "error", "ename": kind, "evalue": message, "traceback": trace}
+            yield _code("".join(sources), error) | {"metadata": {"tags": ["raises-exception"]}}
+            sources = []
+        elif example.want:
+            yield _code("".join(sources), {"output_type": "stream", "name": "stdout", "text": example.want})
+            sources = []
+    if sources:
+        yield _code("".join(sources))
+
+
+def _code(source: str, *outputs: dict[str, Any]) -> dict[str, Any]:
+    return {"cell_type": "code", "source": source.rstrip("\n"), "outputs": list(outputs), "execution_count": None}

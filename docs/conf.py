@@ -14,9 +14,9 @@ from tools.notebooks import write_notebooks  # noqa: E402
 project = "simenv_marl"
 release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "sphinx_design"]
 exclude_patterns = ["_build", "figures", "_clients_*"]  # figures and clients are parts of pages
-myst_enable_extensions = ["deflist"]
+myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 
 add_module_names = False
@@ -26,6 +26,9 @@ autodoc_typehints_description_target = "documented_params"
 napoleon_attr_annotations = False
 napoleon_numpy_docstring = False
 python_use_unqualified_type_names = True
+
+copybutton_prompt_text = r">>> |\.\.\. |\$ "  # copied is what is typed, without prompts and output
+copybutton_prompt_is_regexp = True
 
 html_theme = "furo"
 html_title = f"simenv_marl {release}"

@@ -309,6 +309,26 @@ def test_many_single_views_for_stable_baselines3():
         each.close()
 
 
+def test_what_options_say_in_place_of_wrappers():
+    common, before, after = page.blocks("coming-from-supersuit.md")
+    told = []
+    for code in (before, after):
+        names = {}
+        exec(common, names)
+        exec(code, names)
+        env, drawn = names["env"], np.random.default_rng(3)
+        told.append([env.reset(seed=1)[0]])
+        while env.agents:
+            actions = {name: drawn.uniform(-0.5, 1.0, 1).astype(np.float32) for name in names["names"]}
+            observations, rewards, *_ = env.step({agent: actions[agent] for agent in env.agents})
+            alive = {boat.name for boat in env.unwrapped.simulation.boats}
+            told[-1].append(({name: observations[name] for name in sorted(alive)}, rewards))
+    wrapped, ours = told
+    assert alike(wrapped[: len(ours)], ours)
+    assert 3 < len(ours) == len(wrapped) - 1  # black_death_v3 notices the end a step later
+    assert min(rewards["boat_0"] for _, rewards in ours[1:]) == -0.5
+
+
 def test_the_page(monkeypatch):
     (names,) = page.steps("SuperSuit", monkeypatch)
     assert names["observations"].shape == (4, 6)

@@ -1,0 +1,100 @@
+"""The pages that a newcomer meets first: their code runs, and what they quote is what the library says."""
+
+import ast
+import builtins
+import random
+import re
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+from examples.greenhouse_coop import model
+
+import simenv_marl
+
+from .clients import page
+
+SOURCES = Path(simenv_marl.__file__).parent
+
+
+def run(code, **names):
+    exec(code, names)
+    return names
+
+
+def test_the_front_page():
+    (code,) = page.blocks("index.md")
+    env = run(code)["env"]
+    assert env.reset(seed=1)[0] == [5.0]
+    rewards = [env.step(action)[1] for action in (1, 1, 0, 1, 1)]
+    assert rewards == [-1.0, -2.0, -1.0, -2.0, -3.0]
+
+
+# -- coming from elsewhere ------------------------------------------------------------------------
+
+
+def turns(env, seed):
+    """What is told in an episode of random actions, turn by turn."""
+    actions, told = random.Random(seed), []
+    env.reset(seed=seed)
+    for agent in env.agent_iter():
+        observation, reward, terminated, truncated, _ = env.last()
+        told.append((agent, observation.tolist(), reward, terminated, truncated))
+        env.step(None if terminated or truncated else actions.randrange(4))
+    return told
+
+
+def test_a_hand_written_environment_and_its_successor_tell_the_same():
+    before, after = map(run, page.blocks("coming-from-pettingzoo.md"))
+    told = [turns(before["StallEnv"](), seed) for seed in range(20)]
+    assert told == [turns(after["env"], seed) for seed in range(20)]
+    assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
+
+
+def test_the_environment_of_the_paper_in_todays_words(monkeypatch):
+    monkeypatch.setitem(sys.modules, "model", model)
+    _, after = page.blocks("coming-from-sim-env.md")
+    names = run(after)
+    assert names["terminated"]
+    assert names["alive"](names["env"].simulation.greenhouse) == 0
+    assert -1 <= names["reward"] <= 1
+
+
+# -- errors by their text -------------------------------------------------------------------------
+
+
+@cache
+def messages():
+    """The texts in the sources, with an ellipsis in place of what is filled in."""
+    texts = []
+    for path in SOURCES.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                texts.append("".join(str(p.value) if isinstance(p, ast.Constant) else "..." for p in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    return texts
+
+
+def quoted():
+    """The texts that stand as headings on the page."""
+    text = (page.DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    return re.findall(r"^### (.+)$", text, re.MULTILINE)
+
+
+def test_there_are_errors_to_be_looked_up():
+    assert len(quoted()) >= 20
+
+
+@pytest.mark.parametrize("text", quoted())
+def test_what_the_page_quotes_is_what_the_library_says(text):
+    parts = [re.escape(part.strip()) for part in text.replace("`", "").split("...")]
+    pattern = re.compile(".*".join(parts), re.DOTALL)
+    assert any(pattern.search(message) for message in messages()), text
+
+
+def test_the_page_names_errors_that_there_are():
+    text = (page.DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([A-Z]\w+Error)`", text))
+    assert {name for name in named if not hasattr(builtins, name)} <= set(simenv_marl.errors.__all__)

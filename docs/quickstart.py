@@ -1,4 +1,4 @@
-"""From a model to PPO in one file. It needs ``pip install simenv-marl stable-baselines3``."""
+"""From a model to PPO, in one file. Needs simenv-marl and stable-baselines3."""
 
 from random import Random
 
@@ -37,7 +37,7 @@ class Quarter:
 
 
 points = {
-    Shop.choose_order: make_step(  # what the agent observes, what it may do, what it earns
+    Shop.choose_order: make_step(  # what the agent observes, does and earns
         observation_space=Box(0, 100, (1,)),
         observation_space_mapping=lambda shop: [shop.stock],
         action_space=Discrete(5),
@@ -49,9 +49,12 @@ points = {
 
 if __name__ == "__main__":
     env = single_env(Quarter, points)  # a gymnasium.Env
-    ppo = PPO("MlpPolicy", env, learning_rate=1e-3, gamma=0.9, n_steps=900, batch_size=90, device="cpu", seed=0)
+    ppo = PPO("MlpPolicy", env, learning_rate=1e-3, gamma=0.9, seed=0)
     ppo.learn(20_000)
-    learned = {"buyer_0": lambda observation: ppo.predict(observation, deterministic=True)[0]}
-    for name, policies in {"rule": {}, "PPO": learned}.items():  # on the same ten quarters
-        cash = [simulate(Quarter, policies, points=points, seed=seed).shop.cash for seed in range(10)]
-        print(f"{name:4} earns {sum(cash) / 10:.0f} a quarter")
+
+    def buy(observation):
+        return ppo.predict(observation, deterministic=True)[0]
+
+    for name, policies in {"rule": {}, "PPO": {"buyer_0": buy}}.items():
+        ends = [simulate(Quarter, policies, points=points, seed=n) for n in range(100, 110)]
+        print(f"{name:4} earns {sum(end.shop.cash for end in ends) / 10:.0f} a quarter")

@@ -1,6 +1,11 @@
 """Settings of the tests with real learners."""
 
+import sys
+from pathlib import Path
+
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))  # the models of the pages
 
 torch = pytest.importorskip("torch")
 

@@ -2,6 +2,7 @@
 
 import os
 import random
+import sys
 
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 
@@ -12,6 +13,7 @@ import torch
 from examples.greenhouse_coop.env import parallel_env as parallel_greenhouse
 from examples.greenhouse_coop.env import raw_env as aec_greenhouse
 from examples.greenhouse_coop.env import watering_env
+from hive import BEES, DEFINITION, MASK_OBSERVED, Bee, HiveSim, points
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
@@ -24,8 +26,7 @@ from ray.tune.registry import register_env
 from simenv_marl import aec_env, parallel_env, simulate
 
 from . import commands
-from .hive import BEES, DEFINITION, MASK_OBSERVED, Bee, HiveSim, points
-from .page import blocks
+from .page import DOCS, blocks
 
 HELD_OUT = range(10_000, 10_010)
 GREENHOUSES = {
@@ -144,47 +145,54 @@ TAKE_OUT = """
 import sys
 from tests.clients.page import blocks
 names = {"checkpoint": sys.argv[1]}
-for code in blocks("_clients_rllib.md")[3:]:
-    exec(code, names)
-print(names["greenhouse"].day, names["greenhouse"].water_use)
+code = blocks("_clients_rllib.md")
+for part in (code[1], *code[4:]):
+    exec(part, names)
+print(names["shop"].cash)
 """
 
 
+def in_the_bakery(names):
+    """The mean cash in the end when the page's policies decide in turns, over seeds that none has seen."""
+    shops = [simulate(names["FourWeeks"], names["policies"], points=names["points"], seed=seed) for seed in HELD_OUT]
+    return np.mean([shop.shop.cash for shop in shops])
+
+
 def test_the_pages_code_trains_two_agents_and_takes_their_policies_out():
-    _, build, train, define, take_out = blocks("_clients_rllib.md")
+    _, spaces, build, train, define, take_out = blocks("_clients_rllib.md")
     names = {"__name__": "__main__"}
-    exec(define, names)
-    exec(build, names)
+    for code in (spaces, build, define):
+        exec(code, names)
     algorithm = names["algorithm"]
     early = algorithm.save_to_path()
     exec(train, names)
     trained, names["checkpoint"] = names["checkpoint"], early
     exec(take_out, names)
-    before = in_the_greenhouse(names["policies"])
+    before = in_the_bakery(names)
     names["checkpoint"] = trained
     exec(take_out, names)
     policies = names["policies"]
-    after = in_the_greenhouse(policies)
-    live = in_the_greenhouse({agent: names["policy_of"](algorithm.get_module(agent)) for agent in policies})
+    after = in_the_bakery(names)
+    names["policies"] = {agent: names["policy_of"](algorithm.get_module(agent)) for agent in policies}
+    live = in_the_bakery(names)
     algorithm.stop()
     assert live == after
-    assert after > before + 5
+    assert after > before + 150
     # The model's own loop runs just as the environment's in which one decides after the other.
-    env = aec_greenhouse()
+    env = aec_env(names["FourWeeks"], names["points"])
     env.reset(seed=1)
     while not any(env.terminations.values()) and not any(env.truncations.values()):
         env.step(policies[env.agent_selection](env.observe(env.agent_selection)))
-    assert names["greenhouse"].day == env.simulation.greenhouse.day
-    assert names["greenhouse"].water_use == env.simulation.greenhouse.water_use > 0
-    elsewhere = commands.python("-c", TAKE_OUT, names["checkpoint"]).split()
-    assert elsewhere[-2:] == [str(names["greenhouse"].day), str(names["greenhouse"].water_use)]
+    assert names["shop"].cash == env.simulation.shop.cash
+    elsewhere = commands.python("-c", TAKE_OUT, names["checkpoint"], PYTHONPATH=os.pathsep.join([str(DOCS), *sys.path]))
+    assert elsewhere.split()[-1] == str(names["shop"].cash)
 
 
 @pytest.fixture
 def policy_of():
     """The function on the page."""
     names = {"__name__": "__main__"}
-    exec(blocks("_clients_rllib.md")[3], names)
+    exec(blocks("_clients_rllib.md")[4], names)
     return names["policy_of"]
 
 

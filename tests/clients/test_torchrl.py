@@ -5,11 +5,11 @@ import pytest
 import torch
 from examples.greenhouse_coop import env as greenhouse
 from gymnasium import spaces
+from hive import BEES, DEFINITION, MASKED, Hive, HiveSim, points
 from torchrl.envs import ExplorationType, GymWrapper, PettingZooWrapper, check_env_specs, set_exploration_type
 
 from simenv_marl import RULE, aec_env, parallel_env, simulate
 
-from .hive import BEES, DEFINITION, MASKED, Hive, HiveSim, points
 from .page import blocks
 
 HELD_OUT = range(10_000, 10_020)

@@ -1,6 +1,6 @@
-"""A hive whose bees are born and die: agents that learners with fixed rosters find hardest.
+"""A hive whose bees are born and die, and its environments: learners with fixed rosters find such agents hardest.
 
-The model has a loop, a clock and rules of its own. Nothing blossoms in some of the meadows, which masks can tell.
+The model has a loop, a clock and rules of its own. Some meadows have no nectar; action masks exclude these.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ DEFINITION: dict[str, Any] = {
     "action_space_mapping": int,
     "reward_mapping": lambda bee: bee.brought,
     "agent": lambda bee: bee.name,
-    "removed_by": {"tests.clients.hive.Hive.lose": lambda hive, bee: bee.name},
+    "removed_by": {"hive.Hive.lose": lambda hive, bee: bee.name},
 }
 MASKED = DEFINITION | {"action_mask_mapping": lambda bee: [nectar > 0 for nectar in bee.hive.nectar]}
 MASK_OBSERVED = MASKED | {  # by those names for RLlib

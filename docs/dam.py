@@ -1,4 +1,4 @@
-"""A dam that speaks the wire, in as few lines as that takes. It stands for a simulator in any language."""
+"""A dam that uses the wire protocol, in few lines. It represents a simulator in any language."""
 
 import json
 import os
@@ -7,11 +7,11 @@ import sys
 
 
 class Stopped(BaseException):
-    """The environment wants no more of this episode."""
+    """The environment has abandoned this episode."""
 
 
 def run(decide, seed, days):
-    """The model: how much water is let out is decided every day."""
+    """Run the model: every day, it decides how much water to let out."""
     weather, level = random.Random(seed), 50.0
     for day in range(days):
         level += weather.uniform(0, 10)
@@ -26,7 +26,7 @@ def plain_rule(point, entity, time, args, rule):
 
 
 def speak(reading, writing):
-    """Play one episode after the other to an environment."""
+    """Run one episode after the other for an environment."""
 
     def send(frame):
         writing.write(json.dumps(frame) + "\n")

@@ -19,7 +19,7 @@ BEES = [f"bee_{number}" for number in range(4)]
 
 
 class Bee:
-    """Flies out every day, and lives on what it brings home."""
+    """A bee: flies out every day, and lives on the nectar that it brings home."""
 
     def __init__(self, hive: Hive, number: int) -> None:
         self.hive, self.name = hive, f"bee_{number}"
@@ -27,15 +27,15 @@ class Bee:
         self.brought = 0.0
 
     def observed(self) -> list[float]:
-        """What it knows when it decides: the nectar of each meadow, and how strong it is."""
+        """Observe the nectar of each meadow, and the bee's strength."""
         return [*self.hive.nectar, self.strength / 5]
 
     def choose_meadow(self) -> int:
         """Decide where to fly."""
-        return next(number for number in range(MEADOWS) if self.hive.nectar[number])  # the nearest where there is any
+        return next(number for number in range(MEADOWS) if self.hive.nectar[number])  # the nearest with nectar
 
     def fly(self) -> None:
-        """Spend a day."""
+        """Fly to a meadow; become stronger or weaker, according to its nectar."""
         self.brought = self.hive.nectar[self.choose_meadow()]
         self.strength = min(self.strength + (1 if self.brought > 0.5 else -1), 5)
         if self.strength == 0:
@@ -43,7 +43,7 @@ class Bee:
 
 
 class Hive:
-    """Has room for four bees in its time, of which one is there at the beginning."""
+    """A hive with one bee at first; at most four bees hatch in all."""
 
     def __init__(self, seed: int | None) -> None:
         self.random = Random(seed)
@@ -53,7 +53,7 @@ class Hive:
         self.dawn()
 
     def dawn(self) -> None:
-        """Let the meadows blossom anew; on every other day a bee hatches."""
+        """Draw the nectar of the meadows; on every other day, a bee hatches."""
         self.nectar = [self.random.random() if self.random.random() < 0.8 else 0.0 for _ in range(MEADOWS)]
         self.nectar[self.random.randrange(MEADOWS)] = self.random.uniform(0.2, 1.0)
         if self.day % 2 == 0 and self.hatched < len(BEES):
@@ -61,11 +61,11 @@ class Hive:
             self.hatched += 1
 
     def lose(self, bee: Bee) -> None:
-        """Do without a bee from now on."""
+        """Remove a dead bee."""
         self.bees.remove(bee)
 
     def update_day(self) -> None:
-        """Let a day go by."""
+        """Simulate one day."""
         for bee in list(self.bees):
             bee.fly()
         self.day += 1
@@ -73,14 +73,14 @@ class Hive:
 
 
 class HiveSim(SimulationInterface):
-    """Twelve days of a hive, or fewer where no bee is left."""
+    """Twelve days of a hive; the episode ends earlier if no bee is left."""
 
     def reset(self, seed: int | None = None) -> None:
-        """Found a new hive."""
+        """Start with a new hive."""
         self.hive = Hive(seed)
 
     def run(self) -> Any:
-        """Let day after day go by."""
+        """Simulate day after day."""
         while self.hive.day < DAYS:
             self.hive.update_day()
             if not self.hive.bees:
@@ -88,19 +88,19 @@ class HiveSim(SimulationInterface):
         return TRUNCATED
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """All bees are going to fly."""
+        """Announce that all bees are going to decide."""
         return [(bee,) for bee in self.hive.bees]
 
     def time(self) -> float:
-        """The day."""
+        """Return the day."""
         return float(self.hive.day)
 
     def state(self) -> list[float]:
-        """All meadows, and the day."""
+        """Return the nectar of all meadows, and the day."""
         return [*self.hive.nectar, self.hive.day / DAYS]
 
 
-# What there is to be learnt: fly to where the most nectar is.
+# The task: fly to the meadow with the most nectar.
 DEFINITION: dict[str, Any] = {
     "observation_space": spaces.Box(0, 1, (MEADOWS + 1,), np.float32),
     "observation_space_mapping": Bee.observed,
@@ -111,7 +111,7 @@ DEFINITION: dict[str, Any] = {
     "removed_by": {"hive.Hive.lose": lambda hive, bee: bee.name},
 }
 MASKED = DEFINITION | {"action_mask_mapping": lambda bee: [nectar > 0 for nectar in bee.hive.nectar]}
-MASK_OBSERVED = MASKED | {  # by those names for RLlib
+MASK_OBSERVED = MASKED | {  # RLlib needs these keys
     "observation_space": spaces.Dict(
         {
             "observations": spaces.Box(0, 1, (MEADOWS + 1,), np.float32),
@@ -123,5 +123,5 @@ MASK_OBSERVED = MASKED | {  # by those names for RLlib
 
 
 def points(definition: dict[str, Any] = MASKED) -> dict[Any, Any]:
-    """The bees' decision point under one of the definitions above."""
+    """Return the bees' decision point, with one of the definitions above."""
     return {Bee.choose_meadow: make_step(**definition)}

@@ -44,26 +44,26 @@ class Training:
     """A training run, as a simulation.
 
     Attributes:
-        found: What the trained waterer is worth beside the model's rule: the row of ``Evaluation.summary``.
+        found: The comparison of the trained waterer with the model's rule: a row of ``Evaluation.summary``.
     """
 
     def __init__(self, days: int, held_out: int = HELD_OUT, **settings: Any) -> None:
-        """Take the factors.
+        """Store the factors.
 
         Args:
-            days: For how long it trains.
-            held_out: The first of the 16 seeds on which it is judged.
-            **settings: Of PPO.
+            days: The length of the training.
+            held_out: The first of the 16 seeds of the evaluation.
+            **settings: Settings of PPO.
         """
         self.days, self.held_out, self.settings = days, held_out, settings
 
     def reset(self, seed: int | None = None) -> None:
-        """Make a learner that knows nothing."""
+        """Make an untrained learner."""
         env = RescaleAction(watering_env(), np.float32(-1), np.float32(1))
         self.model = PPO("MlpPolicy", env, n_steps=250, batch_size=125, seed=seed, **self.settings)
 
     def run(self) -> None:
-        """Train it, and judge it beside the rule, where both meet the same weather."""
+        """Train the learner, and compare it with the rule in the same weather."""
         self.model.learn(self.days)
         contenders = {"rule": {}, "trained": {"waterer_0": self.decide}}
         seeds = range(self.held_out, self.held_out + 16)
@@ -71,7 +71,7 @@ class Training:
         self.found = judged.summary().loc["trained"]
 
     def decide(self, observation: Any) -> Any:
-        """What it has learnt."""
+        """Return the learned action."""
         return (self.model.predict(observation, deterministic=True)[0] + 1) / 2
 
 
@@ -80,9 +80,9 @@ GAIN: Final = {
     "gain_low": lambda training: training.found["difference_low"],
     "gain_high": lambda training: training.found["difference_high"],
 }
-"""By how much it does better than the rule, with the interval over the seeds on which it was judged."""
+"""The gain over the rule, with its interval over the seeds of the evaluation."""
 
-# It seeds the process's generators, as learners do: with global_rng=True each training has generators of its own.
+# Learners seed the process's global generators; with global_rng=True each training has generators of its own.
 experiment = partial(run_experiment, Training, metric=GAIN, global_rng=True)
 
 
@@ -93,25 +93,25 @@ def sweep(folder: Path, days: int, seeds: Sequence[int] = SEEDS, workers: int = 
 
 
 def search(folder: Path, days: int, trials: int, seeds: Sequence[int] = SEEDS) -> optuna.Study:
-    """Let Optuna look for better settings between those that were swept."""
+    """Let Optuna search for better settings within the range of the sweep."""
 
     def objective(trial: optuna.Trial) -> float:
         rate = trial.suggest_float("learning_rate", 3e-4, 1e-2, log=True)
         gamma = trial.suggest_float("gamma", 0.5, 0.99)
         found = []
-        for step, seed in enumerate(seeds):  # one training may be luck
+        for step, seed in enumerate(seeds):  # a single training may be lucky
             found.append(simulate(Training(days, learning_rate=rate, gamma=gamma), seed=seed, global_rng=True).found)
             mean = float(np.mean([own["difference"] for own in found]))
             trial.set_user_attr("intervals", [[own["difference_low"], own["difference_high"]] for own in found])
             trial.report(mean, step)
-            if trial.should_prune():  # no need to train again with what has done worse than most
+            if trial.should_prune():  # do not train again with settings that are worse than most
                 raise optuna.TrialPruned
         return mean
 
     storage = f"sqlite:///{folder / 'search.db'}"
     name = f"{days} days, {len(seeds)} seeds"
     study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True, direction="maximize")
-    study.sampler = optuna.samplers.TPESampler(seed=len(study.trials))  # resumed, it does not draw the same again
+    study.sampler = optuna.samplers.TPESampler(seed=len(study.trials))  # so that a resumed search draws other settings
     done = len(study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED)))
     study.optimize(objective, n_trials=max(0, trials - done))
     return study

@@ -109,7 +109,7 @@ class Sender {
 
     void TimedOut() { Decide(true); }
 
-    /// Judges the present rate by the packets that were sent at it, and changes it.
+    /// Evaluates the present rate by the packets that were sent at it, and changes it.
     void Decide(bool timer) {
         const double now = Simulator::Now().GetSeconds();
         try {
@@ -117,7 +117,7 @@ class Sender {
                 POINT, m_name, [&] { return State(timer); }, [&] { return Rule(timer); }, now);
             m_rate = std::min(std::max(m_rate * factor, LOWEST_RATE), HIGHEST_RATE);
         } catch (const simenv::Stop&) {
-            return Simulator::Stop();  // and not on through ns-3, which frees an event only where that returns
+            return Simulator::Stop();  // not through ns-3, which frees an event only after it returns
         }
         m_record.Add(m_rate);
         m_decided = now;
@@ -127,10 +127,10 @@ class Sender {
         m_timer = Simulator::Schedule(Seconds(PATIENCE + 3 * m_rtt), &Sender::TimedOut, this);
     }
 
-    /// By what to multiply the rate, as TCP has it: half of it after a loss, else one packet more for each round trip.
+    /// The factor of TCP's rule: half the rate after a loss, otherwise one more packet for each round trip.
     double Rule(bool timer) const { return Loss(timer) > 0 ? 0.5 : 1 + 8 * PACKET / m_rtt / m_rate; }
 
-    /// Which share of the packets is lost that were sent at the present rate.
+    /// The share of lost packets among those sent at the present rate.
     double Loss(bool timer) const { return timer ? 1.0 : m_lost ? double(m_lost) / (m_lost + m_arrived) : 0.0; }
 
     simenv::Json State(bool timer) const {

@@ -101,7 +101,7 @@ def go(action: Any, sheep: Any) -> None:
 
 
 def sheep_moves(sight: int = SIGHT) -> Definition:
-    """Define what sheep decide that see so and so far."""
+    """Define the decision of sheep that see ``sight`` steps far."""
     return make_step(
         observation_space=Box(-1.0, np.inf, (1 + 3 * len(cells(sight)),), np.float32),
         observation_space_mapping=lambda sheep: look(sheep, sight),
@@ -109,7 +109,7 @@ def sheep_moves(sight: int = SIGHT) -> Definition:
         apply=go,
         reward_mapping=lambda sheep: 1.0,
         agent=lambda sheep: f"sheep_{sheep.unique_id}",
-        removed_by="mesa.agent.Agent.remove",  # whether it has starved or was eaten
+        removed_by="mesa.agent.Agent.remove",  # called for sheep that starve or are eaten
     )
 
 

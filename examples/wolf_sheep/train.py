@@ -96,14 +96,14 @@ class Herd:
         self._generator = torch.Generator().manual_seed(seed)
 
     def explore(self, observations: NDArray[np.float32]) -> tuple[Any, dict[str, Any]]:
-        """Draw the actions of many sheep, and tell how likely each was."""
+        """Draw the actions of many sheep; also return the log-probability of each."""
         with torch.no_grad():
             likely = self.logits(torch.from_numpy(observations)).log_softmax(-1)
             actions = torch.multinomial(likely.exp(), 1, generator=self._generator)
             return actions[:, 0], {"log_prob": likely.gather(1, actions)[:, 0]}
 
     def decide(self, observations: NDArray[np.float32]) -> Any:
-        """The likeliest actions of many sheep."""
+        """Return the most likely actions of many sheep."""
         with torch.no_grad():
             return self.logits(torch.from_numpy(observations)).argmax(-1)
 
@@ -126,9 +126,9 @@ class Herd:
 
 
 def tensors(found: Trajectories) -> Any:
-    """What was lived through, as TorchRL has it: ``done`` where a trajectory ends, ``terminated`` where by death.
+    """Convert trajectories for TorchRL: ``done`` where a trajectory ends, ``terminated`` where it ends by death.
 
-    Rewards are scaled so that an endless life is worth 1.
+    Rewards are scaled so that the value of an endless life is 1.
     """
 
     def column(values: NDArray[Any]) -> Any:
@@ -176,7 +176,7 @@ class Learner:
         self._generator = torch.Generator().manual_seed(seed)
 
     def learn(self, found: Trajectories) -> None:
-        """Learn from what was lived through with ``Herd.explore``."""
+        """Update the policy from trajectories that ``Herd.explore`` has collected."""
         rows = tensors(found)
         with torch.no_grad():
             self._advantage(rows)

@@ -8,12 +8,16 @@ import pytest
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = (
     "tutorial", "concepts", "how-to", "options", "rounds", "vector", "many-agents", "extensions", "variants",
-    "checking", "branches", "planning",
+    "checking", "branches", "planning", "clients", "looking", "demonstrations", "experiments", "sweeps", "outside",
+    "clients-cpp", "c-callbacks", "energyplus", "contributing", "wolf-sheep", "many-simulations", "speed", "wire",
+    "shared-policy", "planning-experiments",
 )  # fmt: skip
 
 
 def code_of(page):
     text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    parts = re.compile(r"^```\{include\} (_\w+\.md)\n```$", re.MULTILINE)
+    text = parts.sub(lambda part: (DOCS / part[1]).read_text(encoding="utf-8"), text)
     return text, "".join(re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL))
 
 

@@ -42,6 +42,27 @@ def test_nothing_is_wrong_with_a_simulator_that_does_well():
     assert check_wire(command("1"), timeout=10).ok  # one episode for each process
 
 
+EXITS_AFTER_STOP = """
+decide = outside.Wire.decide
+def exits(*call):
+    try:
+        return decide(*call)
+    except outside.Stopped:
+        sys.exit({code})
+outside.Wire.decide = exits
+"""
+
+
+def test_a_simulator_may_exit_after_a_stop(tmp_path):
+    report = check_wire(changed(tmp_path, EXITS_AFTER_STOP.format(code=0)))
+    assert report.ok, str(report)
+    stops = {tried: verdict for tried, verdict in found(report).items() if tried.startswith("stop")}
+    assert len(stops) == 3
+    assert set(stops.values()) == {"note"}
+    report = check_wire(changed(tmp_path, EXITS_AFTER_STOP.format(code=0)), decisions=5)  # the first is broken off, too
+    assert found(report)["two episodes in a row with the same seed"] == "note"
+
+
 def test_an_episode_that_does_not_end_is_broken_off():
     report = check_wire(command(), options={"hours": 10_000}, decisions=20)
     assert report.ok
@@ -63,6 +84,15 @@ def test_an_episode_that_does_not_end_is_broken_off():
             "def keep(self):\n    global wire\n    wire = self\n    init(self)\n"
             "outside.Wire.__init__, outside.Stopped = keep, Stopped",
             "stop in place of the answer to call 1",
+        ),
+        (EXITS_AFTER_STOP.format(code=3), "stop in place of the answer to call 1"),
+        (  # in the middle of the second episode, and with 0
+            "decide, calls = outside.Wire.decide, []\n"
+            "def exits(*call):\n"
+            "    calls.append(call)\n"
+            "    return sys.exit() if len(calls) == 30 else decide(*call)\n"
+            "outside.Wire.decide = exits",
+            "two episodes in a row with the same seed",
         ),
         (
             "receive = outside.Wire.receive\n"
@@ -86,14 +116,16 @@ def test_an_episode_that_does_not_end_is_broken_off():
             "receive = outside.Wire.receive\n"
             "def waits(self):\n"
             "    try:\n        return receive(self)\n"
-            "    except SystemExit:\n        time.sleep(60)\n"
+            "    except SystemExit:\n"
+            "        if sys._getframe(1).f_code.co_name == 'play':\n            time.sleep(60)\n"
+            "        raise\n"
             "outside.Wire.receive = waits",
             "the input's end between episodes",
         ),
     ],
 )
 def test_what_is_wrong_is_found(tmp_path, change, tried):
-    report = check_wire(changed(tmp_path, change), timeout=3.0)
+    report = check_wire(changed(tmp_path, change), timeout=10.0)
     assert not report.ok
     assert found(report)[tried] == "wrong", str(report)
 

@@ -152,9 +152,11 @@ class _Check:
         child.send(_padded(self._start, pad))
         while True:
             frame = child.receive()
+            child.may_exit = False
             frames.append(frame)
             if "end" in frame:
                 child.check_end(frame["end"])
+                child.may_exit = True
                 return frames
             if "decide" not in frame:
                 if "error" in frame:
@@ -169,6 +171,7 @@ class _Check:
             child.check_named(frame, frame.get("entity"))
             if number == stop or number == self._most:
                 child.send(STOP)
+                child.may_exit = True
                 return frames
             before = encode({"reseed": reseed[1]}) if number == reseed[0] else b""
             child.send(before + _padded(encode({"act": number, "rule": True}), pad if number == 1 else 0))
@@ -196,12 +199,16 @@ class _Check:
     def _two(self) -> tuple[str, str]:
         with self._child() as child:
             self._play(child)
-            try:
-                return self._compared(self._play(child))
-            except ProcessDiedError:
-                if child.exit_code() == 0:
-                    return NOTE, "it exits after an episode, and is started anew for each"
-                raise
+            return self._again(child)
+
+    def _again(self, child: Child) -> tuple[str, str]:
+        """Play an episode in a process that has played one, unless it has exited after that."""
+        try:
+            return self._compared(self._play(child))
+        except ProcessDiedError:
+            if child.may_exit and child.exit_code() == 0:
+                return NOTE, "it exits after an episode, and is started anew for each"
+            raise
 
     def _compared(self, frames: list[Any]) -> tuple[str, str]:
         for number, (one, other) in enumerate(zip(self._first, frames, strict=False)):
@@ -214,7 +221,7 @@ class _Check:
     def _stop(self, number: int) -> tuple[str, str]:
         with self._child() as child:
             self._play(child, stop=number)
-            return self._compared(self._play(child))
+            return self._again(child)
 
     def _long(self) -> tuple[str, str]:
         with self._child() as child:

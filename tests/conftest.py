@@ -6,12 +6,14 @@ import random
 import signal
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from simenv_marl.core.options import Options
 
-# Hypothesis draws the same examples at every run, and keeps no files.
-settings.register_profile("tests", deadline=None, derandomize=True, database=None)
+# Hypothesis draws the same examples at every run, keeps no files, and does not look at the clock.
+settings.register_profile(
+    "tests", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("tests")
 
 # A shell that starts the tests in the background has them ignore interrupts, which some are about.

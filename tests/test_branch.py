@@ -329,10 +329,9 @@ def test_an_error_that_is_not_made_of_its_arguments():
 
 
 def test_a_branch_that_takes_too_long_is_ended():
-    env, begun, before = going_on(), time.monotonic(), children()
+    env, before = going_on(), children()
     with pytest.raises(BranchError, match="longer than"):
-        branch(env, lambda twin, number: time.sleep(60), 2, method="fork", time_limit=0.3)
-    assert time.monotonic() - begun < 30
+        branch(env, lambda twin, number: time.sleep(600), 2, method="fork", time_limit=0.3)
     assert children() == before
     env.step(1)
 

@@ -4,7 +4,6 @@ import gc
 import sys
 import weakref
 from collections import Counter
-from time import sleep
 from typing import ClassVar
 
 import numpy as np
@@ -611,6 +610,8 @@ def test_what_is_missing_is_named(monkeypatch, missing, wanted):
 def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch):
     """Few at first, which stay in the processor's caches; never more than asked for, and the same comes of it."""
     monkeypatch.setattr("simenv_marl.many.batch.CROWD", 4)
+    clock = [0.0]  # stands still while simulations run
+    monkeypatch.setattr("simenv_marl.many.batch.perf_counter", lambda: clock[0])
     ant = decision(agent="ant_0")
     source = calling(*[ant] * 6)
 
@@ -618,7 +619,7 @@ def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch
         seen = []
 
         def policy(observations):
-            sleep(pause)
+            clock[0] += pause
             seen.append(len(observations))
             return [1] * len(observations)
 
@@ -626,9 +627,10 @@ def test_more_are_under_way_where_a_policy_takes_longer_than_they_do(monkeypatch
         assert [simulation.log for simulation in found] == [[1] * 6] * 40
         return max(seen)
 
-    assert crowds(0.01) > 8
-    assert crowds(0.01, batch_size=6) == 6
-    assert crowds(0.01, batch_size=3) == 3
+    assert crowds(0.0) == 4
+    assert crowds(1.0) > 8
+    assert crowds(1.0, batch_size=6) == 6
+    assert crowds(1.0, batch_size=3) == 3
 
 
 def test_workers_may_be_as_many_as_there_are():

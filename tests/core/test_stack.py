@@ -326,7 +326,7 @@ def test_between_episodes_an_environment_may_change_threads():
 @pytest.mark.parametrize("where", ["here", "elsewhere"])
 def test_an_environment_that_is_dropped_takes_its_stack_along(driver, when, where):
     gc.collect()
-    before, log, decide = stacks(len(STACKS) + 1), [], decision()
+    before, log, decide = stacks(len(STACKS) + 1, looks=20), [], decision()
     held = [single_env(unwinding(decide, log), decide, driver=driver)]
     simulation = weakref.ref(held[0].simulation)
     if when != "never reset":

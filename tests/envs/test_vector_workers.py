@@ -32,6 +32,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.envs.worker import is_shareable
+from tests.processes import gone
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
 from tests.worlds.models import notes
 from tests.worlds.worlds import designs, seeds
@@ -341,17 +342,6 @@ def test_errors_survive_pickling():
 # -- the end --------------------------------------------------------------------------------------------
 
 
-def gone(process: int) -> bool:
-    """Whether a process ends, within some seconds."""
-    for _ in range(200):
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.02)
-    return False
-
-
 def test_close_ends_the_workers_in_every_state_and_only_once():
     for prepare in (
         lambda envs: None,
@@ -447,21 +437,19 @@ class Hanging(Counter):
             time.sleep(60)
 
 
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="there is no setitimer")
+@pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="there is no SIGALRM")
 def test_an_interrupted_step_leaves_the_environment_in_step():
     envs = workers(Slow)
-    envs.reset(seed=0)
+    envs.reset(seed=0, options={"process": os.getpid()})
 
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGALRM, interrupt)
     try:
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
         with pytest.raises(KeyboardInterrupt):
             envs.step(ONES)
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
     with pytest.raises(EpisodeOverError, match="begin the next ones"):
         envs.step(ONES)
@@ -472,13 +460,19 @@ def test_an_interrupted_step_leaves_the_environment_in_step():
 
 
 class Slow(Counter):
-    """Takes its time."""
+    """Interrupts the process that waits for it."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        super().reset(seed, options)
+        self.process = (options or {}).get("process")
 
     def run(self) -> Any:
         while True:
             self.count += self.decide()
-            if self.seed == 0:
-                time.sleep(0.4)
+            if self.process is not None and self.seed == 0:
+                time.sleep(0.1)
+                os.kill(self.process, signal.SIGALRM)
+                time.sleep(0.3)
 
 
 SCRIPT = """

@@ -1,7 +1,6 @@
 """What goes wrong in a model in C++, as the user of its environment meets it."""
 
 import gc
-import time
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from simenv_marl import (
     simulate,
 )
 from tests.outside.compiling import COMPILER, ROOT, compiled
+from tests.processes import gone
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler: neither g++ nor clang++ is installed")
 
@@ -99,10 +99,7 @@ def test_an_environment_that_is_gone_takes_its_process_along(probe):
     number = process(env)
     del env
     gc.collect()
-    until = time.monotonic() + 10
-    while time.monotonic() < until and runs(number):
-        time.sleep(0.01)
-    assert not runs(number)
+    assert gone(number)
 
 
 def test_arrays_and_nested_values_are_decisions(probe):
@@ -122,11 +119,3 @@ def test_arrays_and_nested_values_are_decisions(probe):
 def process(env):
     """The number of the process of an environment."""
     return env.simulation._link.child._process.number
-
-
-def runs(number):
-    try:
-        with open(f"/proc/{number}/stat", encoding="utf-8") as file:
-            return file.read().split()[2] != "Z"
-    except OSError:
-        return False

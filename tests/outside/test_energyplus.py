@@ -198,10 +198,14 @@ def test_errors_surface_from_the_plain_model_too(monkeypatch):
 def test_an_interrupt_that_comes_while_energyplus_runs_is_not_lost():
     building = Building(3)
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
-    signal.setitimer(signal.ITIMER_REAL, 0.02)
+
+    def run():
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        building.run()
+
     try:
         with pytest.raises(KeyboardInterrupt):
-            building.run()
+            run()
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)

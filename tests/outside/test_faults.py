@@ -3,7 +3,6 @@
 import os
 import signal
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +23,8 @@ from simenv_marl import (
 )
 from simenv_marl.remote.child import _Process
 from tests.outside.reservoirs import BOTH, INFLOW, PRICE, broken, by_its_rule, reservoirs
-from tests.outside.test_process import all_told, child, ruled, runs
+from tests.outside.test_process import all_told, child, ruled
+from tests.processes import runs
 from tests.worlds.faulty import AT_ONCE, FAULTS
 
 IN_MID_EPISODE = {
@@ -45,9 +45,9 @@ IN_MID_EPISODE = {
     "removed point": (WireError, r"moon\.phase.*not in its hello"),
     "end": (WireError, "the end True"),
     "half a line": (ProcessDiedError, "closed its pipe in the middle of a line, and has exited with code 0"),
-    "half a line, silent": (ProcessTimeoutError, "still runs; it has sent half a line for 0.3 s"),
-    "drop by drop": (ProcessTimeoutError, "still runs; it has sent half a line for 0.3 s"),
-    "silence": (ProcessTimeoutError, "still runs; it has sent nothing for 0.3 s"),
+    "half a line, silent": (ProcessTimeoutError, "still runs; it has sent half a line for 2 s"),
+    "drop by drop": (ProcessTimeoutError, "still runs; it has sent half a line for 2 s"),
+    "silence": (ProcessTimeoutError, "still runs; it has sent nothing for 2 s"),
     "exit": (ProcessDiedError, "closed its pipe, and has exited with code 0"),
     "exit 3": (ProcessDiedError, "closed its pipe, and has exited with code 3"),
     "crash": (ProcessDiedError, "was killed by SIGABRT.*there are many words\na last word"),
@@ -80,8 +80,8 @@ def test_all_faults_are_tested():
 
 
 def patience(what: str) -> float:
-    """For how long to wait for a simulator, in seconds: not long where nothing comes."""
-    return 0.3 if what in ("silence", "drop by drop", "half a line, silent", "grandchild") else 20.0
+    """For how long to wait for a simulator, in seconds: not long where no more comes."""
+    return 2.0 if what in ("silence", "drop by drop", "half a line, silent", "grandchild") else 20.0
 
 
 @pytest.mark.parametrize("what", IN_MID_EPISODE)
@@ -91,9 +91,9 @@ def test_in_mid_episode(what):
     env = aec_env(simulation, "reservoir.inflow")
     env.reset(seed=1)
     number = child(env)
+    env.step(RULE)
+    env.step(RULE)
     env.unwrapped.simulation._link.child.timeout = patience(what)
-    env.step(RULE)
-    env.step(RULE)
     with pytest.raises(kind, match=f"(?s){text}") as caught:
         env.step(RULE)
     assert "there are many words" in str(caught.value)
@@ -111,8 +111,6 @@ def test_in_mid_episode(what):
 def test_at_once(what):
     kind, text = AT_ONCE_TOLD[what]
     env = aec_env(broken("at once", what, timeout=patience(what)), "reservoir.inflow")
-    if what == "silence":
-        env.unwrapped.simulation.timeout = 1.0
     for _ in range(2):
         with pytest.raises(kind, match=f"(?s){text}"):
             env.reset(seed=1)
@@ -240,9 +238,9 @@ def test_descriptors_and_processes_are_given_back():
     for what in ("exit 3", "garbage", "silence"):
         env = aec_env(broken("in mid-episode", what), "reservoir.inflow")
         env.reset(seed=1)
+        env.step(RULE)
+        env.step(RULE)
         env.unwrapped.simulation._link.child.timeout = 0.3
-        env.step(RULE)
-        env.step(RULE)
         with pytest.raises(ProcessError):
             env.step(RULE)
         env.close()
@@ -257,10 +255,8 @@ def test_a_process_that_does_not_end_is_ended():
     env.reset(seed=1)
     number = child(env)
     os.kill(number, signal.SIGSTOP)
-    began = time.monotonic()
     env.close()
     assert not runs(number)
-    assert time.monotonic() - began < 20
 
 
 def test_an_end_that_follows_a_stop_is_not_the_next_episode():

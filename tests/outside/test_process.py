@@ -7,7 +7,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -58,6 +57,7 @@ from tests.outside.reservoirs import (
     reservoirs,
     told,
 )
+from tests.processes import gone, runs
 from tests.worlds import bare as bare_world
 from tests.worlds import outside
 
@@ -82,14 +82,6 @@ def child(env):
     """The number of the process of an environment's simulation; None if it has none."""
     found = env.unwrapped.simulation._link.child
     return None if found is None else found._process.number
-
-
-def runs(number: int) -> bool:
-    """Whether a process runs, and is no zombie."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def all_told(env, seed, choose):
@@ -608,10 +600,7 @@ def test_the_process_ends_with_the_one_that_has_started_it():
     )
     told_ = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=60, cwd=Path.cwd())
     number = int(told_.stdout)
-    deadline = time.monotonic() + 10
-    while runs(number) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not runs(number)
+    assert gone(number)
 
 
 # -- bad input ------------------------------------------------------------------------------------

@@ -186,14 +186,14 @@ def alive(kind: type) -> int:
     return sum(type(thing) is kind for thing in gc.get_objects())
 
 
-def stacks(expected: int | None = None) -> int:
+def stacks(expected: int | None = None, looks: int = 1000) -> int:
     """How many greenlets there are since the file of tests began, but for those that are a thread's own.
 
     A thread's own has no parent, and is freed a moment after the thread has ended. Of environments that hold others one
     goes at a time: what is expected is waited for, and else until nothing more goes.
     """
     number = -1
-    for _ in range(20):
+    for _ in range(looks):  # on a machine that is busy a moment may be long
         before = number
         gc.collect()
         number = sum(type(thing) is greenlet.greenlet and thing.parent is not None for thing in gc.get_objects())

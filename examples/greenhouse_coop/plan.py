@@ -222,6 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Kept]:
         {title: own.poured for title, own in kept.items()},
         options.out,
         "plan.png",
+        title="Plans keep a greenhouse: the waterer tries out amounts of water before it pours",
     )
     console.print(f"Picture: {path}", soft_wrap=True)
     return kept

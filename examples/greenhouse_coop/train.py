@@ -39,6 +39,15 @@ WATERER, VENTILATOR = "waterer_0", "ventilator_0"
 HELD_OUT: Final = 1_000_000
 """Seeds from here on are for the final comparison; all others may be learnt from."""
 
+NEXT: Final = """
+What to do next:
+  examples/greenhouse_coop/model.py  the model, which knows nothing of reinforcement learning
+  examples/greenhouse_coop/env.py    its environments: what the two agents observe, decide and earn
+  docs/tutorial.md                   an environment of a model of your own, step by step
+  docs/clients.md                    training with Stable-Baselines3, TorchRL, RLlib and others
+  make plan                          the same greenhouses kept by planning, without any training"""
+"""Printed at the end."""
+
 OUT: Final = Path(__file__).parent / "out"
 
 
@@ -79,6 +88,9 @@ class Linear:
         total = float((observation - 0.5) @ self.weights[:-1] + self.weights[-1])
         return np.array([1 / (1 + math.exp(-total)) if total > -700 else 0.0], np.float32)
 
+
+ONE_TRAINED, BOTH_TRAINED = "watering trained", "both trained"
+"""Titles of the teams that are trained."""
 
 Team = Mapping[str, Policy]
 """A policy for each agent; who has none follows the rule of the model."""
@@ -301,12 +313,22 @@ def draw_seeds(rng: np.random.Generator, number: int) -> list[int]:
 # -- the comparison -------------------------------------------------------------------------------
 
 
-def compare(options: argparse.Namespace) -> dict[str, list[Outcome]]:
+def compare(options: argparse.Namespace) -> tuple[dict[str, list[Outcome]], dict[str, list[NDArray[np.float64]]]]:
     """Train, search, and let all policies keep the greenhouses of the held-out seeds.
 
     Returns:
-        By the title of each team, the outcome for each seed.
+        By the title of each team, the outcome for each seed; and by the title of each team that was trained, the mean
+        return of each candidate of each generation.
     """
+    curves: dict[str, list[NDArray[np.float64]]] = {ONE_TRAINED: [], BOTH_TRAINED: []}
+
+    def rated(title: str) -> Rate:
+        def rate(teams: Sequence[Team], seeds: Iterable[int]) -> NDArray[np.float64]:
+            curves[title].append(crew.rate(teams, seeds))
+            return curves[title][-1]
+
+        return rate
+
     schedule = Schedule.of(options.budget)
     rng = np.random.default_rng(options.seed)
     total = schedule.episodes + 6 * options.seeds
@@ -316,22 +338,29 @@ def compare(options: argparse.Namespace) -> dict[str, list[Outcome]]:
         crew.say("constant pairs")
         pair = search(crew, LITRES, EXCHANGES, draw_seeds(rng, schedule.pair_seeds))
         crew.say("training the waterer")
-        waterer = learn(crew.rate, alone, schedule.alone_generations, rng)
+        waterer = learn(rated(ONE_TRAINED), alone, schedule.alone_generations, rng)
         crew.say("training both")
-        both = learn(crew.rate, pair, schedule.both_generations, rng)
+        both = learn(rated(BOTH_TRAINED), pair, schedule.both_generations, rng)
         poured, exchanged = alone[WATERER].value * MOST_WATER, 100 * pair[VENTILATOR].value
         teams: dict[str, Team] = {
             "rule": {},
             "random actions": {WATERER: anything, VENTILATOR: anything},
             f"constant watering ({poured:.0f} l)": alone,
             f"constant pair ({pair[WATERER].value * MOST_WATER:.0f} l, {exchanged:.0f} %)": pair,
-            "watering trained": waterer,
-            "both trained": both,
+            ONE_TRAINED: waterer,
+            BOTH_TRAINED: both,
         }
         crew.say("held-out seeds")
         outcomes = crew.play(list(teams.values()), range(HELD_OUT, HELD_OUT + options.seeds))
         crew.say("done")
-    return dict(zip(teams, outcomes, strict=True))
+    return dict(zip(teams, outcomes, strict=True)), curves
+
+
+def explain(outcomes: Sequence[Outcome]) -> str:
+    """Say why the model's rule earns so little."""
+    litres = max(max(outcome.poured) for outcome in outcomes)
+    day = max(sum(number > 0 for number in outcome.alive) for outcome in outcomes)
+    return f"{litres:.0f} litres a day drown all plants within {day} days, and dead plants earn nothing"
 
 
 def tabulate(results: Mapping[str, Sequence[Outcome]]) -> Table:
@@ -348,7 +377,7 @@ def tabulate(results: Mapping[str, Sequence[Outcome]]) -> Table:
             ([sum(outcome.poured) for outcome in outcomes], ".0f"),
         )
         cells = [f"{np.mean(values):{form}} ± {np.std(values):<4{form}}" for values, form in columns]
-        table.add_row(title, *cells, style="bold" if title == "both trained" else None)
+        table.add_row(title, *cells, style="bold" if title == BOTH_TRAINED else None)
     return table
 
 
@@ -373,7 +402,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     from .picture import draw
 
     options = parse(arguments)
-    results = compare(options)
+    results, curves = compare(options)
     console = Console()
     console.print(tabulate(results))
     titles = list(results)
@@ -382,13 +411,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"Both trained against the best constant pair: {np.mean(gains):+.1f}"
         f" (better in {sum(gain > 0 for gain in gains)} of {len(gains)})"
     )
+    because = explain(results["rule"])
+    console.print(f"Why the rule earns {_mean(results['rule']):.1f}: {because}.", soft_wrap=True)
     path = draw(
         {title: [outcome.value for outcome in outcomes] for title, outcomes in results.items()},
         {title: np.array([outcome.alive for outcome in outcomes]) for title, outcomes in results.items()},
         {title: np.array([outcome.poured for outcome in outcomes]) for title, outcomes in results.items()},
         options.out,
+        title="Two agents learn to keep a greenhouse: one decides the water, the other the ventilation",
+        notes={"rule": because},
+        curves=curves,
     )
     console.print(f"Picture: {path}", soft_wrap=True)
+    console.print(NEXT, soft_wrap=True, highlight=False)
 
 
 if __name__ == "__main__":

@@ -26,9 +26,11 @@ from examples.greenhouse_coop.env import (
     watering_env,
 )
 from examples.greenhouse_coop.model import Greenhouse, Plant
+from examples.greenhouse_coop.picture import draw
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 from pettingzoo.test import api_test, seed_test
 
 from simenv_marl import RULE, TRUNCATED, InvalidActionError, branch
@@ -466,10 +468,39 @@ def test_trains_end_to_end(tmp_path, capsys):
     printed = capsys.readouterr().out
     for title in ("rule", "random actions", "constant watering", "constant pair", "watering trained", "both trained"):
         assert title in printed
+    assert re.search(r"Why the rule earns 3\.\d: 200 litres a day drown all plants within \d days", printed)
+    named = re.findall(r"^  (\S+/\S+)", printed.partition("What to do next:")[2], flags=re.MULTILINE)
+    assert len(named) == 4
+    assert all((ROOT / path).is_file() for path in named)
     picture = tmp_path / "new" / "folder" / "greenhouse.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert vars(Greenhouse)["update_air_exchange"] is UNDECORATED[0]
     assert np.random.get_state()[1].tolist() == before
+
+
+def test_the_picture_shows_all_that_happened_and_how_it_was_learnt(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    results, curves = train.compare(train.parse([*TINY, "--workers", "1"]))
+    assert {title: np.shape(values) for title, values in curves.items()} == {
+        train.ONE_TRAINED: (1, train.POPULATION), train.BOTH_TRAINED: (1, train.POPULATION)
+    }  # fmt: skip
+    poured = {title: np.array([outcome.poured for outcome in outcomes]) for title, outcomes in results.items()}
+    draw(
+        {title: [outcome.value for outcome in outcomes] for title, outcomes in results.items()},
+        {title: np.array([outcome.alive for outcome in outcomes]) for title, outcomes in results.items()},
+        poured,
+        tmp_path,
+        title="The title",
+        notes={"rule": "drowned"},
+        curves=curves,
+    )
+    (figure,) = drawn
+    returns, learning, _, litres = figure.axes
+    assert figure.get_suptitle() == "The title"
+    assert "drowned" in [text.get_text() for text in returns.texts]
+    assert learning.lines[0].get_ydata() == pytest.approx(np.mean(curves[train.ONE_TRAINED], axis=1))
+    assert litres.get_ylim()[1] >= poured["random actions"].mean(axis=0).max() > 300
 
 
 def test_trains_alike_on_any_number_of_processes(tmp_path, capsys):

@@ -60,7 +60,7 @@ def search(out: Path, job: tuple[int, int]) -> str:
     path = out / f"{LIBRARY}-{episodes}-{seed}.json"
     if path.exists():
         return f"{path.name} is there already"
-    outcomes = compare(argparse.Namespace(budget=episodes, seeds=len(FINAL), seed=seed, workers=1))
+    outcomes, _ = compare(argparse.Namespace(budget=episodes, seeds=len(FINAL), seed=seed, workers=1))
     found = {team: asdict(Verdict.of(played)) for team, played in zip(TEAMS, outcomes.values(), strict=True)}
     found["constant ventilation"] = asdict(constant_ventilation(seed))
     titles = list(outcomes)

@@ -1,0 +1,65 @@
+"""What stands beside the code: licence, citation, forms for issues, hooks."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import simenv_marl
+
+yaml = pytest.importorskip("yaml", reason="comes with the extra docs")
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def loaded(path):
+    return yaml.safe_load((ROOT / path).read_text(encoding="utf-8"))
+
+
+def test_the_licence_is_filled_in():
+    text = (ROOT / "LICENSE").read_text(encoding="utf-8")
+    assert "[name of copyright owner]" not in text
+    assert f"Copyright 2026 {PROJECT['authors'][0]['name']}\n" in text
+
+
+def test_the_citation_is_of_this_version_and_names_the_paper():
+    citation = loaded("CITATION.cff")
+    assert citation["version"] == PROJECT["version"] == simenv_marl.__version__
+    assert citation["license"] == PROJECT["license"]
+    assert [author["name"] for author in citation["authors"]] == [author["name"] for author in PROJECT["authors"]]
+    paper = citation["preferred-citation"]
+    assert paper["title"] == "Sim-Env: Decoupling OpenAI Gym Environments from Simulation Models"
+    assert [author["family-names"] for author in paper["authors"]] == ["Schuderer", "Bromuri", "Eekelen"]
+    assert paper["identifiers"][0]["value"].removeprefix("arXiv:") in paper["url"]
+
+
+@pytest.mark.parametrize("form", ["bug", "feature", "question"])
+def test_forms_for_issues_can_be_shown(form):
+    form = loaded(f".github/ISSUE_TEMPLATE/{form}.yml")
+    assert form["name"]
+    assert form["description"]
+    parts = {part["id"]: part["attributes"]["label"] for part in form["body"]}
+    assert len(parts) == len(form["body"])
+    assert all(part["type"] in {"dropdown", "input", "textarea"} for part in form["body"])
+
+
+def test_hooks_need_nothing_but_the_environment_of_make_check():
+    (repository,) = loaded(".pre-commit-config.yaml")["repos"]
+    assert repository["repo"] == "local"
+    for hook in repository["hooks"]:
+        assert hook["language"] == "system"
+        assert hook["entry"].startswith(".venv/bin/")
+
+
+def test_read_the_docs_builds_what_make_docs_builds():
+    config = loaded(".readthedocs.yaml")
+    assert (ROOT / config["sphinx"]["configuration"]).is_file()
+    (install,) = config["python"]["install"]
+    assert set(install["extra_requirements"]) <= PROJECT["optional-dependencies"].keys()
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "SECURITY.md", ".github/PULL_REQUEST_TEMPLATE.md"])
+def test_targets_that_are_named_exist(page):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for named in (ROOT / page).read_text(encoding="utf-8").split("`make ")[1:]:
+        assert f"\n{named.partition('`')[0]}:" in makefile

@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo plan matrix pension test test-clients test-rllib test-wrappers test-oldest test-clusters test-outside test-wheel coverage mutants soak lint docs benchmark clean
+.PHONY: demo plan matrix pension check test test-wheel test-templates test-pythons test-clients test-rllib test-wrappers test-oldest test-clusters test-outside coverage mutants soak lint docs benchmark clean
 
 demo: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.train
@@ -17,6 +17,14 @@ matrix: .venv/.matrix
 
 test: lint docs
 	$(BIN)/python -m pytest -n 2 --order random
+
+# The quickest of them, for each commit: under two minutes on two cores, once the environment is there.
+CHECK_TESTS := tests/test_definitions.py tests/test_registration.py tests/test_repository.py tests/test_stepped.py \
+	$(addprefix tests/contract/test_,$(addsuffix .py,conformance environments episodes errors identity joint many_agents \
+	messages one_agent rewards rounds simulate)) \
+	tests/core/test_points.py tests/core/test_spaces.py tests/envs/test_vector.py
+check: lint
+	$(BIN)/python -m pytest --quiet -n 2 $(CHECK_TESTS)
 
 # The same for the pension fund. PENSION="--quick --out /tmp/pension"
 pension: .venv/.matrix
@@ -62,6 +70,29 @@ test-oldest: .venv-oldest/.oldest
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --constraint tests/oldest.txt --editable '.[many]' hypothesis pytest simpy
 	touch $@
 
+# What is published. The wheel is tested with what the source distribution contains, but for the sources: nothing can stand
+# in for what the wheel lacks.
+TESTED_WITH := cffi gevent hypothesis mesa[network] pytest pytest-xdist simpy trio
+WHEEL_TESTS := $(CHECK_TESTS) tests/many/test_workers.py tests/test_command_line.py tests/examples/test_greenhouse.py README.md
+test-wheel:
+	rm -rf dist build/sdist
+	test -x .venv-wheel/bin/python || $(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/pip install --quiet --disable-pip-version-check build pyyaml twine
+	.venv-wheel/bin/python -m build --outdir dist .
+	.venv-wheel/bin/twine check --strict dist/*
+	.venv-wheel/bin/pip uninstall --quiet --yes simenv-marl
+	.venv-wheel/bin/pip install --quiet --disable-pip-version-check "$$(echo dist/*.whl)[demo,many]" $(TESTED_WITH)
+	.venv-wheel/bin/python -m pytest --quiet tests/distribution
+	mkdir -p build/sdist && tar -xzf dist/*.tar.gz --strip-components 1 -C build/sdist && rm -r build/sdist/src
+	cd build/sdist && ../../.venv-wheel/bin/python -m pytest --quiet -n 2 --driver greenlet $(WHEEL_TESTS)
+
+# Each supported Python, but for the one of .venv. What is not found is told of.
+PYTHONS := 3.11 3.12 3.13
+test-pythons:
+	sh tools/pythons.sh "$(TESTED_WITH)" \
+	    "tests/contract tests/core tests/envs" \
+	    $(filter-out $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'),$(PYTHONS))
+
 # Local clusters, on the loopback address alone. Each has an environment of its own, because of what it pins.
 test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 	.venv-dask/bin/python -m tests.clusters.check dask
@@ -82,8 +113,8 @@ test-outside: .venv/.test
 	$(BIN)/python -m pytest -n 2 -rs tests/outside
 
 # The built wheel, on the newest Python that is there: templates from an empty folder, and the newest Mesa.
-test-wheel:
-	sh tools/wheel.sh
+test-templates:
+	sh tools/templates.sh
 
 lint: .venv/.test
 	$(BIN)/ruff check .
@@ -104,7 +135,7 @@ benchmark: .venv/.test
 	touch $@
 
 clean:
-	rm -rf .venv .venv-* .mutants docs/_build
+	rm -rf .venv .venv-* .mutants build dist docs/_build
 
 # One policy for all sheep of Mesa's model: trained, compared, and drawn into docs/figures.
 .PHONY: wolf-sheep

@@ -3,7 +3,7 @@
 # Python that is there serves, and with it the newest Mesa, whose example models are tried as well.
 set -eu
 cd "$(dirname "$0")/.."
-venv=$PWD/.venv-wheel
+venv=$PWD/.venv-templates
 quiet="--quiet --disable-pip-version-check"
 
 for python in python3.13 python3.12 "$HOME"/.pyenv/versions/3.13.*/bin/python "$HOME"/.pyenv/versions/3.12.*/bin/python python3; do

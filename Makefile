@@ -81,7 +81,7 @@ test-wheel:
 	.venv-wheel/bin/python -m build --outdir dist .
 	.venv-wheel/bin/twine check --strict dist/*
 	.venv-wheel/bin/pip uninstall --quiet --yes simenv-marl
-	.venv-wheel/bin/pip install --quiet --disable-pip-version-check "$$(echo dist/*.whl)[demo,many]" $(TESTED_WITH)
+	.venv-wheel/bin/pip install --quiet --disable-pip-version-check "$$(echo dist/*.whl)[demo,experiments]" $(TESTED_WITH)
 	.venv-wheel/bin/python -m pytest --quiet tests/distribution
 	mkdir -p build/sdist && tar -xzf dist/*.tar.gz --strip-components 1 -C build/sdist && rm -r build/sdist/src
 	cd build/sdist && ../../.venv-wheel/bin/python -m pytest --quiet -n 2 --driver greenlet $(WHEEL_TESTS)

@@ -11,7 +11,8 @@ The model knows nothing of this: its methods are named as decision points from h
 - ``FundSim``: the simulation, some years of a fund; its time is in years, so that infos tell how many have gone by.
 
 ``premium_env``, ``board_env``, ``team_env`` and ``mix_env`` make environments of these; the last is goal-based: the
-goal is a coverage, and episodes can be replayed with another.
+goal is a coverage, and episodes can be replayed with another. Importing this module registers all of them: see
+``_register``.
 
 Actions that the law forbids are masked: discounts on premiums without the coverage for them, indexation below 110 %,
 more risk in a shortfall. What is not masked can still be denied: a recovery plan that cuts less than the regulator
@@ -25,7 +26,9 @@ from dataclasses import replace
 from math import log
 from typing import Any, Final
 
+import gymnasium
 import numpy as np
+import pettingzoo
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
@@ -38,6 +41,7 @@ from simenv_marl import (
     aec_env,
     difference,
     make_step,
+    register_simulation,
     single_env,
 )
 
@@ -421,3 +425,22 @@ def mix_env(simulation: Any = FundSim, **options: Any) -> SimulationEnv:
         **options: As ``simenv_marl.single_env`` takes them.
     """
     return single_env(simulation, MIX_WITH_GOAL, **options)
+
+
+def _register() -> None:
+    """Enter the environments into the registries of Gymnasium and PettingZoo.
+
+    The team is ``fin_base/coop_v0`` (AEC and parallel) and ``fin_base/Joint-v0``, each of its agents alone
+    ``fin_base/ChooseMix-v0`` and so on; the others are ``fin_base/board_v0``, ``fin_base/premium_v0`` and
+    ``fin_base/MixWithGoal-v0``.
+    """
+    register_simulation(FundSim, TEAM, name="fin_base", state_space=STATE_SPACE)
+    if "fin_base/MixWithGoal-v0" not in gymnasium.registry:
+        gymnasium.register("fin_base/MixWithGoal-v0", f"{__name__}:mix_env")
+    known = getattr(pettingzoo, "aec_registry", None)  # PettingZoo has a registry since 1.26
+    for name in ("board", "premium"):
+        if known is not None and f"fin_base/{name}-v0" not in known:
+            pettingzoo.register("aec", f"fin_base/{name}_v0", f"{__name__}:{name}_env")
+
+
+_register()

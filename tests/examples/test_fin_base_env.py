@@ -1,6 +1,12 @@
 """The pension fund as environments: the same fund by its rules, what may be decided, and who ends when."""
 
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
 import numpy as np
+import pettingzoo
 import pytest
 from examples.fin_base.env import (
     BOARD,
@@ -27,9 +33,10 @@ from examples.fin_base.law import MINIMUM
 from examples.fin_base.pension import Parameters
 from examples.fin_base.people import Client, clients_of
 from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import api_test, seed_test
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
 from simenv_marl import RULE, InvalidActionError, aec_env, branch, joint_env, parallel_env, single_env, vector_env
+from simenv_marl.__main__ import main
 from simenv_marl.testing import check_simulation
 
 from .test_fin_base import state, with_coverage
@@ -39,6 +46,11 @@ SMALL = Parameters(clients=60, coverage=1.0)  # poor enough for plans, cuts and 
 
 def small(years=12):
     return FundSim(years, SMALL)
+
+
+def rich():
+    """A fund in which nothing but indexation is ever masked."""
+    return FundSim(3, Parameters(clients=60, coverage=5.0))
 
 
 def plain(seed, years=12):
@@ -325,13 +337,102 @@ def test_market_and_people_are_drawn_anew(generator):
     assert draws[0] == draws[1] != draws[2]
 
 
-def test_others_checks_pass():
-    api_test(board_env(small(3)), num_cycles=30)
+AGENTS = ["indexer_0", "planner_0", "manager_0", "regulator_0"]
+
+
+@pytest.mark.parametrize("make", [board_env, team_env])
+def test_pettingzoos_tests_pass_for_single_agents(make):
+    api_test(make(small(3)), num_cycles=30)
+    seed_test(lambda: make(small(3)), num_cycles=10)
+
+
+def test_pettingzoos_tests_pass_for_agents_that_are_born_and_end():
     with pytest.warns(UserWarning, match="possible_agents"):  # which clients there will be is not known beforehand
         api_test(premium_env(small(3)), num_cycles=30)
-    seed_test(lambda: board_env(small(3)), num_cycles=10)
-    rich = FundSim(3, Parameters(clients=60, coverage=2.0))  # in which nothing is masked: the check knows no masks
-    check_env(mix_env(rich), skip_render_check=True)
+    seed_test(lambda: premium_env(small(3)), num_cycles=10)
+
+
+@pytest.mark.parametrize("points", [BOARD, TEAM], ids=["board", "team"])
+def test_pettingzoos_tests_pass_for_rounds(points):
+    """These tests know no masks."""
+    unmasked = {point: definition for point, definition in points.items() if definition.agent != "indexer_0"}
+    parallel_api_test(parallel_env(rich(), unmasked), num_cycles=30)
+    parallel_seed_test(lambda: parallel_env(rich(), unmasked), num_cycles=10)
+
+
+@pytest.mark.parametrize(
+    ("make", "fund"),
+    [(mix_env, rich()), (lambda fund: single_env(fund, REGULATOR), FundSim(3, Parameters(clients=60, coverage=0.9)))],
+    ids=["mix", "demand"],
+)
+def test_gymnasiums_checker_passes(make, fund):
+    check_env(make(fund), skip_render_check=True)
+
+
+# -- registered -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["ChooseIndexation", "ChooseCut", "ChooseMix", "ChooseDemand", "Joint"])
+def test_gymnasium_makes_the_teams_agents_by_their_ids(name):
+    environment = gymnasium.make(f"fin_base/{name}-v0", max_steps=2)
+    environment.reset(seed=1)
+    assert isinstance(environment.unwrapped.simulation, FundSim)
+    _, reward, *_ = environment.unwrapped.step(RULE)
+    assert reward != 0
+    environment.close()
+
+
+def test_gymnasium_makes_the_goal_based_environment_by_its_id():
+    environment = gymnasium.make("fin_base/MixWithGoal-v0", simulation=rich())
+    check_env(environment.unwrapped, skip_render_check=True)
+    assert set(environment.observation_space.spaces) == {"observation", "achieved_goal", "desired_goal"}
+
+
+@pytest.mark.skipif(not hasattr(pettingzoo, "aec_registry"), reason="this PettingZoo has no registry")
+@pytest.mark.parametrize(("name", "agents"), [("coop", AGENTS), ("board", AGENTS), ("premium", None)])
+def test_pettingzoo_makes_environments_by_their_ids(name, agents):
+    environment = pettingzoo.make("aec", f"fin_base/{name}_v0", max_steps=3)
+    if agents:
+        assert environment.possible_agents == agents
+    environment.reset(seed=1)
+    assert environment.agent_selection.startswith("manager" if agents else "client")
+    for _ in range(3):
+        environment.step(RULE)
+    assert all(environment.truncations.values())
+
+
+@pytest.mark.skipif(not hasattr(pettingzoo, "parallel_registry"), reason="this PettingZoo has no registry")
+def test_pettingzoo_makes_the_team_in_rounds_by_its_id():
+    environment = pettingzoo.make("parallel", "fin_base/coop_v0", max_steps=3)
+    assert environment.possible_agents == AGENTS
+    environment.reset(seed=1)
+    _, rewards, *_ = environment.step(dict.fromkeys(environment.agents, RULE))
+    assert set(rewards) <= set(AGENTS)
+
+
+def test_ids_are_known_in_a_fresh_process_and_may_be_registered_twice():
+    code = """
+import importlib
+import gymnasium
+import examples.fin_base.env as module
+
+importlib.reload(module)
+for name in ("ChooseMix", "MixWithGoal"):
+    environment = gymnasium.make(f"examples.fin_base.env:fin_base/{name}-v0", max_steps=2)
+    print(gymnasium.spec(environment.spec.id).id)
+"""
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == ["fin_base/ChooseMix-v0", "fin_base/MixWithGoal-v0"], done.stderr
+
+
+# -- the library's own check ----------------------------------------------------------------------
+
+
+def test_the_command_line_finds_no_errors(capsys):
+    assert main(["check", f"{__name__}:small", "--episodes", "1", "--max-steps", "40"]) == 0
+    assert "ERROR" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("points", [BOARD, PREMIUMS])

@@ -1,0 +1,62 @@
+"""Stable-Baselines3 and TorchRL on the pension fund, by the code of its page: both gain over the rule."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from examples.fin_base.env import FundSim
+
+from simenv_marl import evaluate
+
+from .page import blocks
+
+UNSEEN = range(1_000_000, 1_000_032)
+
+
+@pytest.fixture(autouse=True)
+def _the_same_at_every_run():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+def welfare_gained(learner, agents):
+    """By how much agents that decide by a learner do better than the rule, seed by seed: mean, low, high."""
+    contenders = {"rule": {}, "learner": dict.fromkeys(agents, learner.decide)}
+    found = evaluate(
+        learner.fund, contenders, seeds=UNSEEN, points=learner.points, metric=FundSim.welfare, baseline="rule"
+    )
+    return found.summary("metric").loc["learner", ["difference", "difference_low", "difference_high"]]
+
+
+def read(section):
+    """The blocks of a section of the page, and the names that they share."""
+    return blocks("_clients_pension.md", section), {"__name__": "__main__"}
+
+
+def check(found, before):
+    """A trained learner does better than the rule, and than it did before: both intervals lie above 0 and the other."""
+    trained = found.summary("metric").loc["trained"]
+    assert trained["difference_low"] > 0
+    assert trained["difference_low"] > before["difference_high"]
+
+
+def test_stable_baselines3_gains_over_the_rule():
+    (define, learn), names = read("Train it with Stable-Baselines3")
+    exec(define, names)
+    before = welfare_gained(SimpleNamespace(**names), ["indexer_0"])
+    exec(learn, names)
+    check(names["found"], before)
+
+
+def test_torchrl_gains_over_the_rule():
+    (define, learn, compare), names = read("Train it with TorchRL")
+    exec(define, names)
+    exec(learn, names)
+    trained = names["policy"]
+    torch.manual_seed(0)
+    names["policy"], _ = names["learner"]()
+    exec(compare, names)
+    before = names["found"].summary("metric").loc["trained"]
+    names["policy"] = trained
+    exec(compare, names)
+    check(names["found"], before)

@@ -21,7 +21,9 @@ def blocks(name: str, section: str | None = None) -> list[CodeType]:
     """
     text = (DOCS / name).read_text(encoding="utf-8")
     if section is not None:
-        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+        level, _, rest = text.partition(f"# {section}\n")
+        level = level.rpartition("\n")[2] + "#"  # up to the next heading that is as high
+        text = re.split(rf"^#{{2,{len(level)}}} ", rest, maxsplit=1, flags=re.MULTILINE)[0]
     found = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert found, f"docs/{name} has no python under {section!r}"
     where = f"docs/{name}: {section}" if section else f"docs/{name}"

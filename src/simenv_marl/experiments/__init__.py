@@ -1,1 +1,1 @@
-"""Experiments: contenders on the same seeds, designs, sweeps that resume, and what factors do."""
+"""Experiments: contenders on the same seeds, designs, sweeps that can be resumed, and effects of factors."""

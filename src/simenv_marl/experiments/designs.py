@@ -1,4 +1,4 @@
-"""Designs: which combinations of factors are worth a run."""
+"""Designs of experiments: which combinations of factors to run."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 __all__ = ["design"]
 
 MOST_ROWS: Final = 10_000_000
-"""A design of more rows is taken for a mistake."""
+"""The largest number of rows. A larger design is considered a mistake."""
 
 
 @dataclass(frozen=True)
 class Factor:
-    """What is varied.
+    """A factor of an experiment.
 
     Attributes:
-        name: What it is called.
-        levels: The values that it can have; None where it is a range.
-        low, high: The bounds of a range, which belong to it.
-        whole: Whether a range is one of integers.
+        name: Its name.
+        levels: The values that it can have; None for a range.
+        low, high: The bounds of a range, inclusive.
+        whole: Whether it is a range of integers.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Factor:
     whole: bool = False
 
     def spread(self, unit: NDArray[np.float64]) -> list[Any]:
-        """Values for numbers in [0, 1), so that what is spread evenly there is spread evenly here."""
+        """Map numbers in [0, 1) to values of the factor, uniformly."""
         if self.levels is not None:
             return [self.levels[min(floor(u * len(self.levels)), len(self.levels) - 1)] for u in unit.tolist()]
         if self.whole:
@@ -49,24 +49,24 @@ class Factor:
         return [self._between(u) for u in unit.tolist()]
 
     def _between(self, u: float) -> float:
-        value = self.low * (1 - u) + self.high * u  # which cannot overflow
+        value = self.low * (1 - u) + self.high * u  # this form cannot overflow
         return float(min(max(value, self.low), self.high))
 
     def placed(self, unit: NDArray[np.float64]) -> list[Any]:
-        """Values for places in [0, 1], both ends of which belong to it; of a range."""
+        """Map numbers in [0, 1], inclusive, to values of a range."""
         return [round(self._between(u)) if self.whole else self._between(u) for u in unit.tolist()]
 
     def steps(self, number: int) -> list[Any]:
-        """So many values of a range, from one bound to the other; all levels of a list."""
+        """Return ``number`` values of a range from bound to bound, or all levels of a list."""
         if self.levels is not None:
             return list(self.levels)
         return list(dict.fromkeys(self.placed(np.linspace(0.0, 1.0, number))))
 
     def ends(self) -> list[Any]:
-        """The two values of a design of two levels.
+        """Return the two values for a two-level design.
 
         Raises:
-            OptionValueError: There are not two.
+            OptionValueError: There are not two levels.
         """
         if self.levels is not None and len(self.levels) != 2:
             raise OptionValueError(
@@ -79,32 +79,32 @@ class Factor:
 def design(
     factors: Mapping[str, Any], method: str = "full_factorial", n: int | None = None, *, seed: int | None = None
 ) -> "DataFrame":
-    """Say which combinations of factors are to be run.
+    """Return a design: a table of the combinations of factors to run.
 
     Args:
-        factors: By name: a range, the tuple ``(low, high)``, of integers where both are; or a list of levels, which
-            may be anything.
+        factors: A dict from the name of a factor to its values: a range, given as the tuple ``(low, high)`` (a range of
+            integers if both are integers), or a list of levels of any type.
         method: How combinations are chosen:
 
-            - ``"full_factorial"``: all combinations; of a range ``n`` values (2) from bound to bound;
-            - ``"fractional_factorial"``: of two levels each, a fraction in ``n`` runs, a power of two (as many as main
-              effects need), with as little mixed as can be;
-            - ``"plackett_burman"``: of two levels each, main effects in a multiple of four runs;
-            - ``"central_composite"``: two ranges or more, for a quadratic surface: corners, a star and the middle, all
-              within; once for each combination of levels;
-            - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space;
-            - ``"one_at_a_time"``: the middle of ranges and the first of levels, and then each factor by itself at its
-              other values, of a range ``n`` (2) from bound to bound;
+            - ``"full_factorial"``: all combinations. A range has ``n`` values (default 2) from bound to bound.
+            - ``"fractional_factorial"``: two levels per factor, a fraction of all combinations in ``n`` runs. ``n`` is
+              a power of two (default: as many as main effects need). Effects are confounded as little as possible.
+            - ``"plackett_burman"``: two levels per factor, main effects in a multiple of four runs.
+            - ``"central_composite"``: two or more ranges, for a quadratic response surface: corners, star points and
+              the centre, all within the ranges; once for each combination of levels.
+            - ``"latin_hypercube"``, ``"sobol"``, ``"halton"``: ``n`` rows that fill the space.
+            - ``"one_at_a_time"``: the centre of ranges and the first of levels; then each factor alone at its other
+              values, for a range ``n`` (default 2) values from bound to bound.
             - ``"saltelli"``: ``n`` samples (a power of two) for ``sobol_indices``, in ``n * (2 * factors + 2)`` rows.
-        n: How many, where the method asks for that.
-        seed: Of what is drawn at random. None: always the same, so that a script that is run again goes on with its
+        n: The number of samples, runs or values per range, for methods that use it.
+        seed: The seed of random designs. None: always the same design, so that a script that runs again continues its
             experiment.
 
     Returns:
-        A row for each run, a column for each factor, in values of the factor's own type.
+        A ``DataFrame`` with one row for each run and one column for each factor, in the factor's own type.
 
     Raises:
-        OptionValueError: A factor has no levels, the method does not exist, or cannot be with these factors and ``n``.
+        OptionValueError: A factor has no levels, the method does not exist, or it does not fit these factors and ``n``.
         MissingExtraError: pandas, pyDOE or SALib is missing.
     """
     pandas = needed("pandas", "design")
@@ -164,12 +164,12 @@ def _factor(name: Any, given: Any) -> Factor:
 def _same(one: Any, other: Any) -> bool:
     try:
         return bool(one == other)
-    except Exception:  # such as of arrays
+    except Exception:  # for example of arrays
         return False
 
 
 def _dtype(factor: Factor) -> Any:
-    """In which type a column keeps the values of a factor."""
+    """Return the dtype of a factor's column."""
     kinds = {int if factor.whole else float} if factor.levels is None else set(map(type, factor.levels))
     if kinds == {str}:
         return "str"
@@ -194,7 +194,7 @@ def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Colu
 
 
 def _of_two_levels(factors: Sequence[Factor], matrix: Any) -> Columns:
-    """A design of -1 and 1."""
+    """Return the columns of a design from its matrix of -1 and 1."""
     return [
         [factor.ends()[int(sign > 0)] for sign in column]
         for factor, column in zip(factors, np.asarray(matrix).T, strict=True)
@@ -219,19 +219,19 @@ def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -
 
 
 def _generators(basic: int, number: int) -> str:
-    """What the columns of a fractional design are products of, so that effects of low order are mixed least.
+    """Return the generators of a fractional design, chosen so that low-order effects are confounded least.
 
     Args:
-        basic: How many factors have all their combinations.
-        number: How many factors there are. Columns are bits: the product of two is their exclusive or.
+        basic: The number of factors that have all their combinations.
+        number: The number of factors. Columns are bits: the product of two columns is their exclusive or.
     """
     columns: list[int] = []
     for resolution in range(min(basic + 1, 8), 2, -1):
         columns = [1 << place for place in range(basic)]
-        sums: list[set[int]] = [{0}, *(set() for _ in range(resolution - 2))]  # of so many columns
+        sums: list[set[int]] = [{0}, *(set() for _ in range(resolution - 2))]  # the sums of 0, 1, 2, ... columns
         for column in columns:
             _extend(sums, column)
-        for word in range(3, 2**basic):  # taken in their order, what is left is large: a lexicographic code
+        for word in range(3, 2**basic):  # greedily in this order: a lexicographic code, which is large
             if len(columns) == number:
                 break
             if not any(word in own for own in sums):
@@ -253,7 +253,7 @@ def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Col
     for factor in factors:
         factor.ends()
     matrix = None
-    for columns in range(number, number + 8):  # of some sizes none is known to it, but of the next one
+    for columns in range(number, number + 8):  # pyDOE lacks some sizes; the next one may exist
         try:
             matrix = pydoe.pbdesign(columns)[:, :number]
         except ValueError:
@@ -274,11 +274,11 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
             f"a central composite design is one of two ranges (low, high) at least, not {len(ranges)}"
         )
     number = 2 ** len(ranges) + 2 * len(ranges) + 1
-    sizes = [len(factor.levels or "-") for factor in factors]  # it is there once for each combination of levels
+    sizes = [len(factor.levels or "-") for factor in factors]  # once for each combination of levels
     rows = _checked_rows(number * prod(sizes))
     if n is not None and n != rows:
         raise OptionValueError(f"a central composite design of these {len(factors)} factors has {rows} runs, not {n}")
-    # The middle is there once: a simulation with the same seed would bring the same.
+    # The centre occurs once: a simulation with the same seed would have the same result.
     matrix = iter(pydoe.ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T)
     columns: Columns = []
     for place, factor in enumerate(factors):

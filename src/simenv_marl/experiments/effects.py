@@ -1,4 +1,4 @@
-"""What factors do: main effects, interactions, and shares of the variance."""
+"""Effects of factors: main effects, interactions, and shares of the variance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,22 +20,22 @@ if TYPE_CHECKING:
 __all__ = ["Effects", "effects", "sobol_indices"]
 
 MANY: Final = 8
-"""Numbers of more levels than these are grouped into ``GROUPS``."""
+"""Numeric factors with more levels than this are grouped into ``GROUPS``."""
 
 GROUPS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Effects:
-    """What factors do to a value. Made by ``effects``.
+    """The effects of factors on a value. Made by ``effects``.
 
     Attributes:
-        main: A row for each level of each factor, by which it is indexed: ``mean`` of the value there, its interval
-            ``low`` and ``high``, ``effect`` (by how much that is more than the mean of all), and ``count``.
-        interactions: A row for each pair of factors: ``strength``, the standard deviation of what the means of their
-            combinations are apart from the sum of both main effects; the strongest first.
-        of: What the value is.
-        levels: Those of each factor, as they are: in an index, 1 and True and 1.0 are the same.
+        main: One row for each level of each factor, the index: ``mean`` (of the value at this level), the bounds of its
+            interval ``low`` and ``high``, ``effect`` (the mean minus the mean of all), and ``count``.
+        interactions: One row for each pair of factors, the strongest first. ``strength`` is the standard deviation of
+            the differences between the means of their combinations and the sum of both main effects.
+        of: The name of the value.
+        levels: The levels of each factor with their types. An index cannot distinguish 1, True and 1.0.
     """
 
     main: "DataFrame"
@@ -45,10 +45,10 @@ class Effects:
     _cells: "dict[tuple[str, str], DataFrame]"
 
     def cells(self, one: str, other: str) -> "DataFrame":
-        """The mean of the value in each combination of two factors: a row for each level of the one.
+        """Return the mean of the value for each combination of two factors: one row for each level of the first.
 
         Raises:
-            OptionValueError: One of them is no factor.
+            OptionValueError: One of them is not a factor.
         """
         for pair, table in self._cells.items():
             if pair == (one, other):
@@ -61,10 +61,10 @@ class Effects:
         """Draw the main effects of all factors and, below them, the strongest interactions.
 
         Args:
-            figure: Where to draw. None: a new figure.
+            figure: The figure to draw in. None: a new figure.
 
         Returns:
-            The figure. Notebooks show a new one where it is the last value of a cell; ``savefig`` saves it.
+            The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
 
         Raises:
             MissingExtraError: Matplotlib is missing.
@@ -83,24 +83,24 @@ def effects(
     agent: str = TEAM,
     confidence: float = 0.95,
 ) -> Effects:
-    """Say what the factors of an experiment do.
+    """Estimate the effects of an experiment's factors.
 
-    Factors of many numbers are grouped into quarters. Runs that have failed are left out. Intervals are over the seeds,
-    for the rows that there are: what the other factors do at a level makes them no wider. Where there is only one seed,
-    they are over the rows.
+    Numeric factors with many values are grouped into quarters. Failed runs are left out. Intervals are over the seeds,
+    for the given rows: the effects of other factors at a level do not widen its interval. With a single seed, intervals
+    are over the rows.
 
     Args:
-        frame: What ``run_experiment`` has returned.
+        frame: The result of ``run_experiment``.
         of: The value: ``"return"``, ``"length"`` or the name of a metric.
-        contender: Whose runs are looked at. None: all, and the contender is a factor like any other.
-        agent: Whose rows.
-        confidence: Of the intervals.
+        contender: The contender whose runs are used. None: all runs, with the contender as one more factor.
+        agent: The agent whose rows are used. Default: the team.
+        confidence: The confidence level of the intervals.
 
     Returns:
         The effects.
 
     Raises:
-        OptionValueError: There is no such column, contender or agent, the values are no numbers, or nothing varies.
+        OptionValueError: There is no such column, contender or agent, the values are not numbers, or nothing varies.
     """
     pandas = needed("pandas", "effects")
     check_confidence(confidence)
@@ -130,7 +130,7 @@ def effects(
 
 
 def _by_seed(values: NDArray[np.float64], seeds: NDArray[Any]) -> NDArray[np.float64]:
-    """The mean of each seed; the values themselves where there is only one seed."""
+    """Return the mean of each seed, or the values themselves if there is only one seed."""
     distinct, place = np.unique(seeds, return_inverse=True)
     if len(distinct) < 2:
         return values
@@ -138,7 +138,7 @@ def _by_seed(values: NDArray[np.float64], seeds: NDArray[Any]) -> NDArray[np.flo
 
 
 def _taken(frame: "DataFrame", of: str, contender: str | None, agent: str) -> "tuple[DataFrame, list[str]]":
-    """The rows that count, and the names of the factors.
+    """Return the rows to use, and the names of the factors.
 
     Raises:
         OptionValueError: There are none.
@@ -162,7 +162,7 @@ def _taken(frame: "DataFrame", of: str, contender: str | None, agent: str) -> "t
 
 
 def _levels(column: Any) -> Any:
-    """Which level each row has; those of many numbers are quarters of them."""
+    """Return the level of each row; numeric factors with many values are grouped into quarters."""
     pandas = needed("pandas", "effects")
     if column.nunique() > MANY and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
         return pandas.qcut(column, GROUPS, duplicates="drop")
@@ -170,7 +170,7 @@ def _levels(column: Any) -> Any:
 
 
 def _in_order(levels: Any) -> list[Any]:
-    """The levels of a factor: numbers and groups in their order, others as they come; one for all that are missing."""
+    """Return a factor's levels: numbers and groups sorted, others in order of appearance, one for missing values."""
     found: list[Any] = list(levels.cat.categories) if hasattr(levels, "cat") else list(dict.fromkeys(levels.tolist()))
     found = [level for level in found if not _is_nan(level)]
     ordered = sorted(found) if all(type(level) in (int, float) for level in found) else found
@@ -182,12 +182,12 @@ def _is_nan(level: Any) -> bool:
 
 
 def _at(levels: Any, level: Any) -> NDArray[np.bool_]:
-    """Where a factor has a level."""
+    """Return in which rows a factor has a level."""
     return np.array([own == level or (_is_nan(own) and _is_nan(level)) for own in levels.tolist()], np.bool_)
 
 
 def _cells(pair: tuple[str, str], levels: Any, at: Any, values: NDArray[np.float64]) -> "DataFrame":
-    """The means in all combinations of two factors."""
+    """Return the means of all combinations of two factors."""
     pandas, (one, other) = needed("pandas", "effects"), pair
     means = [[values[a & b].mean() if (a & b).any() else np.nan for b in at[other]] for a in at[one]]
     table: DataFrame = pandas.DataFrame(means, index=pandas.Index(levels[one], name=one))
@@ -196,7 +196,7 @@ def _cells(pair: tuple[str, str], levels: Any, at: Any, values: NDArray[np.float
 
 
 def _strength(means: NDArray[np.float64]) -> float:
-    """How far the means of combinations are from the sum of both main effects; nan where some are missing."""
+    """Return how far the means of combinations are from the sum of both main effects; nan if some are missing."""
     apart = means - means.mean(axis=1, keepdims=True) - means.mean(axis=0, keepdims=True) + means.mean()
     return float(np.sqrt((apart**2).mean()))
 
@@ -212,22 +212,23 @@ def sobol_indices(
     agent: str = TEAM,
     confidence: float = 0.95,
 ) -> "DataFrame":
-    """Say which share of a value's variance is due to which factor, by SALib.
+    """Estimate the share of each factor in the variance of a value (Sobol indices), by SALib.
 
     Args:
-        frame: What ``run_experiment`` has returned for ``design(..., method="saltelli")``. The value of a row is its
-            mean over the seeds.
+        frame: The result of ``run_experiment`` for ``design(..., method="saltelli")``. The value of a row is its mean
+            over the seeds.
         of: The value: ``"return"``, ``"length"`` or the name of a metric.
-        contender: Whose runs are looked at.
-        agent: Whose rows.
-        confidence: Of the intervals.
+        contender: The contender whose runs are used.
+        agent: The agent whose rows are used. Default: the team.
+        confidence: The confidence level of the error bounds.
 
     Returns:
-        Indexed by factor: ``first``, the share that is due to the factor alone, and ``total``, the share that it takes
-        part in; by how much they may be off, ``first_error`` and ``total_error``.
+        A table indexed by factor: ``first`` (first-order index, the share of the factor alone), ``total`` (total-order
+        index, which includes its interactions), and the half-widths of their intervals, ``first_error`` and
+        ``total_error``.
 
     Raises:
-        OptionValueError: The design is another one, runs have failed, or the value is no number or does not vary.
+        OptionValueError: The frame has another design, runs have failed, or the value is not a number or does not vary.
         MissingExtraError: SALib is missing.
     """
     pandas, analyze = needed("pandas", "sobol_indices"), needed("SALib.analyze.sobol", "sobol_indices").analyze
@@ -251,7 +252,7 @@ def sobol_indices(
 
 
 def _is_saltelli(rows: Sequence[Any]) -> bool:
-    """Whether rows are blocks of: A; A with each factor of B in turn; B with each factor of A in turn; B."""
+    """Return whether rows are blocks of: A; A with each factor of B in turn; B with each factor of A in turn; B."""
     count = len(rows[0])
     size = 2 * count + 2
     if not count or len(rows) % size:

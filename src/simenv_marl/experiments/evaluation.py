@@ -1,4 +1,4 @@
-"""Contenders on the same seeds: who does better, by how much, and how sure that is."""
+"""Compares contenders on the same seeds, with confidence intervals."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -43,19 +43,20 @@ if TYPE_CHECKING:
 __all__ = ["Evaluation", "evaluate"]
 
 FIRST: Final = 16
-"""After how many seeds it is first looked whether intervals are narrow enough: those of fewer are not to be trusted."""
+"""The number of seeds before the first check of the intervals' width: intervals of fewer seeds are unreliable."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What contenders have come to on the same seeds. Made by ``evaluate``.
+    """The results of contenders on the same seeds. Made by ``evaluate``.
 
     Attributes:
-        frame: A row for each contender, seed and agent, and one for the team, whose ``agent`` is ``"team"``. Columns:
-            ``contender``, ``seed``, ``agent``, ``return`` (the sum of its rewards), ``length`` (the number of its
-            decisions; of the team, of all) and the metrics, which are the same in all rows of an episode.
-        baseline: The contender that all others are compared with; None if there is none.
-        confidence: Of the intervals.
+        frame: A ``DataFrame`` with one row for each contender, seed and agent, and one for the team, whose ``agent`` is
+            ``"team"``. Columns: ``contender``, ``seed``, ``agent``, ``return`` (the undiscounted sum of rewards),
+            ``length`` (the number of decisions; for the team, of all agents) and the metrics, which are the same in all
+            rows of an episode.
+        baseline: The contender that all others are compared with, or None.
+        confidence: The confidence level of the intervals.
     """
 
     frame: "DataFrame"
@@ -67,7 +68,7 @@ class Evaluation:
         return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
 
     def values(self, of: str = "return") -> "DataFrame":
-        """The team's values: a row for each seed, a column for each contender.
+        """Return the team's values: one row for each seed, one column for each contender.
 
         Args:
             of: ``"return"``, ``"length"`` or the name of a metric.
@@ -84,14 +85,15 @@ class Evaluation:
         return team.pivot(index="seed", columns="contender", values=of).loc[seeds, names]
 
     def summary(self, of: str = "return") -> "DataFrame":
-        """The mean of the team's values for each contender, with its interval.
+        """Return the mean of the team's values for each contender, with its confidence interval.
 
         Args:
             of: ``"return"``, ``"length"`` or the name of a metric.
 
         Returns:
-            Indexed by contender: ``mean``, ``low`` and ``high``; with a baseline also ``difference``,
-            ``difference_low`` and ``difference_high``: by how much it does better on the same seeds.
+            A table indexed by contender, with the columns ``mean``, ``low`` and ``high``. With a baseline also
+            ``difference``, ``difference_low`` and ``difference_high``: the mean paired difference from the baseline on
+            the same seeds.
 
         Raises:
             OptionValueError: There is no such column.
@@ -110,13 +112,13 @@ class Evaluation:
         return table.rename_axis("contender")
 
     def improvement(self, of: str = "return") -> "DataFrame":
-        """The probability that a contender does better than the baseline on a seed, where ties count half.
+        """Estimate the probability that a contender has a higher value than the baseline on a seed. Ties count half.
 
         Args:
             of: ``"return"``, ``"length"`` or the name of a metric.
 
         Returns:
-            Indexed by contender: ``probability``, ``low`` and ``high``.
+            A table indexed by contender, with the columns ``probability``, ``low`` and ``high``.
 
         Raises:
             OptionValueError: There is no baseline, or no such column.
@@ -128,19 +130,21 @@ class Evaluation:
         return table.rename_axis("contender")
 
     def seeds_needed(self, difference: float, *, power: float = 0.8, of: str = "return") -> "Series[float]":
-        """How many seeds would tell a difference from the baseline, as far as the seeds that there are can say.
+        """Estimate the number of seeds that would detect a difference from the baseline.
+
+        The estimate uses the variance on the present seeds.
 
         Args:
-            difference: The mean difference that is to be told from none.
-            power: How often it is to be told: 0.8 is four times out of five.
+            difference: The mean difference to detect.
+            power: The probability of detecting it. 0.8 is four times out of five.
             of: ``"return"``, ``"length"`` or the name of a metric.
 
         Returns:
-            By contender, the number of seeds (by the paired t-test, at ``confidence``); infinity where no number of
-            seeds is large enough.
+            The number of seeds by contender (by the paired t-test, at ``confidence``); infinity if no number of seeds
+            is large enough.
 
         Raises:
-            OptionValueError: There is no baseline or no such column, or an argument cannot have its value.
+            OptionValueError: There is no baseline or no such column, or an argument has an invalid value.
         """
         check_number("difference", difference)
         check_number("power", power)
@@ -161,14 +165,14 @@ class Evaluation:
         return {name: values[name].to_numpy() - base for name in values.columns if name != self.baseline}
 
     def plot(self, of: str = "return", *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
-        """Draw each seed as a line from contender to contender and, with a baseline, the differences seed by seed.
+        """Draw each seed as a line across the contenders and, with a baseline, the difference on each seed.
 
         Args:
             of: ``"return"``, ``"length"`` or the name of a metric.
-            figure: Where to draw. None: a new figure.
+            figure: The figure to draw in. None: a new figure.
 
         Returns:
-            The figure. Notebooks show a new one where it is the last value of a cell; ``savefig`` saves it.
+            The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
 
         Raises:
             OptionValueError: There is no such column.
@@ -199,38 +203,40 @@ def evaluate(
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
 ) -> Evaluation:
-    """Have contenders meet the same seeds.
+    """Evaluate contenders on the same seeds.
 
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
-        contenders: From a name to policies, as ``simulate`` takes them. ``{}``: the model as it is.
-        seeds: What the simulations are reset with; all different.
-        points: The decision points, as ``generate_env`` takes them. Agents for whom a contender has no policy are left
-            to their rule, and have returns like all others.
+        contenders: A dict from the name of a contender to its policies, as ``simulate`` takes them. ``{}`` is the model
+            as it is.
+        seeds: The seeds of the simulations, all different.
+        points: The decision points, as ``generate_env`` takes them. Agents without a policy of the contender follow
+            their rule, and have returns like all others.
         baseline: The contender that the others are compared with.
-        metric: A callable of the simulation after its end, whose column is ``metric``, or a dict of them by column.
-            Numbers, strings or None.
-        team: What the returns of an episode make together; None: their sum. It gets the returns of the agents, which
-            are numbers (``max`` serves) and a mapping by agent (``lambda returns: returns["waterer_0"]``); of those
-            alone that have decided (``returns.get("waterer_0", 0.0)``).
-        confidence: Of the intervals.
-        width: Stop as soon as the interval of every difference from the baseline (without one: of every mean) is at
-            most this wide; ``seeds`` are then those that there may be. Looked at from 16 seeds on, now and then.
-        batched: Whether policies are those of ``simulate_many``, which answer many decisions at once.
-        batch_size: How many simulations may be suspended together, if so.
-        workers: How many processes share the work: see ``simulate_many``.
-        progress: Whether to show a bar, by ``tqdm``.
-        **options: As ``simulate`` takes them.
+        metric: A callable of the simulation after its end, whose column is ``metric``, or a dict from column to
+            callable. A metric returns a number, a string or None.
+        team: A callable that combines the returns of an episode's agents into the team's value. None: their sum. It
+            gets an object that is both the tuple of returns (``max`` works) and a mapping by agent (``lambda returns:
+            returns["waterer_0"]``). Agents that never decided are missing there (``returns.get("waterer_0", 0.0)``).
+        confidence: The confidence level of the intervals.
+        width: Stop as soon as the interval of every difference from the baseline (without a baseline: of every mean) is
+            at most this wide; ``seeds`` are then the seeds that may be used. The width is checked from 16 seeds on, at
+            growing distances.
+        batched: Whether the policies are those of ``simulate_many``, which answer many decisions at once.
+        batch_size: The largest number of simulations that are suspended together, if ``batched``.
+        workers: The number of worker processes: see ``simulate_many``.
+        progress: Whether to show a progress bar, by ``tqdm``.
+        **options: The options of ``simulate``.
 
     Returns:
         The evaluation.
 
     Raises:
-        OptionValueError: An argument cannot have its value. Nothing has run.
+        OptionValueError: An argument has an invalid value. No simulation has run.
         MissingExtraError: pandas, SciPy, joblib or tqdm is missing.
-        SimEnvError: Something else cannot work; the leaf says what.
-        BaseException: Whatever a model, a mapping, a policy, a metric or ``team`` raises, with notes that say of which
-            contender and seed.
+        SimEnvError: Something else cannot work. The subclass tells what.
+        BaseException: Any exception of a model, a mapping, a policy, a metric or ``team``, with notes that name the
+            contender and the seed.
     """
     needed("pandas", "evaluate"), needed("scipy.stats", "evaluate")
     found = checked_contenders(contenders, batched=bool(batched))
@@ -241,9 +247,9 @@ def evaluate(
     metrics, size = checked_metrics(metric), int(batch_size) if batched else 0
     points = list(points) if isinstance(points, Iterator) else points
     common = (simulation, points, chosen, points_of(found), metrics, size, team)
-    plans = _plans(found, *common[:4])  # made here also where the work is done elsewhere, so that errors come before
+    plans = _plans(found, *common[:4])  # made here even if workers do the work, so that errors come first
     if workers:
-        pack((found, common))  # as here what cannot be sent there
+        pack((found, common))  # so do errors of pickling
 
     def play(name: str, lot: list[int]) -> list[Outcome]:
         if workers:
@@ -267,7 +273,7 @@ def _play_all(
     is_narrow: Callable[[Mapping[str, Sequence[Outcome]]], bool],
     bar: Any,
 ) -> dict[str, list[Outcome]]:
-    """Have the contenders of these names play, one lot of seeds after the other, until that is enough."""
+    """Have these contenders play, one lot of seeds after the other, until the intervals are narrow enough."""
     outcomes: dict[str, list[Outcome]] = {name: [] for name in names}
     done = 0
     while done < len(places):
@@ -284,7 +290,7 @@ def _play_all(
 
 
 def _next(done: int, number: int, width: float | None) -> int:
-    """Up to which seed it goes on before intervals are looked at again: each look takes its time, too."""
+    """Return the number of seeds before the next check of the intervals; each check takes time, too."""
     return number if width is None else min(number, max(FIRST, done + max(4, done // 8)))
 
 
@@ -296,7 +302,7 @@ def _widest(outcomes: Mapping[str, Sequence[Outcome]], team: Any, baseline: str 
         base = values.pop(baseline)
         values = {name: own - base for name, own in values.items()}
     bounds = [interval(own, confidence) for own in values.values()]
-    return float(np.max([high - low for low, high in bounds], initial=0.0))  # nan where one of them is
+    return float(np.max([high - low for low, high in bounds], initial=0.0))  # nan if one of them is nan
 
 
 def _plans(
@@ -310,7 +316,7 @@ def _plans(
 
 
 def _spread(arguments: tuple[Any, ...], seeds: list[int], workers: int, size: int) -> list[Outcome]:
-    """Have workers play the episodes of a contender."""
+    """Play the episodes of a contender in workers."""
     return [outcome for _, part in spread(_play_part, arguments, seeds, workers, size) for outcome in part]
 
 
@@ -325,14 +331,14 @@ def _play_part(
     team: Any,
     seeds: list[int],
 ) -> list[Outcome]:
-    """In a worker: play a part of a contender's episodes."""
+    """Play a part of a contender's episodes, in a worker."""
     (plan,) = _plans(contender, simulation, points, options, named).values()
     with processes_kept():
         return _play(plan, seeds, metrics, size, team)
 
 
 def _play(plan: Plan, seeds: Sequence[int], metrics: Metrics, size: int, team: Any) -> list[Outcome]:
-    """Play episodes of a contender; ``size`` of them at once, or one by one where that is 0."""
+    """Play episodes of a contender: ``size`` of them at once, or one by one if ``size`` is 0."""
     if not size:
         return [play(plan, seed, metrics, team) for seed in seeds]
     outcomes: dict[int, Outcome] = {}
@@ -352,7 +358,7 @@ def _frame(seeds: Sequence[int], outcomes: Mapping[str, Sequence[Outcome]], metr
 
 
 def typed(columns: Mapping[str, Sequence[Any]]) -> "DataFrame":
-    """A table whose columns keep their values as they are; numbers of which some are missing are floats."""
+    """Return a table whose columns keep the types of their values. A numeric column with missing values is float."""
     pandas = needed("pandas", "a table")
     table: DataFrame = pandas.DataFrame(
         {name: pandas.Series(values, dtype=_dtype(values)) for name, values in columns.items()}
@@ -373,7 +379,7 @@ def _dtype(values: Sequence[Any]) -> Any:
 
 
 def rows_of(outcome: Outcome, team: Any) -> list[tuple[str, float, int]]:
-    """Agent, return and length: of each agent, and of the team."""
+    """Return agent, return and length for each agent and for the team."""
     rows = [(agent, value, outcome.lengths[agent]) for agent, value in outcome.returns.items()]
     return [*rows, (TEAM, team_value(team, outcome.returns), sum(outcome.lengths.values()))]
 
@@ -382,10 +388,10 @@ def rows_of(outcome: Outcome, team: Any) -> list[tuple[str, float, int]]:
 
 
 def distinct_seeds(given: Iterable[int]) -> list[int]:
-    """The seeds; there are some, and each but once.
+    """Return the seeds as a list; there is at least one, and all are different.
 
     Raises:
-        OptionValueError: It is otherwise.
+        OptionValueError: There are none, or one of them is repeated.
     """
     seeds = checked_seeds(given)
     if not seeds:

@@ -1,4 +1,4 @@
-"""The packages that experiments need beside the core."""
+"""The packages that experiments need besides the core."""
 
 from __future__ import annotations
 

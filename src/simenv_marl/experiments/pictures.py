@@ -1,4 +1,4 @@
-"""Pictures of what experiments have found."""
+"""Plots of the results of experiments."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 LINES: Final = 200
-"""So many seeds at most are drawn as lines."""
+"""The largest number of seeds that are drawn as lines."""
 
 WIDEST: Final = 14.0
-"""So many inches at most a figure is wide."""
+"""The largest width of a figure, in inches."""
 
 
 def _bare(axes: Any, *, grid: str) -> None:
@@ -26,7 +26,7 @@ def _bare(axes: Any, *, grid: str) -> None:
 
 
 def _name_below(axes: Any, names: list[str]) -> None:
-    """Write names below; aslant where they would run into each other."""
+    """Write names below the axes; slanted if they would overlap."""
     axes.set_xticks(range(len(names)), names)
     inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
     if sum(len(name) + 2 for name in names) * LETTER > inches:
@@ -35,18 +35,18 @@ def _name_below(axes: Any, names: list[str]) -> None:
 
 
 LETTER: Final = 0.075
-"""How wide a letter is on average, in inches."""
+"""The average width of a letter, in inches."""
 
 
 def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: str, figure: Any) -> Any:
     """Draw the values of contenders seed by seed, and their differences from the baseline.
 
     Args:
-        values: A row for each seed, a column for each contender.
-        summary: The means, with their intervals, by contender.
-        baseline: The contender to compare with; None: no differences are drawn.
-        of: What the values are.
-        figure: Where to draw; None: a new figure.
+        values: One row for each seed, one column for each contender.
+        summary: The means and their intervals, by contender.
+        baseline: The contender to compare with. None: no differences are drawn.
+        of: The name of the values.
+        figure: The figure to draw in. None: a new figure.
     """
     names = list(values.columns)
     others = [name for name in names if name != baseline]
@@ -64,7 +64,7 @@ def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: 
 
 
 def _draw_values(axes: Any, values: DataFrame, summary: DataFrame, what: str) -> None:
-    """A line for each seed, from contender to contender."""
+    """Draw a line for each seed, across the contenders."""
     names, places = list(values.columns), np.arange(len(values.columns))
     numbers = values.to_numpy(np.float64)
     for row in numbers[:LINES]:
@@ -84,12 +84,12 @@ def _draw_values(axes: Any, values: DataFrame, summary: DataFrame, what: str) ->
 
 
 def _draw_differences(axes: Any, values: DataFrame, summary: DataFrame, baseline: str, others: list[str]) -> None:
-    """A dot for each seed: by how much a contender does better on it."""
+    """Draw a dot for each seed: the difference of a contender from the baseline."""
     axes.axhline(0.0, color=INK, linewidth=0.8, zorder=1)
     base, names = values[baseline].to_numpy(np.float64), list(values.columns)
     for place, name in enumerate(others):
         apart = values[name].to_numpy(np.float64) - base
-        across = place + 0.24 * (2 * (np.arange(len(apart)) * 0.618034 % 1) - 1)  # spread evenly, in no order
+        across = place + 0.24 * (2 * (np.arange(len(apart)) * 0.618034 % 1) - 1)  # spread evenly, in irregular order
         colour = COLOURS[names.index(name) % len(COLOURS)]
         axes.scatter(across, apart, 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
         _mark(axes, place, *summary.loc[name, ["difference", "difference_low", "difference_high"]])
@@ -109,10 +109,10 @@ def _mark(axes: Any, place: float, mean: float, low: float, high: float) -> None
 # -- effects --------------------------------------------------------------------------------------
 
 DRAWN: Final = 4
-"""So many interactions at most are drawn."""
+"""The largest number of interactions that are drawn."""
 
 ABREAST: Final = 5
-"""So many factors at most are drawn side by side."""
+"""The largest number of factors side by side."""
 
 
 def draw_effects(effects: Any, figure: Any) -> Any:
@@ -120,7 +120,7 @@ def draw_effects(effects: Any, figure: Any) -> Any:
 
     Args:
         effects: The effects.
-        figure: Where to draw; None: a new figure.
+        figure: The figure to draw in. None: a new figure.
     """
     factors = list(effects.levels)
     pairs = [pair for pair, strength in effects.interactions["strength"].items() if strength > 0][:DRAWN]

@@ -1,4 +1,4 @@
-"""Episodes that are played for what they bring: the return of each agent, and what is measured of the model."""
+"""Plays episodes and returns their results: the return of each agent, and the metrics of the model."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from ..many.collect import learners_plan
 from ..simulation import RULE
 
 TEAM: Final = "team"
-"""What stands in the column ``agent`` of the row of all agents together."""
+"""The value of the column ``agent`` in the row of the team."""
 
 COLUMNS: Final = ("contender", "seed", "agent", "return", "length", "status", "error")
-"""The columns of tables that are no factors and no metrics."""
+"""The columns of tables besides factors and metrics."""
 
 Policies = Mapping[Any, Any]
 Metrics = Mapping[str, Callable[[Any], Any]]
 
 
 class Outcome(NamedTuple):
-    """What has come of one episode.
+    """The results of one episode.
 
     Attributes:
-        returns: By agent, the sum of its rewards, in the order in which agents first decided.
-        lengths: By agent, how many decisions it has taken.
-        metrics: By name, what was measured of the simulation.
+        returns: The undiscounted return of each agent, in the order of the agents' first decisions.
+        lengths: The number of decisions of each agent.
+        metrics: The metrics of the simulation, by name.
     """
 
     returns: dict[str, float]
@@ -45,7 +45,7 @@ class Outcome(NamedTuple):
 
 
 class Returns(tuple[float, ...]):
-    """The returns of the agents of an episode: their numbers, as ``sum`` and ``max`` want them, and a mapping by agent.
+    """The returns of an episode's agents: a tuple of numbers, for ``sum`` and ``max``, and a mapping by agent.
 
     Example:
         ``returns["waterer_0"]``, ``returns.get("waterer_0", 0.0)``, ``min(returns)``, ``returns.items()``
@@ -54,7 +54,7 @@ class Returns(tuple[float, ...]):
     _names: tuple[str, ...]
 
     def __new__(cls, returns: Mapping[str, float]) -> Returns:
-        """Make them of a dict."""
+        """Make the returns from a dict."""
         made = super().__new__(cls, returns.values())
         made._names = tuple(returns)
         return made
@@ -70,37 +70,37 @@ class Returns(tuple[float, ...]):
         return key in self._names if isinstance(key, str) else super().__contains__(key)
 
     def get(self, key: str, default: Any = None) -> Any:
-        """The return of an agent, or the default where it has not decided."""
+        """Return the return of an agent, or the default if it did not decide."""
         return self[key] if key in self._names else default
 
     def keys(self) -> tuple[str, ...]:
-        """The names of the agents."""
+        """Return the names of the agents."""
         return self._names
 
     def values(self) -> tuple[float, ...]:
-        """Their returns."""
+        """Return the returns of the agents."""
         return tuple(self)
 
     def items(self) -> Iterator[tuple[str, float]]:
-        """Both."""
+        """Return pairs of name and return."""
         return zip(self._names, self, strict=True)
 
 
 def checked_team(team: Any) -> None:
-    """Make sure that something can make one value of the returns of agents.
+    """Check the argument ``team``.
 
     Raises:
-        OptionValueError: It cannot.
+        OptionValueError: It is not a callable or None.
     """
     if team is not None and not callable(team):
         raise OptionValueError(f"team must be a callable of the returns, or None, not {shown(team)}")
 
 
 def team_value(team: Callable[[Returns], Any] | None, returns: Mapping[str, float]) -> float:
-    """What the returns of all agents of an episode make together.
+    """Combine the returns of an episode's agents into the team's value.
 
     Raises:
-        OptionValueError: It is no number.
+        OptionValueError: The value is not a number.
     """
     if team is None:
         return float(sum(returns.values()))
@@ -115,15 +115,15 @@ def team_value(team: Callable[[Returns], Any] | None, returns: Mapping[str, floa
 
 
 def checked_contenders(contenders: Any, what: str = "contenders", *, batched: bool) -> dict[str, Policies]:
-    """Contenders by name.
+    """Return contenders by name.
 
     Args:
-        contenders: As users give them.
-        what: The argument in which they stand.
+        contenders: The contenders, as users give them.
+        what: The name of the argument.
         batched: Whether their policies answer many decisions at once.
 
     Raises:
-        OptionValueError: They are none.
+        OptionValueError: These are not contenders.
     """
     if not isinstance(contenders, Mapping):
         raise OptionValueError(f"{what} must be a dict from a name to policies, not {shown(contenders)}")
@@ -147,14 +147,14 @@ def checked_contenders(contenders: Any, what: str = "contenders", *, batched: bo
 
 
 def checked_metrics(metric: Any, taken: Sequence[str] = ()) -> dict[str, Callable[[Any], Any]]:
-    """Metrics by name; a single one is called ``metric``.
+    """Return metrics by name; a single one is called ``metric``.
 
     Args:
-        metric: A callable of the simulation, or a dict of them.
+        metric: A callable of the simulation, or a dict of callables.
         taken: The names of the factors.
 
     Raises:
-        OptionValueError: They are none, or a name is that of another column.
+        OptionValueError: These are not metrics, or a name is that of another column.
     """
     if metric is None:
         return {}
@@ -170,10 +170,10 @@ def checked_metrics(metric: Any, taken: Sequence[str] = ()) -> dict[str, Callabl
 
 
 def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options that can be used again for each contender.
+    """Return options that can be used again for each contender.
 
     Raises:
-        OptionValueError: They say who decides, which is for contenders to say.
+        OptionValueError: They contain ``policies``; the contenders define these.
     """
     if "policies" in options:
         raise OptionValueError("who decides is said by contenders: there is no option policies here")
@@ -181,14 +181,14 @@ def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def points_of(contenders: Mapping[str, Policies]) -> list[Any]:
-    """The decision points that contenders name."""
+    """Return the decision points that contenders name."""
     keys = [key for policies in contenders.values() for key in policies]
     return list(dict.fromkeys(key for key in keys if not isinstance(key, str) or "." in key))
 
 
 @contextmanager
 def telling(contender: str) -> Iterator[None]:
-    """Have errors say of which contender they are."""
+    """Add the name of the contender to errors."""
     try:
         yield
     except BaseException as error:
@@ -199,14 +199,14 @@ def telling(contender: str) -> Iterator[None]:
 def contender_plan(
     simulation: Any, policies: Policies, points: Any, options: Mapping[str, Any], named: Sequence[Any]
 ) -> Plan:
-    """The plan of a contender's episodes, in which all decide whose rewards are counted.
+    """Return the plan of a contender's episodes. All agents whose rewards count decide in it.
 
     Args:
         simulation: As ``simulate`` takes it.
         policies: The contender's policies.
         points: The decision points, as ``generate_env`` takes them.
-        options: As ``simulate`` takes them.
-        named: The points that any contender names. If it is not known which points are meant, it is these.
+        options: The options of ``simulate``.
+        named: The points that any contender names. They are used if the points are not known otherwise.
 
     Raises:
         SimEnvError: Something in them cannot work.
@@ -230,30 +230,30 @@ def contender_plan(
 
 
 class Tally:
-    """The returns of agents, while episodes run: a watcher of ``run``, and of one episode alone."""
+    """Counts the returns of agents while episodes run: a ``Watcher`` for ``run``, and for one episode alone."""
 
     def __init__(self, team: Callable[[Returns], Any] | None) -> None:
         self._team = team
-        self._books: dict[int, dict[str, list[Any]]] = {}  # by place of the episode and agent: return, and length
+        self._books: dict[int, dict[str, list[Any]]] = {}  # by place of the episode, and by agent: return and length
 
     def count(self, place: int, agent: Agent) -> None:
-        """An agent decides."""
+        """Count a decision of an agent."""
         account = agent.notes
         if account is None:
             account = agent.notes = self._books.setdefault(place, {}).setdefault(agent.name, [0.0, 0])
         account[1] += 1
 
     def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
-        """Decisions are going to be answered: see ``Watcher``."""
+        """Count the decisions that are about to be answered: see ``Watcher``."""
         for place, episode in zip(places, waiting, strict=True):
             agent: Any = episode.pending
             self.count(place, agent)
 
     def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
-        """They have been: see ``Watcher``."""
+        """Do nothing: returns do not depend on the answers."""
 
     def moved(self, episode: Episode) -> None:
-        """An episode stands at its next decision, or is over: see ``Watcher``."""
+        """Add the reward when an episode reaches its next decision or its end: see ``Watcher``."""
         if episode.pending is not None:
             self._pay(episode.pending)
         for agent in episode.just_ended:
@@ -269,23 +269,23 @@ class Tally:
             account[0] += agent.reward
 
     def outcome(self, place: int, simulation: Any, metrics: Metrics) -> Outcome:
-        """What has come of an episode that is over.
+        """Return the results of an episode that is over.
 
         Raises:
-            AgentError: An agent is called as the row of all agents is.
-            BaseException: What a metric raises, or what makes one value of the returns.
+            AgentError: The name of an agent is that of the team's row.
+            BaseException: Any exception of a metric or of ``team``.
         """
         accounts = self._books.pop(place, {})
         if TEAM in accounts:
             raise AgentError(f"an agent is called {TEAM!r}, which is what the row of all agents is called; rename it")
         returns = {name: float(account[0]) for name, account in accounts.items()}
         lengths = {name: account[1] for name, account in accounts.items()}
-        team_value(self._team, returns)  # now, and not when all have been played: it may fail
+        team_value(self._team, returns)  # called now because it may fail, not when all episodes are over
         return Outcome(returns, lengths, {name: _plain(name, metric(simulation)) for name, metric in metrics.items()})
 
 
 def _plain(name: str, value: Any) -> Any:
-    """What a metric has returned, as a value of Python's own."""
+    """Return a metric's value as a Python number or string."""
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
         value = value.item()
     if value is not None and type(value) not in (bool, int, float, str):
@@ -294,10 +294,10 @@ def _plain(name: str, value: Any) -> Any:
 
 
 def play(plan: Plan, seed: int, metrics: Metrics, team: Callable[[Returns], Any] | None = None) -> Outcome:
-    """Play one episode, with policies of one decision at a time.
+    """Play one episode, with policies that answer one decision at a time.
 
     Raises:
-        BaseException: Whatever the model, a mapping, a policy, a metric or ``team`` raises.
+        BaseException: Any exception of the model, a mapping, a policy, a metric or ``team``.
     """
     tally = Tally(team)
     try:
@@ -343,19 +343,19 @@ def play_many(
     told: Callable[[int, Outcome], None],
     team: Callable[[Returns], Any] | None = None,
 ) -> None:
-    """Play many episodes, with policies of many decisions at once.
+    """Play many episodes, with policies that answer many decisions at once.
 
     Args:
-        plan: Of the episodes.
-        seeds: What they are reset with.
-        batch_size: How many may be suspended together.
-        metrics: What is measured.
-        told: Called with the place of a seed and what has come of it, as soon as that is known.
-        team: What the returns of an episode make together; None: their sum.
+        plan: The plan of the episodes.
+        seeds: The seeds of the simulations.
+        batch_size: The largest number of simulations that are suspended together.
+        metrics: The metrics.
+        told: Called with the index of a seed and its results, as soon as these are known.
+        team: A callable that combines the returns of an episode. None: their sum.
 
     Raises:
-        BaseException: Whatever a model, a mapping, a policy, a metric or ``team`` raises. What others came to was told
-            before.
+        BaseException: Any exception of a model, a mapping, a policy, a metric or ``team``. ``told`` got the results of
+            the episodes that had ended before.
     """
     tally = Tally(team)
 

@@ -1,4 +1,4 @@
-"""Experiments: every row of a design, every contender, every seed; stored as they are run, and resumed."""
+"""Experiments: every row of a design with every contender on every seed; stored as they run, and resumed."""
 
 import json
 import os
@@ -46,13 +46,13 @@ if TYPE_CHECKING:
 __all__ = ["run_experiment"]
 
 BY_RULE: Final = "rule"
-"""The contender that is always there: the model as it is."""
+"""The contender that is always present: the model as it is."""
 
 SHARE: Final = 16
-"""In so many parts each process gets its work: few enough to cost nothing, enough for all to end together."""
+"""The number of parts of the work per process: few enough to cost nothing, enough for all to end together."""
 
 TRIED: Final = 10
-"""In so many rows at most it is looked whether all contenders can be, where making their simulations fails."""
+"""The largest number of rows on which contenders are checked, if making the simulations of rows fails."""
 
 LONGEST_TRACE: Final = 4000
 
@@ -62,9 +62,9 @@ class Run(NamedTuple):
 
     Attributes:
         row: The factors.
-        key: The same as JSON.
-        contender: Who decides.
-        seed: What it is reset with.
+        key: The factors as JSON.
+        contender: The name of the contender.
+        seed: The seed of the simulation.
     """
 
     row: Row
@@ -90,39 +90,39 @@ def run_experiment(
     retry_errors: bool = False,
     **options: Unpack[EpisodeOptions],
 ) -> "DataFrame":
-    """Run every row of a design with every contender on every seed; what was run before is not run again.
+    """Run every row of a design with every contender on every seed. Stored runs are not repeated.
 
-    Each run is stored as soon as it is known. A process that is killed loses what it was running, and nothing else:
-    called again, with the same or with more rows, contenders and seeds, this does what is missing.
+    Each run is stored as soon as it is finished. A process that is killed loses only the runs it was working on. Call
+    this again with the same rows, contenders and seeds, or with more, and it does the missing runs.
 
     Args:
-        make: Called with the factors of a row by keyword, returns a simulation or a ``Variant``; or a ``Variant``,
-            whose parameters they become. It is called for each run, and what it returns is the run's own.
-        design: A row for each combination of factors, as ``design`` makes it: a ``DataFrame``, or what becomes one.
-        policies: Contenders besides ``"rule"``, the model as it is: from a name to policies of ``simulate``.
-        seeds: What the simulations are reset with; all different.
+        make: A callable that gets the factors of a row as keyword arguments and returns a simulation or a ``Variant``;
+            or a ``Variant``, whose parameters the factors become. It is called anew for each run.
+        design: One row for each combination of factors, as ``design`` makes it: a ``DataFrame``, or data for one.
+        policies: Contenders besides ``"rule"``, the model as it is: a dict from a name to policies for ``simulate``.
+        seeds: The seeds of the simulations, all different.
         points: The decision points, as ``generate_env`` takes them.
         metric: As ``evaluate`` takes it.
-        team: What the returns of an episode make together, as in ``evaluate``; None: their sum.
-        store: The folder of the experiment, which is made where it is missing.
-        batched: Whether policies are those of ``simulate_many``. The seeds of a row are then run together.
-        batch_size: How many of them at most, if so.
-        workers: How many processes share the work: see ``simulate_many``. They all write to the folder.
-        progress: Whether to show a bar with the time that is left, by ``tqdm``.
-        retry_errors: Whether runs that have failed are run again.
-        **options: As ``simulate`` takes them.
+        team: As ``evaluate`` takes it. None: the sum of the returns.
+        store: The folder of the experiment. It is created if it is missing.
+        batched: Whether the policies are those of ``simulate_many``. The seeds of a row then run together.
+        batch_size: The largest number of seeds that run together, if ``batched``.
+        workers: The number of worker processes: see ``simulate_many``. All of them write to the folder.
+        progress: Whether to show a progress bar with the remaining time, by ``tqdm``.
+        retry_errors: Whether failed runs are repeated.
+        **options: The options of ``simulate``.
 
     Returns:
-        A row for each agent of each run, and one for the team (``agent`` is ``"team"``), in the order of the design,
+        One row for each agent of each run, and one for the team (``agent`` is ``"team"``), in the order of the design,
         the contenders and the seeds. The columns: the factors, ``contender``, ``seed``, ``agent``, ``return``,
-        ``length``, the metrics, ``status`` (``"ok"``, or ``"error"``: then the team's row is the only one) and
+        ``length``, the metrics, ``status`` (``"ok"`` or ``"error"``; a failed run has only the team's row) and
         ``error``.
 
     Raises:
-        OptionValueError: An argument cannot have its value, or the store is one of another experiment. Nothing has run.
+        OptionValueError: An argument has an invalid value, or the store belongs to another experiment. Nothing has run.
         StoreError: The store cannot be read or written. What was stored before stays.
         MissingExtraError: pandas, joblib or tqdm is missing.
-        SimEnvError: Something else cannot work; the leaf says what.
+        SimEnvError: Something else cannot work. The subclass tells what.
     """
     needed("pandas", "run_experiment")
     contenders = _contenders(policies, batched=bool(batched))
@@ -138,7 +138,7 @@ def run_experiment(
     tried = _try(trying, rows, contenders)
     arguments = (*workshop, metrics, size, folder, new_session())
     if workers:
-        pack(arguments)  # what cannot be sent to other processes is found out before
+        pack(arguments)  # errors of pickling come before any run
     prepare(folder, factors, list(metrics))
     stored = _compared(folder, factors, keys, rows, tried, partial(_try, trying, contenders=contenders))
     missing = list(_missing(rows, keys, contenders, places, stored, retry=retry_errors))
@@ -155,20 +155,20 @@ def _compared(
     tried: Any,
     trying: Callable[[list[Row]], Any],
 ) -> Stored:
-    """What is stored, once it is known to be of this experiment, with warnings of what has changed since.
+    """Return the stored runs, after checks that they belong to this experiment; warn of changes since then.
 
     Args:
-        folder: Where.
-        factors: Their names.
-        keys: Of the rows, as they are stored.
-        rows: All of them.
-        tried: Of which row a simulation was made, and of what.
-        trying: Makes one of other rows.
+        folder: The folder of the store.
+        factors: The names of the factors.
+        keys: The keys of the rows, as they are stored.
+        rows: All rows.
+        tried: The row of which a simulation was made, and its provenance.
+        trying: A callable that does the same for other rows.
     """
     stored = read(folder, factors, tried[0])
     compare(folder, stored, keys)
-    if tried[0] not in stored.rows:  # so that what is there is compared with what it would be now
-        with suppress(SimEnvError):  # of a row that has failed
+    if tried[0] not in stored.rows:  # so that stored runs are compared with what they would be made of now
+        with suppress(SimEnvError):  # making this row's simulation failed
             tried = trying([row for row, key in zip(rows, keys, strict=True) if key in stored.rows])
         stored = read(folder, factors, tried[0])
     warn_of_changes(folder, stored, tried[1])
@@ -176,7 +176,7 @@ def _compared(
 
 
 def _run_missing(arguments: Any, missing: list[Run], workers: int, at_once: int, total: int | None) -> None:
-    """Run what is missing, with a bar where it is said how many runs there are in all."""
+    """Do the missing runs, with a progress bar if ``total`` is given."""
     with nullcontext() if total is None else progress_bar(total, "run", total - len(missing)) as bar, processes_kept():
         for number in _work(arguments, missing, workers, at_once):
             if bar is not None:
@@ -203,10 +203,10 @@ def _contenders(policies: Any, *, batched: bool) -> dict[str, Policies]:
 
 
 def checked_design(design: Any) -> "tuple[DataFrame, list[Row]]":
-    """A design as a table, and its rows in values that JSON knows.
+    """Return a design as a table, and its rows as JSON values.
 
     Raises:
-        OptionValueError: It is none.
+        OptionValueError: It is not a design.
     """
     pandas = needed("pandas", "a design")
     try:
@@ -240,26 +240,26 @@ def _plain(name: str, value: Any) -> Any:
 
 def _folder(store: Any) -> Path:
     try:
-        return Path(store).absolute()  # other processes may be in other folders
+        return Path(store).absolute()  # other processes may have another working directory
     except TypeError as error:
         raise OptionValueError(f"store must be the path of a folder, not {shown(store)}") from error
 
 
 def _try(workshop: Workshop, rows: Sequence[Row], contenders: Iterable[str]) -> tuple[str, dict[str, dict[str, Any]]]:
-    """Find out whether all contenders can be.
+    """Check that all contenders can be set up.
 
     Returns:
-        A row, as JSON, and what its runs are made of, by contender; nothing where no row can be.
+        A row, as JSON, and the provenance of its runs by contender; empty if no row's simulation can be made.
 
     Raises:
-        SimEnvError: One of them cannot be.
+        SimEnvError: A contender cannot be set up.
     """
     for row in rows[:TRIED]:
         try:
             made = {contender: json.loads(workshop.plan(row, contender)[1](0)) for contender in contenders}
         except SimEnvError:
             raise
-        except Exception:  # this row is going to fail, maybe another does not
+        except Exception:  # this row fails; another may not
             continue
         return written(row), made
     return "", {}
@@ -279,7 +279,7 @@ def _missing(
 ) -> Iterator[Run]:
     seen: set[str] = set()
     for row, key in zip(rows, keys, strict=True):
-        if key in seen:  # the same row brings the same
+        if key in seen:  # the same row has the same result
             continue
         seen.add(key)
         for contender in contenders:
@@ -290,7 +290,7 @@ def _missing(
 
 
 def _work(arguments: tuple[Any, ...], runs: list[Run], workers: int, together: int) -> Iterator[int]:
-    """Do what is missing; yields how many runs have been done since the last time."""
+    """Do the missing runs; yield the number of runs done since the last yield."""
     if not runs:
         return
     if workers:
@@ -301,12 +301,12 @@ def _work(arguments: tuple[Any, ...], runs: list[Run], workers: int, together: i
 
 
 def _do_part(*arguments: Any) -> None:
-    """In a worker: do a part of the runs."""
+    """Do a part of the runs, in a worker."""
     *others, runs = arguments
     parent = _parents.setdefault(os.getpid(), os.getppid())
     with processes_kept():
         for _ in _do(*others, runs=runs):
-            if os.getppid() != parent:  # it was killed, and nothing waits for this any more
+            if os.getppid() != parent:  # the parent was killed, so that nothing waits for the results
                 return
 
 
@@ -326,7 +326,7 @@ def _do(
     *,
     runs: Sequence[Run],
 ) -> Iterator[int]:
-    """Run, and write down what comes of it; yields how many runs have been done since the last time."""
+    """Do runs and store their results; yield the number of runs done since the last yield."""
     workshop = Workshop(make, contenders, points, options, named)
     writer = Writer(folder, session)
     try:
@@ -368,20 +368,20 @@ def _do_one(workshop: Workshop, run: Run, metrics: Metrics, size: int, writer: W
 
 
 def _is_failure(error: BaseException) -> bool:
-    """Whether an error is one of the run, and not what stops this process."""
-    cancelled = getattr(sys.modules.get("asyncio"), "CancelledError", SystemExit)  # of a task of the model's own
+    """Return whether an error is a failure of the run, and not a request to stop this process."""
+    cancelled = getattr(sys.modules.get("asyncio"), "CancelledError", SystemExit)  # a task of the model was cancelled
     return isinstance(error, (Exception, SystemExit, cancelled))
 
 
 def _unknown(seed: int) -> str:
-    """What there is to say of what could not be made."""
+    """Return the provenance of a run whose simulation could not be made."""
     return written({"seed": seed})
 
 
 def _do_many(
     workshop: Workshop, row: Row, contender: str, runs: list[Run], metrics: Metrics, size: int, writer: Writer
 ) -> list[Run]:
-    """Do the runs of one row and contender together; returns those that an error has kept from coming to an end."""
+    """Do the runs of one row and contender together; return those that did not end because of an error."""
     left = dict(enumerate(runs))
     try:
         plan, provenance = workshop.plan(row, contender)
@@ -397,7 +397,7 @@ def _do_many(
     except BaseException as error:
         if not _is_failure(error):
             raise
-        workshop.forget()  # whose it is will be seen when they are run one by one
+        workshop.forget()  # running them one by one will show which run it was
     return list(left.values())
 
 
@@ -413,7 +413,7 @@ def _frame(
     metrics: Sequence[str],
     team: Any,
 ) -> "DataFrame":
-    """The table of all runs, in the order of the design, the contenders and the seeds."""
+    """Return the table of all runs, in the order of the design, the contenders and the seeds."""
     pandas = needed("pandas", "run_experiment")
     places: list[int] = []
     columns: dict[str, list[Any]] = {name: [] for name in (*COLUMNS[:5], *metrics, *COLUMNS[5:])}
@@ -439,7 +439,7 @@ def _rows(known: Known, contender: str, seed: int, metrics: Sequence[str], team:
         return
     try:
         rows = rows_of(known.outcome, team)
-    except Exception as error:  # of team=, which is asked for what is stored, too
+    except Exception as error:  # raised by team=, which is called for stored runs, too
         yield from _rows(Known(None, told(error)), contender, seed, metrics, team)
         return
     measured = [known.outcome.metrics.get(name) for name in metrics]

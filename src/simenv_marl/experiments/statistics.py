@@ -1,4 +1,4 @@
-"""What a number of seeds tells: intervals of means, and how many seeds would tell a difference."""
+"""Statistics over seeds: confidence intervals of means, and the number of seeds that detects a difference."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from ..errors import OptionValueError, shown
 from .extras import needed
 
 RESAMPLES: Final = 5_000
-"""How often values are drawn anew for an interval; always the same ones, so that it is always the same interval."""
+"""The number of bootstrap samples for an interval; always the same samples, for reproducible intervals."""
 
 CORRECTED: Final = 10_000
-"""Of up to so many values: the correction takes as many means as there are values, and of more it corrects nothing."""
+"""The largest number of values with bias correction: it needs one mean per value, and has no effect on more values."""
 
 AT_ONCE: Final = 4_000_000
-"""So many values are drawn at once."""
+"""The number of values that are drawn at once."""
 
 MOST_SEEDS: Final = 10_000_000
-"""A difference that needs more seeds than these is as good as none."""
+"""A difference that needs more seeds than this counts as none."""
 
 
 def check_number(name: str, value: Any) -> None:
-    """Make sure that something is a finite number.
+    """Check that an argument is a finite number.
 
     Raises:
         OptionValueError: It is not.
@@ -36,10 +36,10 @@ def check_number(name: str, value: Any) -> None:
 
 
 def check_confidence(confidence: Any) -> None:
-    """Make sure that an interval can be so sure.
+    """Check that a confidence level is between 0 and 1.
 
     Raises:
-        OptionValueError: It cannot.
+        OptionValueError: It is not.
     """
     check_number("confidence", confidence)
     if not 0 < confidence < 1:
@@ -47,14 +47,14 @@ def check_confidence(confidence: Any) -> None:
 
 
 def numbers(values: Any, of: str) -> Any:
-    """Values of a table as floats; nan where there is none.
+    """Return values of a table as floats; nan where a value is missing.
 
     Args:
         values: A ``DataFrame`` or a ``Series``.
-        of: What they are.
+        of: The name of the column, for the message.
 
     Raises:
-        OptionValueError: They are no numbers.
+        OptionValueError: The values are not numbers.
     """
     try:
         return values.astype(np.float64)
@@ -63,14 +63,14 @@ def numbers(values: Any, of: str) -> Any:
 
 
 def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:
-    """A confidence interval of the mean, by SciPy's bootstrap (bias-corrected and accelerated, unless of very many).
+    """Return a confidence interval of the mean, by SciPy's bootstrap (BCa, or percentile for very many values).
 
     Args:
         values: ``(n,)``, one for each seed.
-        confidence: How sure it is to be, such as 0.95.
+        confidence: The confidence level, such as 0.95.
 
     Returns:
-        Its bounds; nan where there are fewer than two values, or one that is not finite.
+        The bounds; nan if there are fewer than two values, or one that is not finite.
     """
     stats = needed("scipy.stats", "an interval")
     values = np.asarray(values, np.float64)
@@ -81,7 +81,7 @@ def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, flo
     batch = max(1, min(500, AT_ONCE // len(values)))
     for method in ("BCa", "percentile")[len(values) > CORRECTED :]:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of degenerate samples, for which there is the other method
+            warnings.simplefilter("ignore")  # about degenerate samples, which the other method handles
             found = stats.bootstrap(
                 (values,), np.mean, confidence_level=confidence, n_resamples=RESAMPLES, batch=batch, method=method,
                 vectorized=True, rng=np.random.default_rng(0),
@@ -93,22 +93,22 @@ def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, flo
 
 
 def improvement(differences: NDArray[np.float64], confidence: float) -> tuple[float, float, float]:
-    """The probability that a seed goes better, where half of those count that go as well; and its interval."""
+    """Return the share of seeds with a positive difference, where ties count half, and its interval."""
     better = np.where(np.isnan(differences), nan, (np.sign(differences) + 1) / 2)
     return float(better.mean()) if len(better) else nan, *interval(better, confidence)
 
 
 def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
-    """How many seeds tell a mean difference from none, by the paired t-test.
+    """Return the number of seeds that detects a mean difference, by the paired t-test.
 
     Args:
-        differences: ``(n,)``, of the seeds that there are: how much they vary.
-        difference: The mean difference that is to be told.
-        confidence: How seldom none is taken for one: in one case of 20 with 0.95.
-        power: How often one is told.
+        differences: ``(n,)``, the differences on the present seeds, for their variance.
+        difference: The mean difference to detect.
+        confidence: One minus the probability of a false positive: 0.95 is one in 20.
+        power: The probability of detecting the difference.
 
     Returns:
-        The number, at least 2; infinity where it is beyond all bounds, nan where there are fewer than two differences.
+        The number, at least 2; infinity if it is too large, nan if there are fewer than two differences.
     """
     stats = needed("scipy.stats", "the number of seeds")
     if len(differences) < 2 or not np.isfinite(differences).all():

@@ -1,14 +1,14 @@
-"""The folder in which an experiment is stored: what is known of each run, one line of JSON for each.
+"""The folder of an experiment: the result of each run is one line of JSON.
 
 ::
 
     store/
-      experiment.json       what every run has: the names of factors and metrics
-      runs-<id>-<id>.jsonl  a file for each process that has run something, to which only that process has appended;
-                            the first id is later the later it was begun
+      experiment.json       what all runs share: the names of factors and metrics
+      runs-<id>-<id>.jsonl  one file per process that has done runs; only that process appends to it;
+                            the first ids sort in the order in which the files were begun
 
-A line is written at once and as a whole, as soon as a run is known. So a process that is killed loses what it was
-running; a line that it has not finished is the last of its file, and a run that is not known. Nothing is a pickle.
+A process writes a line at once and as a whole when a run is finished. If it is killed, it loses the runs it was working
+on; an unfinished line is the last one of its file and is ignored. There are no pickles.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ VERSION: Final = 1
 HEADER: Final = "experiment.json"
 
 Key = tuple[str, str, int]
-"""What tells a run from all others: its row, written as JSON, the contender, the seed."""
+"""The identity of a run: its row as JSON, the contender, the seed."""
 
 
 def written(value: Any) -> str:
-    """A value as JSON, on one line."""
+    """Return a value as JSON, on one line."""
     return json.dumps(value, separators=(",", ":"))
 
 
 class Known(NamedTuple):
-    """What is known of a run.
+    """The result of a run.
 
     Attributes:
-        outcome: What has come of it; None where it has failed.
-        error: The error in which it has failed; None where it has not.
+        outcome: The results of the episode; None if the run failed.
+        error: The error; None if the run did not fail.
     """
 
     outcome: Outcome | None
@@ -51,17 +51,17 @@ class Known(NamedTuple):
 
 
 class Writer:
-    """What one process appends to its file."""
+    """Appends lines to the file of one process."""
 
     def __init__(self, store: Path, session: str) -> None:
         """Open the file of this process.
 
         Args:
             store: The folder.
-            session: What all processes have in common that take part.
+            session: The id that all participating processes share.
 
         Raises:
-            StoreError: It cannot be opened.
+            StoreError: The file cannot be opened.
         """
         if not (store / HEADER).exists():
             raise StoreError(
@@ -79,7 +79,7 @@ class Writer:
         """Append a line.
 
         Raises:
-            StoreError: It cannot be written. What was written before is as it was.
+            StoreError: The line cannot be written. Earlier lines are unchanged.
         """
         data = line.encode("ascii") + b"\n"
         before = os.fstat(self._file).st_size
@@ -94,7 +94,7 @@ class Writer:
             raise
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         os.close(self._file)
 
 
@@ -102,12 +102,12 @@ _processes: dict[tuple[int, int], str] = {}
 
 
 def _process() -> str:
-    """What tells this process from all others, on all machines; and this thread, where threads are workers."""
+    """Return an id of this process among all machines; and of this thread, if threads are workers."""
     return _processes.setdefault((os.getpid(), threading.get_ident()), uuid4().hex[:12])
 
 
 def new_session() -> str:
-    """What all processes have in common that take part from now on; in the order of letters, the later the later."""
+    """Return an id for all processes that participate from now on. Later ids sort after earlier ones."""
     return f"{time.time_ns():016x}{uuid4().hex[:8]}"
 
 
@@ -120,11 +120,11 @@ def _unwritable(path: Path, error: OSError) -> StoreError:
 
 
 def prepare(store: Path, factors: Sequence[str], metrics: Sequence[str]) -> None:
-    """Make a folder ready for an experiment, or make sure that it is one of the same.
+    """Create the folder of an experiment, or check that it belongs to the same experiment.
 
     Raises:
-        OptionValueError: It is a store of something else.
-        StoreError: It cannot be read or written.
+        OptionValueError: The folder belongs to something else.
+        StoreError: The folder cannot be read or written.
     """
     header = store / HEADER
     meant = {"simenv_marl": VERSION, "factors": sorted(factors), "metrics": sorted(metrics)}
@@ -132,9 +132,9 @@ def prepare(store: Path, factors: Sequence[str], metrics: Sequence[str]) -> None
         store.mkdir(parents=True, exist_ok=True)
         if not header.exists():
             strange = any(not path.name.startswith((HEADER, ".")) for path in store.iterdir())
-            if strange and not header.exists():  # which another process may have made meanwhile
+            if strange and not header.exists():  # another process may have written it meanwhile
                 raise OptionValueError(f"the folder {store} holds something, and is the store of no experiment")
-            fresh = store / f"{HEADER}.{uuid4().hex}"  # replaced as a whole, so that it is there or not
+            fresh = store / f"{HEADER}.{uuid4().hex}"  # renamed as a whole: readers never see half of it
             try:
                 fresh.write_text(json.dumps(meant) + "\n", encoding="ascii")
                 os.replace(fresh, header)
@@ -162,7 +162,7 @@ def prepare(store: Path, factors: Sequence[str], metrics: Sequence[str]) -> None
 
 
 def lines(store: Path, factors: Sequence[str]) -> Iterator[tuple[Key, Known, dict[str, Any]]]:
-    """All that is stored, in the order in which it was begun: which run, what is known of it, its provenance.
+    """Yield all stored runs, in the order in which their files were begun: identity, result, provenance.
 
     Raises:
         StoreError: A file cannot be read.
@@ -172,20 +172,20 @@ def lines(store: Path, factors: Sequence[str]) -> Iterator[tuple[Key, Known, dic
             with path.open("rb") as file:
                 for number, line in enumerate(file, 1):
                     if not line.endswith(b"\n"):
-                        break  # its process was killed, or is writing it
+                        break  # its process was killed, or is still writing
                     try:
                         yield _parsed(json.loads(line), factors)
-                    except (ValueError, TypeError, LookupError, AttributeError):  # it is no JSON, or no run
+                    except (ValueError, TypeError, LookupError, AttributeError):  # not JSON, or not a run
                         warn_user(f"line {number} of {path} cannot be read, and is taken for a run that is not known")
         except OSError as error:
             raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
 
 
 def _parsed(entry: Any, factors: Sequence[str]) -> tuple[Key, Known, dict[str, Any]]:
-    """What a line tells.
+    """Return the contents of a line.
 
     Raises:
-        TypeError, LookupError, AttributeError: It is no run.
+        TypeError, LookupError, AttributeError: The line is not a run.
     """
     key = written({name: entry["factors"][name] for name in factors}), entry["contender"], entry["seed"]
     outcome = None
@@ -197,15 +197,15 @@ def _parsed(entry: Any, factors: Sequence[str]) -> tuple[Key, Known, dict[str, A
 def line_of(
     row: Mapping[str, Any], contender: str, seed: int, known: Known, provenance: str, trace: str | None = None
 ) -> str:
-    """The line of a run.
+    """Return the line of a run.
 
     Args:
         row: The factors.
-        contender: Who has decided.
-        seed: What it was reset with.
-        known: What is known of it.
-        provenance: What it was made of, as JSON.
-        trace: Where it has failed, for those who look.
+        contender: The name of the contender.
+        seed: The seed of the simulation.
+        known: The result.
+        provenance: The provenance, as JSON.
+        trace: The traceback of the error, for people who read the file.
     """
     entry: dict[str, Any] = {
         "factors": row,
@@ -222,13 +222,13 @@ def line_of(
 
 
 class Stored(NamedTuple):
-    """What a store holds.
+    """The contents of a store.
 
     Attributes:
-        runs: What is known of each run.
-        rows: All rows that are known, as JSON.
-        versions: The versions of what has run: by package, all that there were.
-        made: What runs of one row were made of, by contender.
+        runs: The result of each run.
+        rows: All rows with stored runs, as JSON.
+        versions: By package, all versions with which runs were done.
+        made: The provenance of the runs of one row, by contender.
     """
 
     runs: dict[Key, Known]
@@ -238,18 +238,18 @@ class Stored(NamedTuple):
 
 
 def read(store: Path, factors: Sequence[str], looked_at: str = "") -> Stored:
-    """All that is stored; of a run that was run twice, what did not fail, or the latest error.
+    """Read a store. If a run is stored more than once, a success counts, else the latest error.
 
     Args:
         store: The folder.
-        factors: Their names, in the order of the design.
-        looked_at: The row, as JSON, of which it is to be told what its runs were made of.
+        factors: The names of the factors, in the order of the design.
+        looked_at: The row, as JSON, whose provenance is wanted.
 
     Raises:
-        StoreError: Something cannot be read.
+        StoreError: A file cannot be read.
     """
     runs: dict[Key, Known] = {}
-    rows: dict[str, str] = {}  # each is kept once, however many runs it has
+    rows: dict[str, str] = {}  # each row's text is kept once, for all of its runs
     versions: dict[str, set[Any]] = {}
     seen: set[str] = set()
     made: dict[str, list[dict[str, Any]]] = {}
@@ -269,7 +269,7 @@ def read(store: Path, factors: Sequence[str], looked_at: str = "") -> Stored:
 
 
 def versions_in(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """The versions that provenance tells of, by package."""
+    """Return the versions of packages in a provenance."""
     own = {"python": provenance["python"]} if provenance.get("python") else {}
     return {**own, **(provenance.get("packages") or {}), **(provenance.get("dependencies") or {})}
 
@@ -277,17 +277,17 @@ def versions_in(provenance: Mapping[str, Any]) -> dict[str, Any]:
 # -- what has changed since ------------------------------------------------------------------------
 
 MADE_OF: Final = ("make", "simulation", "variant", "parameters", "points", "plugins", "policies", "options")
-"""What changes what comes of a run, of its provenance."""
+"""The parts of the provenance that affect the results of a run."""
 
 ADDRESS: Final = re.compile(" at 0x[0-9a-fA-F]+")
-"""What stands for one object in its text, and for another in that of its like."""
+"""Addresses in memory, which differ in the texts of equal objects."""
 
 
 def compare(folder: Path, stored: Stored, keys: Sequence[str]) -> None:
-    """Compare the rows with those that are stored.
+    """Compare the rows of a design with the stored ones.
 
     Raises:
-        OptionValueError: It is another experiment.
+        OptionValueError: The store belongs to another experiment.
     """
     strange = stored.rows - set(keys)
     if strange and len(strange) == len(stored.rows):
@@ -303,7 +303,7 @@ def compare(folder: Path, stored: Stored, keys: Sequence[str]) -> None:
 
 
 def warn_of_changes(folder: Path, stored: Stored, made_of: Mapping[str, dict[str, Any]]) -> None:
-    """Tell what runs are made of now and were not when the experiment was last run."""
+    """Warn if runs are now made of something else than when the experiment last ran."""
     versions = versions_in(next(iter(made_of.values()), {}))
     changed = {
         name: sorted(map(str, found - {versions[name]}))
@@ -319,7 +319,7 @@ def warn_of_changes(folder: Path, stored: Stored, made_of: Mapping[str, dict[str
             other = [
                 f"{part} {then[part][:LONGEST]} then, {text[:LONGEST]} now"
                 for part, text in parts.items()
-                if then.get(part, text) != text  # it is not known of what could not be made
+                if then.get(part, text) != text  # unknown for runs whose simulation could not be made
             ]
             if other:
                 warn_user(
@@ -330,7 +330,7 @@ def warn_of_changes(folder: Path, stored: Stored, made_of: Mapping[str, dict[str
 
 
 def _parts_of(made: Mapping[str, Any]) -> dict[str, str]:
-    """What a run is made of that changes what comes of it, as text; without addresses in memory."""
+    """Return the parts of a provenance that affect results, as text without addresses in memory."""
     options = {name: value for name, value in (made.get("options") or {}).items() if name != "driver"}
     known = {**made, "options": options}
     return {part: ADDRESS.sub("", json.dumps(known[part], sort_keys=True)) for part in MADE_OF if part in known}

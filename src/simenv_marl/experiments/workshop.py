@@ -1,4 +1,4 @@
-"""What makes the simulations of an experiment, row by row, and the plans of their episodes."""
+"""Makes the simulations of an experiment, row by row, and the plans of their episodes."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from .store import written
 Row = Mapping[str, Any]
 
 LOOKED_AT: Final = ("points", "render_modes", "render_fps")
-"""What a plan takes from a simulation, beside its class."""
+"""The attributes of a simulation that its plan depends on, besides the class."""
 
 KEPT: Final = 8
-"""So many plans are kept for each contender, for rows that differ."""
+"""The number of plans that are kept for each contender, for rows that need different ones."""
 
 
 def checked_make(make: Any, row: Row) -> None:
-    """Make sure that what makes simulations takes the factors.
+    """Check that ``make`` takes the factors.
 
     Raises:
         OptionValueError, SimulationError: It does not.
@@ -46,7 +46,7 @@ def checked_make(make: Any, row: Row) -> None:
         raise OptionValueError(
             f"{name} cannot be called with the factors {', '.join(row) or '(none)'}: {error}"
         ) from error
-    except ValueError:  # a builtin, which cannot say what it takes
+    except ValueError:  # a builtin without a signature
         pass
 
 
@@ -55,11 +55,11 @@ def _varied(variant: Variant, row: Row) -> Variant:
 
 
 class _Supply:
-    """A factory of the simulations of a row, the first of which was made already."""
+    """A factory of the simulations of a row. The first simulation exists already."""
 
     def __init__(self, make: Callable[..., Any], row: Row, first: Any) -> None:
         self._make, self._row, self._first = make, row, first
-        kind = type(first)  # in provenance it goes by the name of what it makes
+        kind = type(first)  # provenance names it after the class that it makes
         self.__name__, self.__qualname__, self.__module__ = kind.__name__, kind.__qualname__, kind.__module__
 
     def __call__(self) -> Any:
@@ -68,12 +68,12 @@ class _Supply:
 
 
 class _Drawn(NamedTuple):
-    """A plan that may serve other rows.
+    """A plan that may be used for other rows.
 
     Attributes:
         plan: The plan.
-        of: What it depends on in what it was made of, and in the simulation, by identity.
-        provenance: What an episode is made of, as JSON, but for what rows differ in.
+        of: The objects that the plan depends on, compared by identity.
+        provenance: The provenance of an episode, as JSON, without the parts in which rows differ.
     """
 
     plan: Plan
@@ -82,7 +82,7 @@ class _Drawn(NamedTuple):
 
 
 class Workshop:
-    """Makes the plans of runs. One plan serves all rows whose simulations differ in nothing that a plan is made of."""
+    """Makes the plans of runs. Rows share a plan if their simulations are alike in all that a plan depends on."""
 
     def __init__(
         self,
@@ -97,17 +97,17 @@ class Workshop:
         self._drawn: dict[str, list[_Drawn]] = {}
 
     def forget(self) -> None:
-        """Make all plans anew, since an error may have left something in them."""
+        """Forget all plans, since an error may have changed something in them."""
         self._drawn.clear()
 
     def plan(self, row: Row, contender: str) -> tuple[Plan, Callable[[int], str]]:
-        """The plan of a row's episodes.
+        """Return the plan of a row's episodes.
 
         Returns:
-            The plan, and what says as JSON, by seed, what an episode is made of.
+            The plan, and a function from seed to the provenance of the episode, as JSON.
 
         Raises:
-            BaseException: What making a simulation raises; or that it cannot work.
+            BaseException: Any exception of making a simulation or its plan.
         """
         source = self._source(row)
         variant = source if isinstance(source, Variant) else None
@@ -147,7 +147,7 @@ class Workshop:
         return plan, base
 
     def _source(self, row: Row) -> Any:
-        """What the simulations of a row are made of: a variant, or a factory."""
+        """Return the source of a row's simulations: a variant or a factory."""
         make = self._make
         if isinstance(make, Variant):
             return _varied(make, row)
@@ -160,7 +160,7 @@ class Workshop:
 
 
 def _depended_on(simulation: Any, variant: Variant | None) -> tuple[Any, ...]:
-    """What a plan depends on, to be compared by identity."""
+    """Return the objects that a plan depends on, to be compared by identity."""
     own = type(simulation), *(getattr(simulation, name, None) for name in LOOKED_AT)
     if variant is None:
         return own
@@ -178,7 +178,7 @@ def _provenance(base: str, seed: int) -> str:
 
 
 def _name_of(make: Any) -> str:
-    """The dotted name of what makes simulations; the name of a variant."""
+    """Return the dotted name of ``make``, or the name of a variant."""
     if isinstance(make, Variant):
         return make.name
     while isinstance(make, partial):

@@ -1,1 +1,1 @@
-"""Policies back in the model: in one simulation, or in many at once; what learners learn from it, and pictures."""
+"""Policies in the model, in one simulation or in many at once; trajectories for learning; plots."""

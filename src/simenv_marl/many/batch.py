@@ -1,11 +1,11 @@
-"""Many simulations side by side, whose decisions are gathered and answered together.
+"""Many simulations at once, whose decisions are gathered and answered in batches.
 
-Of each simulation there is a session and an episode, as there is of an environment. Where a batched policy is to
-answer, the episode waits until many decisions wait for the same policy. Which those are at a time depends on how many
-simulations there are; what becomes of each of them does not.
+Each simulation has a session and an episode, as in an environment. Where a batched policy decides, the episode waits
+until many decisions wait for the same policy. The number of simulations determines which decisions share a batch; it
+does not change the course of any simulation.
 
-Policies stand in the plan as ``PolicyKey``, one for each key under which they were given. Keys of the same policy share
-one ``BatchPolicy``, whose decisions are asked in ``Group`` s, each of the same spaces, so that they can be stacked.
+In the plan, a ``PolicyKey`` stands for each key of ``policies``. Keys of the same policy share one ``BatchPolicy``. Its
+decisions are asked in ``Group``s; all decisions of a group have the same spaces, so that they can be stacked.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ class BatchPolicy:
     """A policy that answers many decisions at once.
 
     Attributes:
-        keys: Under which it was given.
-        policy: The policy, to be called with observations and infos.
+        keys: The keys of ``policies`` that have this policy.
+        policy: The policy, a callable of observations and infos.
         informed: Whether it takes the infos.
-        identifying: Whether it takes what identifies each decision besides.
-        asking: Whether it asks for the environment, and so answers one decision at a time.
-        groups: Of its decisions.
+        identifying: Whether it also takes the identities of the decisions.
+        asking: Whether it asks for the environment and therefore answers one decision at a time.
+        groups: The groups of its decisions.
     """
 
     def __init__(self, policy: Callable[..., Any]) -> None:
@@ -58,13 +58,13 @@ class BatchPolicy:
         return f"the policy of {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
 
     def answers(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
-        """What the policy returns, given as much as it takes."""
+        """Call the policy with as many of the arguments as it takes, and return what it returns."""
         if self.identifying:
             return self.policy(observations, infos, identities)
         return self.policy(observations, infos)
 
     def group(self, point: BoundPoint) -> Group:
-        """The group of the decisions at a point."""
+        """Return the group of the decisions at a point."""
         group = next((group for group in self.groups if group.takes(point)), None)
         if group is None:
             group = Group(self, point)
@@ -73,15 +73,15 @@ class BatchPolicy:
 
 
 def takes_identities(policy: Callable[..., Any]) -> bool:
-    """Whether a policy has to be given a third argument, what identifies each decision."""
+    """Return whether a policy requires a third argument, the identities of the decisions."""
     return sum(p.default is p.empty for p in positional(policy)) > 2
 
 
 class PolicyKey(DeferredPolicy):
-    """What stands for a policy in a plan: the policy, and the key under which it was given.
+    """The stand-in for a policy in a plan: the policy, and the key under which it was given.
 
     Attributes:
-        place: Of its key in the policies.
+        place: The place of its key in ``policies``.
         asked: The policy.
     """
 
@@ -91,18 +91,18 @@ class PolicyKey(DeferredPolicy):
         self._groups: dict[DecisionPoint, Group] = {}
 
     def group(self, point: BoundPoint) -> Group:
-        """The group of its decisions at a point."""
+        """Return the group of its decisions at a point."""
         group = self._groups.get(point.point)
         if group is None:
             group = self._groups[point.point] = self.asked.group(point)
         return group
 
     def __call__(self, observation: Any, info: Any) -> Any:
-        """Answer one decision, where the policy is one of one decision at a time."""
+        """Answer one decision, if the policy answers one decision at a time."""
         return self.asked.policy(observation, info)
 
     def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer a decision at once, of an episode that is a branch and waits for one agent alone."""
+        """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
         group = self.group(agent.point)
         episode.pending = agent
         try:
@@ -113,24 +113,24 @@ class PolicyKey(DeferredPolicy):
 
 
 class AskingKey(AskingPolicy, PolicyKey):
-    """The same of a policy that asks for the environment, and so answers one decision at a time."""
+    """A ``PolicyKey`` of a policy that asks for the environment and therefore answers one decision at a time."""
 
     def __init__(self, place: int, asked: BatchPolicy, policy: Callable[..., Any]) -> None:
         AskingPolicy.__init__(self, policy)
         PolicyKey.__init__(self, place, asked)
 
     def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer a decision at once, of an episode that is a branch and waits for one agent alone."""
+        """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
         return self(agent.observation, agent.info)
 
 
 def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[Any, Any]:
-    """What stands for policies in a plan; what is no policy, as it is.
+    """Replace policies by their stand-ins for a plan. Values that are not policies stay as they are.
 
     Args:
         policies: The policies.
-        rewarded: Whether those that ask for the environment are waited for as well. Else they are asked where they
-            decide, as they answer one decision at a time.
+        rewarded: Whether episodes wait for policies that ask for the environment, too. Otherwise, such a policy is
+            called where it decides, since it answers one decision at a time.
     """
     known: dict[int, BatchPolicy] = {}
     found: dict[Any, Any] = {}
@@ -145,16 +145,16 @@ def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[
 
 
 class Group:
-    """Decisions that are asked together: of one policy, and in the same spaces.
+    """Decisions that are answered in one batch: those of one policy in the same spaces.
 
     Attributes:
         asked: The policy.
-        point: One of the points at which they are decided; the others are alike.
-        stack: Stacks observations.
+        point: One of the points of the decisions; the others have the same spaces.
+        stack: A callable that stacks observations.
         waiting: The episodes whose decisions wait.
-        places: The places of their seeds among the seeds.
-        observations: Theirs.
-        book: What is noted of the decisions; None where no trajectories are collected.
+        places: The index of each waiting episode's seed.
+        observations: The observation of each waiting episode.
+        book: The records of the decisions; None if no trajectories are collected.
     """
 
     __slots__ = ("_discrete", "asked", "book", "observations", "places", "point", "stack", "waiting")
@@ -164,13 +164,13 @@ class Group:
         self.stack = stacker(point.definition.observation_space, cast=True)
         self.waiting: list[Episode] = []
         self.places: list[int] = []
-        # Kept beside the episodes: to ask every one of many suspended episodes again is to wait for their memory.
+        # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
         self.observations: list[Any] = []
         self.book: Any = None
         self._discrete = not point.definition.action_space.shape
 
     def takes(self, point: BoundPoint) -> bool:
-        """Whether decisions at a point can be stacked with these."""
+        """Return whether decisions at a point can be stacked with those of this group."""
         own, other = self.point.definition, point.definition
         return point is self.point or (
             own.observation_space == other.observation_space
@@ -179,18 +179,18 @@ class Group:
         )
 
     def ask(self, observations: Any, waiting: Sequence[Episode]) -> tuple[list[Any], Mapping[str, Any]]:
-        """Have the policy answer.
+        """Ask the policy for actions.
 
         Args:
-            observations: Of those who wait, stacked.
+            observations: The stacked observations of the waiting decisions.
             waiting: The episodes that wait.
 
         Returns:
-            An action for each, and what else the policy has returned.
+            The list of actions, and the dict of extras that the policy returned.
 
         Raises:
-            InvalidActionError: There is not one action for each.
-            BaseException: Whatever the policy raises.
+            InvalidActionError: The policy did not return one action for each decision.
+            BaseException: Any exception of the policy.
         """
         asked = self.asked
         infos: list[Any] = []
@@ -198,7 +198,7 @@ class Group:
             for episode in waiting:
                 agent: Any = episode.pending
                 infos.append(agent.info)
-                agent.info = {}  # what a policy does to its own is not to be seen at the next decision
+                agent.info = {}  # a policy may change its info; the next decision gets a new one
         try:
             identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
             answers = _each(waiting) if asked.asking else asked.answers(observations, infos, identities)
@@ -225,7 +225,7 @@ class Group:
 
 
 def _each(waiting: Sequence[Episode]) -> Any:
-    """What a policy answers that asks for the environment, one decision after the other."""
+    """Ask a policy that asks for the environment, one decision after the other."""
     answers = []
     for episode in waiting:
         agent: Any = episode.pending
@@ -242,16 +242,16 @@ def _each(waiting: Sequence[Episode]) -> Any:
 
 
 class Watcher(Protocol):
-    """What is told of what happens in the episodes."""
+    """An observer of the episodes."""
 
     def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
-        """Decisions are going to be answered; the observations are the watcher's to keep."""
+        """Note that decisions are about to be answered. The watcher may keep the observations."""
 
     def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
-        """They have been answered."""
+        """Note that the policy has answered them."""
 
     def moved(self, episode: Episode) -> None:
-        """An episode stands at its next decision, or is over."""
+        """Note that an episode has reached its next decision or its end."""
 
 
 def run(
@@ -261,25 +261,25 @@ def run(
     finish: Callable[[int, Any], Callable[[], None] | None],
     watcher: Watcher | None = None,
 ) -> None:
-    """Run one simulation per seed, and have their policies answer.
+    """Run one simulation per seed. Batched policies answer the decisions.
 
     Args:
-        plan: What they are made of, with a ``PolicyKey`` for each policy.
-        seeds: What they are reset with.
-        size: How many there may be at a time.
-        finish: Called with the place of a seed and its simulation, as soon as that has ended. What it returns is called
-            as soon as that is closed.
-        watcher: What is told of rewards and ends; None: agents are not rewarded.
+        plan: The plan of the episodes, with a ``PolicyKey`` for each policy.
+        seeds: The seeds of the simulations.
+        size: The largest number of simulations at a time.
+        finish: Called with the index of a seed and its simulation when the simulation has ended. If it returns a
+            callable, that is called after the simulation is closed.
+        watcher: The observer of rewards and ends. None: agents are not rewarded.
 
     Raises:
-        BaseException: Whatever a model, a mapping, a policy or ``finish`` raises. All simulations are unwound.
+        BaseException: Any exception of a model, a mapping, a policy or ``finish``. All simulations are unwound.
     """
     with outside_simulation(), processes_kept():
         _Batches(plan, seeds, size, finish, watcher).run()
 
 
 def _checked(episode: Episode, action: Any) -> Any:
-    """A checked action of the pending agent."""
+    """Return the action of the pending agent, checked."""
     agent: Any = episode.pending
     try:
         return action if action is RULE else agent.point.checked(action, agent.name, agent.mask)
@@ -289,16 +289,16 @@ def _checked(episode: Episode, action: Any) -> Any:
 
 
 def _blame(number: int, error: BaseException) -> None:
-    """Do nothing: the notes of an error tell its seed already."""
+    """Do nothing: the notes of an error name its seed already."""
 
 
 CROWD: Final = 256
-"""So many simulations are under way at first. Of more, each has left the processor's caches when its turn comes again,
-and takes twice as long. A policy that takes longer than all of them is worth that: then there may be more."""
+"""The number of simulations at first. With more, each has left the processor's caches when its turn comes again, and
+takes twice as long. If the policy takes longer than all simulations together, more simulations pay off."""
 
 
 class _Batches:
-    """The simulations that are under way."""
+    """The simulations that are running."""
 
     def __init__(
         self,
@@ -314,7 +314,7 @@ class _Batches:
         self._crowd = min(size, CROWD)
         self._next = 0
         self._sessions: dict[int, Session] = {}  # by the place of their seed
-        # By the power of two that is not above their number: groups of which so many decisions wait.
+        # Groups by the number of their waiting decisions: place i has those with 2**i to 2**(i + 1) - 1.
         self._by_size: list[dict[Group, None]] = [{} for _ in range(size.bit_length())]
 
     def run(self) -> None:
@@ -327,15 +327,15 @@ class _Batches:
             raise
 
     def _largest(self) -> Group:
-        """A group of which more than half as many decisions wait as of any other.
+        """Return a group that has more than half as many waiting decisions as any other.
 
-        To wait for large ones takes fewer calls of policies; to look for the very largest would take the longer, the
+        Waiting for large groups saves calls of policies. Searching for the very largest group would take longer, the
         more groups there are.
         """
         return next(iter(next(groups for groups in reversed(self._by_size) if groups)))
 
     def _answer(self, group: Group) -> None:
-        """Have decisions answered, and let each simulation go on to its next one."""
+        """Have the decisions of a group answered, and run each simulation to its next decision."""
         waiting, group.waiting = group.waiting, []
         places, group.places = group.places, []
         seen, group.observations = group.observations, []
@@ -347,7 +347,7 @@ class _Batches:
         if watcher is not None:
             watcher.asking(group, places, waiting, kept)
         step_all(waiting, list(map(_checked, waiting, actions)), _blame)
-        waiting.reverse()  # taken out one by one, so that nothing holds those that have ended
+        waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
         for place in places:
             self._settle(place, waiting.pop())
         if watcher is not None:
@@ -357,7 +357,7 @@ class _Batches:
         self._refill()
 
     def _settle(self, place: int, episode: Episode) -> None:
-        """See to an episode that stands at its next decision, or is over."""
+        """Queue an episode that waits at a decision, or end it if it is over."""
         if self._watcher is not None:
             self._watcher.moved(episode)
         agent = episode.pending
@@ -370,7 +370,7 @@ class _Batches:
         gathered = group.waiting
         gathered.append(episode)
         group.places.append(place)
-        # Kept beside the episodes: to ask every one of many suspended episodes again is to wait for their memory.
+        # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
         group.observations.append(agent.observation)
         if self._watcher is None:
             agent.observation = None
@@ -379,14 +379,14 @@ class _Batches:
             self._grow(group, many)
 
     def _grow(self, group: Group, number: int) -> None:
-        """So many decisions of a group wait now, a power of two."""
+        """Note that the number of waiting decisions of a group has reached a power of two."""
         place = number.bit_length() - 1
         if place:
             del self._by_size[place - 1][group]
         self._by_size[place][group] = None
 
     def _refill(self) -> None:
-        """Begin simulations, until there are as many as there may be."""
+        """Start simulations until the limit is reached."""
         while self._next < len(self._seeds) and len(self._sessions) < self._crowd:
             place, seed = self._next, self._seeds[self._next]
             self._next += 1
@@ -412,7 +412,7 @@ class _Batches:
         del self._sessions[place]
 
     def _unwind(self, error: BaseException) -> None:
-        """Unwind what is suspended, after an error in one of them."""
+        """Unwind all suspended simulations after an error in one of them."""
         for place, session in self._sessions.items():
             try:
                 session.close()

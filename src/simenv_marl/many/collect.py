@@ -1,4 +1,4 @@
-"""Many simulations at once: policies that answer the decisions of all of them together."""
+"""Many simulations at once, with policies that answer the decisions of all of them in batches."""
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
@@ -32,52 +32,52 @@ def simulate_many(
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
 ) -> list[Any]:
-    """Run one simulation per seed, with policies that answer the decisions of many simulations at once.
+    """Run one simulation per seed, with policies that answer the decisions of many simulations in batches.
 
-    What becomes of each simulation is what ``simulate`` makes of it, with the same policies for one decision at a
-    time; for every ``batch_size`` and number of workers, as long as what a policy answers to one row does not depend on
-    the others.
+    Each simulation ends as it would end with ``simulate`` and the same policies. The results do not depend on
+    ``batch_size`` and ``workers``, as long as a policy's answer to one row does not depend on the other rows.
 
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
-        policies: Who decides: from agent or decision point to a callable of the observations, or of the observations
-            and the infos, or of these and the identities, of as many decisions as wait for it. The observations are
-            stacked, ``(batch, *shape)``; where the space is a ``Dict`` or a ``Tuple``, a dict or a tuple of stacks. The
-            infos are a list of dicts, the identities one of pairs: the seed of the episode, and the number of the
-            decision among all in it.
-            It returns as many actions, in the same order: an array, what becomes one (a tensor), a sequence, or a dict
-            of these. ``RULE`` in place of an action, or of all of them, leaves it to the model. A tuple of the actions
-            and a dict is taken for actions alone (see ``collect_episodes``). Policies that are the same object are
-            asked together; a policy is never asked for decisions in different spaces at once. A ``Variant``'s own
-            policies are asked one by one.
-        seeds: What the simulations are reset with, non-negative integers.
-        points: The decision points, as ``generate_env`` takes them. None and no policies: none.
-        collect: Called with each simulation as soon as it has ended; returns what is to be kept of it. None: the
+        policies: The policies: a dict from an agent or a decision point to a callable. The callable gets the
+            observations of all decisions that wait for it; or the observations and the infos; or the observations, the
+            infos and the identities. Observations are stacked, ``(batch, *shape)``; for a ``Dict`` or ``Tuple`` space
+            they are a dict or a tuple of stacks. The infos are a list of dicts. The identities are a list of pairs: the
+            seed of the episode, and the number of the decision among all decisions of the episode. The callable returns
+            as many actions, in the same order: an array, something that NumPy can convert to one (a tensor), a
+            sequence, or a dict of these. ``RULE`` in place of one action, or of all, leaves the decision to the model.
+            A tuple of actions and a dict is allowed; the dict is ignored here (see ``collect_episodes``). If several
+            keys have the same policy object, their decisions share batches. One batch never mixes different spaces. The
+            policies of a ``Variant`` answer one decision at a time.
+        seeds: The seeds of the simulations, non-negative integers.
+        points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor ``policies``, there are
+            no decision points and the plain models run.
+        collect: A callable of a simulation that has just ended. It returns what to keep of it. None: keep the
             simulation itself.
-        batch_size: How many simulations may be suspended together; in each worker. No more than 256 of them are
-            as long as policies take less time than simulations do.
-        workers: How many processes share the work, by ``joblib``: 0 for none but this one, -1 for as many as
-            joblib's backend has. The simulation, the points, the policies, the options and what is collected have to
-            be such as can be pickled, by reference or by value.
-        progress: Whether to show a bar, by ``tqdm``.
-        **options: As ``simulate`` takes them.
+        batch_size: The largest number of simulations that are suspended together, in each worker process. At most 256
+            are suspended while the policies take less time than the simulations.
+        workers: The number of worker processes, which ``joblib`` runs. 0: this process alone. -1: as many as joblib's
+            backend has. The simulation, points, policies, options and collected values must be picklable, by reference
+            or by value.
+        progress: Whether to show a progress bar, by ``tqdm``.
+        **options: The options of ``simulate``.
 
     Returns:
-        What was collected for each seed, in the order of the seeds.
+        The collected value of each seed, in the order of the seeds.
 
     Raises:
-        OptionValueError: An argument cannot have its value.
-        InvalidActionError: A policy has not returned one legal action for each decision.
+        OptionValueError: An argument has an invalid value.
+        InvalidActionError: A policy did not return one legal action for each decision.
         MissingExtraError: joblib or tqdm is missing.
-        SimEnvError: Something else cannot work; the leaf says what.
-        BaseException: Whatever a model, a mapping, a policy or ``collect`` raises, with a note that says of which
-            seed. All other simulations are unwound before.
+        SimEnvError: Something else cannot work. The subclass tells what.
+        BaseException: Any exception of a model, a mapping, a policy or ``collect``, with a note that names the seed.
+            All other simulations are unwound first.
     """
     checked = checked_seeds(seeds)
     check_numbers(batch_size, workers)
     _check_collect(collect)
     arguments = (simulation, _checked_policies(policies), points, collect, int(batch_size), options)
-    # Made here also where the work is done elsewhere, so that what cannot work is found out before.
+    # The plan is made here even if workers do the work: errors show up before any work starts.
     plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unanswered=True)
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:
@@ -99,7 +99,7 @@ def _simulate_part(
     options: dict[str, Any],
     seeds: list[int],
 ) -> list[Any]:
-    """In a worker: simulate a part of the seeds."""
+    """Simulate a part of the seeds, in a worker process."""
     plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unanswered=True)
     return _simulate(plan, collect, batch_size, seeds, None)
 
@@ -130,36 +130,36 @@ def collect_episodes(
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
 ) -> dict[Any, Trajectories]:
-    """Play one episode per seed, with policies that answer many at once, and keep what learners learn from.
+    """Play one episode per seed with policies that answer in batches, and return the trajectories for learning.
 
-    Those for whom policies answer are rewarded and end as the agents of an AEC environment are that is played with the
-    same policies; all others run their rule. An episode in which nobody decides is none here, and no error.
+    Agents that have a policy are rewarded and end as in an AEC environment that is played with the same policies. All
+    other agents follow their rule. An episode without decisions yields no trajectory and is not an error.
 
     Args:
         simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
-        policies: Who decides, as in ``simulate_many``; ``RULE`` is a policy like any other. A policy may return
-            a tuple of the actions and a dict of arrays of shape ``(batch, ...)`` (log-probabilities, values), which
-            become ``extras``; always of the same names.
-        seeds: What the simulations are reset with, non-negative integers.
+        policies: The policies, as ``simulate_many`` takes them. ``RULE`` is a policy like any other. A policy may
+            return a tuple of the actions and a dict of arrays of shape ``(batch, ...)`` (log-probabilities, values).
+            The arrays become ``extras``; the dict must always have the same keys.
+        seeds: The seeds of the simulations, non-negative integers.
         points: The decision points, as ``generate_env`` takes them.
-        collect: Called with each simulation as soon as it has ended; what it returns stands in ``collected``.
-        batch_size: How many simulations may be suspended together; in each worker. No more than 256 of them are
-            as long as policies take less time than simulations do.
-        workers: How many processes share the work: see ``simulate_many``.
-        progress: Whether to show a bar, by ``tqdm``.
-        **options: As ``aec_env`` takes them. ``max_steps`` truncates. Whoever has a policy is declared, whatever
-            ``possible_agents`` says.
+        collect: A callable of a simulation that has just ended. What it returns is in ``collected``.
+        batch_size: The largest number of simulations that are suspended together, in each worker process. At most 256
+            are suspended while the policies take less time than the simulations.
+        workers: The number of worker processes: see ``simulate_many``.
+        progress: Whether to show a progress bar, by ``tqdm``.
+        **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that has a policy counts as
+            declared, whatever ``possible_agents`` says.
 
     Returns:
-        By the keys of ``policies``, what those have lived through for whom each policy has answered.
+        A dict from each key of ``policies`` to the trajectories of the agents that its policy answered for.
 
     Raises:
-        OptionValueError: An argument cannot have its value, or the extras do not fit the decisions.
-        InvalidActionError: A policy has not returned one legal action for each decision.
+        OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
+        InvalidActionError: A policy did not return one legal action for each decision.
         MissingExtraError: joblib or tqdm is missing.
-        SimEnvError: Something else cannot work; the leaf says what.
-        BaseException: Whatever a model, a mapping or a policy raises, with a note that says of which seed. All other
-            simulations are unwound before.
+        SimEnvError: Something else cannot work. The subclass tells what.
+        BaseException: Any exception of a model, a mapping or a policy, with a note that names the seed. All other
+            simulations are unwound first.
     """
     checked = checked_seeds(seeds)
     check_numbers(batch_size, workers)
@@ -188,14 +188,14 @@ def learners_plan(
     *,
     all_points: bool = False,
 ) -> tuple[Plan, dict[Any, int]]:
-    """The plan of the episodes, and the places of the policies by their keys.
+    """Return the plan of the episodes, and the place of each policy by its key.
 
     Args:
         simulation: As ``collect_episodes`` takes it.
-        policies: As well.
-        points: As well.
-        options: As well.
-        all_points: Whether those for whom no policy answers are agents as well, whose decisions are left to the rule.
+        policies: As ``collect_episodes`` takes them.
+        points: As ``collect_episodes`` takes them.
+        options: As ``collect_episodes`` takes them.
+        all_points: Whether entities without a policy are agents as well, whose decisions follow the rule.
     """
     asked = {key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()}
     found = policy_keys(asked, rewarded=True)
@@ -218,7 +218,7 @@ def _collect_part(
     options: dict[str, Any],
     seeds: list[int],
 ) -> dict[int, Trajectories]:
-    """In a worker: play a part of the episodes."""
+    """Play a part of the episodes, in a worker process."""
     plan, keys = learners_plan(simulation, policies, points, options)
     return _collect(plan, keys, collect, batch_size, seeds, None)
 
@@ -249,10 +249,10 @@ def _collect(
 
 
 def checked_seeds(seeds: Any) -> list[int]:
-    """Seeds as a list of python integers.
+    """Return seeds as a list of Python integers.
 
     Raises:
-        OptionValueError: They are none.
+        OptionValueError: These are not valid seeds.
     """
     if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
         raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {shown(seeds)}")
@@ -276,10 +276,10 @@ def _check_collect(collect: Any) -> None:
 
 
 def check_numbers(batch_size: Any, workers: Any) -> None:
-    """Make sure that there may be so many simulations, and so many processes.
+    """Check ``batch_size`` and ``workers``.
 
     Raises:
-        OptionValueError: There may not.
+        OptionValueError: One of the numbers is invalid.
     """
     for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:

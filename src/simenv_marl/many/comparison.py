@@ -1,4 +1,4 @@
-"""The model's own rule and policies, decision by decision."""
+"""Compares the model's own rule with policies, decision by decision."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,18 +21,18 @@ from .rule_actions import check_knowable, check_known
 from .trajectories import Trajectories
 
 PLAYING: Final = ("batch_size", "collect", "progress", "workers")
-"""Options of ``collect_episodes`` that are none of the environment."""
+"""Options of ``collect_episodes`` that are not options of the environment."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What the model's own rule has decided, and what a policy would have. Made by ``compare_with_rule``.
+    """The decisions of the model's own rule, and what a policy would have decided. Made by ``compare_with_rule``.
 
     Attributes:
-        trajectories: What the rule has lived through, and decided.
-        policy_actions: Like ``trajectories.actions``: what the policy would have done on the same observation. Where it
-            would have left the decision to the rule, the rule's action.
-        agreements: ``(N,)`` bool: in which decisions they agree.
+        trajectories: The trajectories of the rule.
+        policy_actions: The actions that the policy would have taken on the same observations, in the form of
+            ``trajectories.actions``. Where the policy would have left the decision to the rule, the rule's action.
+        agreements: ``(N,)`` bool: whether both agree, for each decision.
     """
 
     trajectories: Trajectories
@@ -41,7 +41,7 @@ class Comparison:
 
     @property
     def agreement(self) -> float:
-        """In which share of the decisions they agree; nan of none."""
+        """The share of decisions in which both agree, 0 to 1; nan if there are no decisions."""
         return float(self.agreements.mean()) if len(self.agreements) else float("nan")
 
     def __repr__(self) -> str:
@@ -58,29 +58,30 @@ def compare_with_rule(
     tolerance: float = 0.0,
     **options: Unpack[EpisodeOptions],
 ) -> dict[Any, Comparison]:
-    """Let the model's own rule decide, and ask policies what they would have done instead.
+    """Let the model's own rule decide, and record what policies would have decided instead.
 
-    At each decision the policy sees what it would see if it decided; then the rule decides. So the episodes are those
-    of the plain model, unless there are others.
+    At each decision the policy gets what it would get if it decided; then the rule decides. So the episodes are those
+    of the plain model, unless ``others`` names policies that decide.
 
     Args:
         simulation: As ``collect_episodes`` takes it.
-        policies: Who is asked, as ``collect_episodes`` takes them. It is not checked whether an
-            action would have been legal.
-        seeds: What the simulations are reset with.
+        policies: The policies to compare, as ``collect_episodes`` takes them. Their actions are not checked for being
+            legal.
+        seeds: The seeds of the simulations.
         points: The decision points, as ``generate_env`` takes them.
-        others: Who decides where no rule does, as ``collect_episodes`` takes policies. They are not compared.
-        tolerance: By how much numbers in actions may differ for the two to agree; those of ``Box`` spaces of floats.
+        others: Policies that decide instead of the rule, as ``collect_episodes`` takes policies. They are not compared.
+        tolerance: The largest difference between numbers in two actions that agree. It applies to ``Box`` spaces of
+            floats.
         **options: As ``collect_episodes`` takes them.
 
     Returns:
-        For each key of ``policies``, the comparison.
+        A dict from each key of ``policies`` to its comparison.
 
     Raises:
-        DefinitionError: It is not known which actions the rule's decisions are.
-        OptionValueError: An argument cannot have its value.
-        InvalidActionError: A policy has not returned one action for each decision.
-        SimEnvError: As ``collect_episodes`` does; so are all other errors.
+        DefinitionError: The actions that correspond to the rule's decisions are unknown.
+        OptionValueError: An argument has an invalid value.
+        InvalidActionError: A policy did not return one action for each decision.
+        SimEnvError: As ``collect_episodes`` raises it; this holds for all other errors, too.
     """
     if not isinstance(policies, Mapping) or not all(callable(policy) for policy in policies.values()):
         raise OptionValueError(f"policies must be a dict from agents or points to callables, not {shown(policies)}")
@@ -98,7 +99,7 @@ def compare_with_rule(
 
 
 class _Onlooker:
-    """A policy that notes what another would do, and leaves it to the rule."""
+    """A policy that records what another policy would do, and leaves the decision to the rule."""
 
     def __init__(self, policy: Any) -> None:
         self.policy = policy
@@ -113,7 +114,7 @@ class _Onlooker:
 
 
 class _AskingOnlooker:
-    """The same for a policy that asks for the environment."""
+    """An ``_Onlooker`` for a policy that asks for the environment."""
 
     def __init__(self, policy: Any) -> None:
         self.asked = AskingPolicy(policy)
@@ -129,7 +130,7 @@ def _onlooker(policy: Any) -> Any:
 
 
 def _compared(found: Trajectories, tolerance: float) -> Comparison:
-    """Make the comparison of what an onlooker has noted."""
+    """Make a comparison from the records of an onlooker."""
     noted = found.extras.get("noted", np.zeros(0)).tolist()
     found = replace(found, extras={name: values for name, values in found.extras.items() if name != "noted"})
     if not len(found):
@@ -150,7 +151,7 @@ def _row(stack: Any, row: int) -> Any:
 
 
 def _agreeing(one: Any, other: Any, tolerance: float) -> NDArray[np.bool_]:
-    """In which rows two stacks agree."""
+    """Return in which rows two stacks agree."""
     if isinstance(one, Mapping):
         return _everywhere([_agreeing(part, other[key], tolerance) for key, part in one.items()])
     if isinstance(one, tuple):

@@ -1,7 +1,7 @@
-"""Demonstrations: what the model's own rule, or policies, have done, as data sets for learners that imitate it.
+"""Demonstrations: data sets of the decisions of the model's rule, or of policies, for imitation and offline learning.
 
-Everything here is ``collect_episodes`` and what is made of its ``Trajectories``. Minari is only imported where a data
-set is written.
+They are made of the ``Trajectories`` that ``collect_episodes`` returns. Minari is imported only when a data set is
+written.
 """
 
 import shutil
@@ -37,35 +37,35 @@ def record_dataset(
     progress: bool = False,
     **options: Unpack[EpisodeOptions],
 ) -> Any:
-    """Play one episode per seed, and write what was decided as a Minari data set, for offline learners.
+    """Play one episode per seed, and write the decisions as a Minari data set for offline learning.
 
-    A data set is of one policy, and an episode in it is what one agent has lived through: that of an agent alone in the
-    single view, or of each of many that share the policy. See ``save_dataset`` for what is in it.
+    A data set has the decisions of one policy. Each episode in it is the trajectory of one agent: the agent of the
+    single view, or one of many agents that share the policy. ``save_dataset`` describes the contents.
 
     Args:
-        dataset_id: What the data set is called, such as ``"greenhouse/rule-v0"``; where there are several policies, a
-            dict from their keys to such names. Those without a name take part, and are not recorded.
+        dataset_id: The name of the data set, such as ``"greenhouse/rule-v0"``. With several policies: a dict from their
+            keys to such names. Policies without a name decide, but are not recorded.
         simulation: As ``collect_episodes`` takes it.
-        policies: Who decides: ``RULE``, a callable, or a ``Mixture``, as ``collect_episodes`` takes them. What the rule
-            decides is known as an action where its point has a ``rule_action_mapping``, or none is needed.
-        seeds: What the simulations are reset with, non-negative integers.
+        policies: The policies: ``RULE``, a callable, or a ``Mixture``, as ``collect_episodes`` takes them. The rule's
+            decisions are known as actions if the point has a ``rule_action_mapping`` or needs none.
+        seeds: The seeds of the simulations, non-negative integers.
         points: The decision points, as ``generate_env`` takes them.
-        metadata: What Minari is told besides: see ``save_dataset``. Without an ``algorithm_name``, that is the name of
-            the policy. What ``provenance`` says is always told.
-        batch_size: How many simulations may be suspended together: see ``collect_episodes``, as for the next two.
-        workers: How many processes share the work.
-        progress: Whether to show a bar.
-        **options: As ``aec_env`` takes them.
+        metadata: Metadata for Minari: see ``save_dataset``. ``algorithm_name`` defaults to the name of the policy. The
+            result of ``provenance`` is always added.
+        batch_size: The largest number of simulations that are suspended together: see ``collect_episodes``.
+        workers: The number of worker processes: see ``collect_episodes``.
+        progress: Whether to show a progress bar: see ``collect_episodes``.
+        **options: The options of ``aec_env``.
 
     Returns:
-        The ``minari.MinariDataset``; where ``dataset_id`` is a dict, a dict of these. An error or an interrupt leaves
-        none of them behind.
+        The ``minari.MinariDataset``. If ``dataset_id`` is a dict: a dict of data sets. After an error or an interrupt,
+        none of them is left on disk.
 
     Raises:
-        OptionValueError: There is such a data set already, or an argument cannot have its value.
-        DefinitionError: It is not known which actions the rule's decisions are.
+        OptionValueError: The data set exists already, or an argument has an invalid value.
+        DefinitionError: The actions that correspond to the rule's decisions are unknown.
         MissingExtraError: Minari is missing.
-        SimEnvError: As ``collect_episodes`` does; so are all other errors.
+        SimEnvError: As ``collect_episodes`` raises it; this holds for all other errors, too.
     """
     if not isinstance(policies, Mapping) or not policies:
         raise OptionValueError(f"policies must be a dict from agents or points to policies, not {shown(policies)}")
@@ -116,27 +116,27 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]
 
 
 def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -> Any:
-    """Write what one policy has decided as a Minari data set.
+    """Write the decisions of one policy as a Minari data set.
 
-    Each trajectory becomes an episode, with its seed. Its observations are one more than its actions, the last one is
-    what the agent came to; terminations and truncations are Gymnasium's. Its infos, as many as observations, are
-    ``by_rule``, ``action_mask`` and ``time`` where there are such, and all extras that are numbers; of the end, where
-    nothing was decided, they are zero, and all actions legal. Its metadata has the ``agent``, the ``episode`` as the
-    place of its seed, and the ``turn`` of its first decision.
+    Each trajectory becomes an episode, with its seed. An episode has one more observation than actions; the last one is
+    the agent's final observation. Terminations and truncations follow Gymnasium. The infos have one row per
+    observation: ``by_rule``, ``action_mask`` and ``time`` where they exist, and all numeric extras. The row of the
+    final observation, where nothing was decided, has zeros, and all actions are legal. The episode's metadata has the
+    ``agent``, the ``episode`` (the index of its seed), and the ``turn`` of its first decision.
 
     Args:
-        dataset_id: What the data set is called, by Minari's rules: ``"(namespace/)name-v0"``.
-        trajectories: What ``collect_episodes`` has returned under one key.
+        dataset_id: The name of the data set, by Minari's rules: ``"(namespace/)name-v0"``.
+        trajectories: The trajectories that ``collect_episodes`` returned under one key.
         **metadata: As ``minari.create_dataset_from_buffers`` takes it: ``author``, ``description``, ``env`` or
-            ``eval_env`` (with which to recover the environment), ``algorithm_name``, ``data_format``, ... Images are
-            stored as they are, unless ``jpeg_encoding=True``.
+            ``eval_env`` (from which readers recover the environment), ``algorithm_name``, ``data_format``, ... Images
+            are stored as they are, unless ``jpeg_encoding=True``.
 
     Returns:
-        The ``minari.MinariDataset``. It lies where Minari keeps its data sets, in ``MINARI_DATASETS_PATH``.
+        The ``minari.MinariDataset``. It is stored in Minari's folder, ``MINARI_DATASETS_PATH``.
 
     Raises:
-        OptionValueError: There is such a data set already, there is nothing to write, or the name is none.
-        DefinitionError: It is not known which actions the rule's decisions are.
+        OptionValueError: The data set exists already, there are no decisions to write, or the name is invalid.
+        DefinitionError: The actions that correspond to the rule's decisions are unknown.
         MissingExtraError: Minari is missing.
     """
     if not isinstance(trajectories, Trajectories):
@@ -151,7 +151,7 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
     given = {"jpeg_encoding": False, **metadata}
     try:
         with warnings.catch_warnings():
-            # Of metadata that is missing. Users know best whether readers of the data set need it.
+            # Warnings about missing metadata: users know best whether readers of the data set need it.
             warnings.filterwarnings("ignore", r"`\w+` is set to None|env_spec is None")
             dataset = minari.create_dataset_from_buffers(
                 dataset_id,
@@ -162,13 +162,13 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
             )
         dataset.storage.update_episode_metadata(_episode_metadata(trajectories))
     except BaseException:
-        shutil.rmtree(path, ignore_errors=True)  # half a data set is none
+        shutil.rmtree(path, ignore_errors=True)  # never leave half a data set
         raise
     return dataset
 
 
 def _check_free(names: Iterable[str]) -> list[Any]:
-    """The paths of data sets that there are not yet."""
+    """Return the paths of the data sets, which must not exist yet."""
     try:
         from minari.dataset.minari_dataset import parse_dataset_id
         from minari.storage.datasets_root_dir import get_dataset_path
@@ -196,14 +196,14 @@ def _check_writable(name: str, found: Trajectories) -> None:
 
 
 def _episodes(found: Trajectories, buffer: Any) -> Iterable[Any]:
-    """Of each trajectory what Minari makes an episode of."""
+    """Make a Minari episode buffer of each trajectory."""
     infos = _infos(found)
     ends = found.starts + found.lengths
     for place, (start, end) in enumerate(zip(found.starts.tolist(), ends.tolist(), strict=True)):
         own, last = np.arange(start, end), np.array([place])
         seed = found.seeds[found.episodes[start]]
         yield buffer(
-            seed=seed if seed < 2**63 else str(seed),  # which Minari reads as an integer all the same
+            seed=seed if seed < 2**63 else str(seed),  # Minari reads the string as an integer
             observations=_listed(joined([taken(found.observations, own), taken(found.last_observations, last)])),
             actions=_listed(taken(found.actions, own)),
             rewards=found.rewards[start:end],
@@ -214,7 +214,7 @@ def _episodes(found: Trajectories, buffer: Any) -> Iterable[Any]:
 
 
 def _infos(found: Trajectories) -> dict[str, tuple[Any, Any]]:
-    """What stands in the infos: of each decision, and of each end."""
+    """Return the infos: by name, the rows of the decisions and those of the ends."""
     number = len(found.starts)
     infos: dict[str, tuple[Any, Any]] = {"by_rule": (found.by_rule, np.zeros(number, np.bool_))}
     if found.action_masks is not None:
@@ -234,7 +234,7 @@ def _infos(found: Trajectories) -> dict[str, tuple[Any, Any]]:
 
 
 def _listed(stack: Any) -> Any:
-    """A stack, with lists in place of arrays of objects."""
+    """Return a stack with lists in place of arrays of objects."""
     if isinstance(stack, Mapping):
         return {key: _listed(part) for key, part in stack.items()}
     if isinstance(stack, tuple):

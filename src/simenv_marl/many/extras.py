@@ -1,4 +1,4 @@
-"""Packages of the extras, which are imported when they are needed."""
+"""Imports packages of the extras when they are needed."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from ..errors import MissingExtraError
 
 
 def needed(module: str, what: str, *, extra: str) -> Any:
-    """A module of an extra.
+    """Import a module that an extra installs.
 
     Args:
-        module: Its dotted name.
-        what: What needs it.
+        module: The dotted name of the module.
+        what: The feature that needs it, for the error message.
         extra: The extra that installs it.
 
     Raises:
-        MissingExtraError: It is not installed.
+        MissingExtraError: The module is not installed.
     """
     try:
         return import_module(module)

@@ -1,4 +1,4 @@
-"""Mixtures of policies, and what else is to be known of policies that learners give."""
+"""Mixtures of policies, and helpers for the policies that users give."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite
@@ -15,11 +15,11 @@ from .batch import BatchPolicy
 
 
 class Mixture:
-    """A policy of many that leaves each decision to one of several, which is drawn for it.
+    """A policy for ``collect_episodes`` that draws, for each decision, which of several policies answers it.
 
-    What is drawn depends on the seed of the episode and the number of the decision in it, and on nothing else: not on
-    what else runs beside it, in however many processes. Which one has decided stands in ``extras["component"]``; what
-    they have returned beside their actions is dropped.
+    The draw depends only on the seed of the episode and the number of the decision in it. It does not depend on other
+    simulations or on the number of processes. ``extras["component"]`` has the index of the policy that decided; the
+    extras of the policies themselves are dropped.
 
     Example:
         ``Mixture({RULE: 0.8, trained: 0.2})``
@@ -29,11 +29,11 @@ class Mixture:
         """Mix policies.
 
         Args:
-            parts: A dict from policy to weight, or pairs of these. A policy is what ``collect_episodes`` takes; a
-                weight is not negative, and they need not sum to one.
+            parts: A dict from policy to weight, or an iterable of such pairs. A policy is anything that
+                ``collect_episodes`` takes. Weights are not negative and need not sum to one.
 
         Raises:
-            OptionValueError: There are no policies, or their weights are none.
+            OptionValueError: There are no policies, or a weight is invalid.
         """
         pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
         if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
@@ -66,7 +66,7 @@ class Mixture:
         return f"<Mixture: {', '.join(f'{weight:.3g} {name_of(policy)}' for policy, weight in parts)}>"
 
     def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
-        """Answer decisions, as policies of ``collect_episodes`` do."""
+        """Answer a batch of decisions, as policies of ``collect_episodes`` do."""
         component = np.searchsorted(self._bounds, _drawn(identities), side="right")
         actions: list[Any] = [RULE] * len(identities)
         for number, asked in enumerate(self._asked):
@@ -83,7 +83,7 @@ class Mixture:
 
 
 def _drawn(identities: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
-    """A number in [0, 1) for each decision, that depends on its identity alone."""
+    """Return a number in [0, 1) for each decision, which depends on its identity alone."""
     # SplitMix64, twice: a generator of its own for each decision would take longer than the decision.
     state = np.array([seed % 2**64 for seed, _ in identities], np.uint64)
     turns = np.array([turn for _, turn in identities], np.uint64)
@@ -98,7 +98,7 @@ def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def actions_of(returned: Any, number: int, policy: Any) -> list[Any]:
-    """What a policy has decided of so many decisions, without its extras."""
+    """Return the actions that a policy returned for ``number`` decisions, without its extras."""
     if type(returned) is tuple and len(returned) == 2 and isinstance(returned[1], Mapping):
         returned = returned[0]
     actions = [RULE] * number if returned is RULE else rows(returned, integers=False)
@@ -109,12 +109,12 @@ def actions_of(returned: Any, number: int, policy: Any) -> list[Any]:
 
 
 def name_of(policy: Any) -> str:
-    """What a policy is called."""
+    """Return the name of a policy."""
     return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or shown(policy))
 
 
 def defers(policy: Any) -> bool:
-    """Whether a policy is sure to leave decisions to the rule."""
+    """Return whether a policy certainly leaves decisions to the rule."""
     if isinstance(policy, Mixture):
         return any(defers(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
     return policy is RULE

@@ -1,4 +1,4 @@
-"""What plots draw: an episode as a row for each agent, in panels of those whose actions are alike; and returns."""
+"""The data of plots: an episode as one row per agent, in panels of agents with like actions; and returns."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from ..errors import OptionValueError, UnknownAgentError, meant, shown
 from .trajectories import Trajectories
 
 CHARTED: Final = 6
-"""So many agents at most have a chart each; more of them have a row each, of colours."""
+"""The largest number of agents that have a chart each. More agents have a row of colours each."""
 
 NAMED: Final = 12
-"""So many different actions at most are told apart one by one; more of them are a scale."""
+"""The largest number of different actions that have a colour each. More actions share a colour scale."""
 
 ENDS: Final = {"x": "terminated", "|": "truncated"}
-"""The marks of how agents end."""
+"""The marks of terminations and truncations."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One array of the actions of a policy.
+    """One array of a policy's actions.
 
     Attributes:
-        name: How it is indexed; empty where it is all there is.
-        width: How many components it has.
-        names: What its numbers are called, where they are told apart one by one.
-        limits: The smallest and the largest of them, in all episodes.
+        name: Its index in the action; empty if the action is one array.
+        width: The number of its components.
+        names: The names of its numbers, where each number has a colour.
+        limits: The smallest and the largest number, in all episodes.
     """
 
     name: str
@@ -40,17 +40,17 @@ class Leaf:
     limits: tuple[float, float]
 
     def component(self, place: int) -> str:
-        """What one of its components is called."""
+        """Return the name of one of its components."""
         return f"{self.name}[{place}]" if self.width > 1 else self.name
 
 
 @dataclass(frozen=True)
 class Row:
-    """One agent in the episode: the key of its policy, its name, its decisions (``rows`` of ``found``), when they were.
+    """One agent in the episode: the key of its policy, its name, and its decisions (``rows`` of ``found``).
 
     Attributes:
-        actions: Of each leaf, ``(decisions, width)``.
-        at, end: When it decided, and when its trajectory ended.
+        actions: For each leaf, ``(decisions, width)``.
+        at, end: The times of its decisions, and the end of its trajectory.
     """
 
     key: Any
@@ -63,17 +63,17 @@ class Row:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Of which of its decisions it is known what they were."""
+        """Return, for each decision, whether its action is known."""
         return self.found.known[self.rows]
 
     @property
     def ruled(self) -> NDArray[np.bool_]:
-        """Which of its decisions were left to the rule."""
+        """Return, for each decision, whether it was left to the rule."""
         return self.found.by_rule[self.rows]
 
     @property
     def ends(self) -> list[str]:
-        """The marks of how it ended."""
+        """Return the marks of the agent's end."""
         last = self.rows.stop - 1
         return [
             mark for mark, how in zip(ENDS, (self.found.terminations, self.found.truncations), strict=True) if how[last]
@@ -82,7 +82,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Panel:
-    """Agents whose actions are alike: those of one policy, or of many."""
+    """Agents with like actions: those of one policy, or of several."""
 
     title: str
     rows: list[Row]
@@ -90,7 +90,7 @@ class Panel:
 
 
 def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
-    """What was given to be drawn, by the keys of the policies."""
+    """Return what is to be drawn as a dict by policy key."""
     if isinstance(trajectories, Trajectories):
         return {None: trajectories}
     if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):
@@ -104,10 +104,10 @@ def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
 
 
 def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
-    """The number of an episode, which may be counted from the end.
+    """Return the number of an episode. Negative numbers count from the end.
 
     Raises:
-        OptionValueError: There is no such episode.
+        OptionValueError: The episode does not exist.
     """
     number = min(len(found.seeds) for found in parts.values())
     try:
@@ -120,11 +120,11 @@ def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
 
 
 def panels_of(parts: Mapping[Any, Trajectories], episode: int, agents: Any, action_names: Any) -> list[Panel]:
-    """A panel for each policy; one for all of them where they are many and their actions alike.
+    """Return one panel per policy, or a single panel if there are many policies with like actions.
 
     Raises:
-        OptionValueError: No agent has decided in the episode, or an argument cannot have its value.
-        UnknownAgentError: One of the agents has not decided in the episode.
+        OptionValueError: No agent decided in the episode, or an argument has an invalid value.
+        UnknownAgentError: One of the agents did not decide in the episode.
     """
     leaves: dict[Any, list[Leaf]] = {}
     rows: list[Row] = []
@@ -187,7 +187,7 @@ def _namer(key: Any, action_names: Any) -> Callable[[int], str]:
 def _taken_apart(
     actions: Any, known: NDArray[np.bool_], name: Callable[[int], str], prefix: str = ""
 ) -> list[tuple[Leaf, NDArray[Any]]]:
-    """The leaves of actions, of which some are not known, each with its array."""
+    """Split actions into leaves, each with its array. Some actions may be unknown."""
     if isinstance(actions, Mapping):
         parts = [(f"{prefix}[{key!r}]" if prefix else str(key), part) for key, part in actions.items()]
         return [found for index, part in parts for found in _taken_apart(part, known, name, index)]
@@ -195,7 +195,7 @@ def _taken_apart(
         places = enumerate(actions)
         return [found for place, part in places for found in _taken_apart(part, known, name, f"{prefix}[{place}]")]
     values = actions.reshape(len(actions), -1)
-    if actions.dtype == object:  # what has no shape is told apart by its text
+    if actions.dtype == object:  # values without a shape are distinguished by their text
         texts, codes = np.unique([str(action) for action in actions], return_inverse=True)
         values = codes.reshape(-1, 1)
         name = [text if len(text) < 20 else f"{text[:18]}…" for text in texts.tolist()].__getitem__
@@ -207,7 +207,7 @@ def _taken_apart(
 
 
 def _shared(leaves: Sequence[Leaf]) -> Leaf:
-    """The same leaf of several policies."""
+    """Return one leaf for the same leaf of several policies."""
     named = [item for leaf in leaves for item in (leaf.names or {}).items()]
     names = None if leaves[0].names is None else dict(sorted(named))
     limits = min(leaf.limits[0] for leaf in leaves), max(leaf.limits[1] for leaf in leaves)
@@ -215,7 +215,7 @@ def _shared(leaves: Sequence[Leaf]) -> Leaf:
 
 
 def title_of(key: Any) -> str:
-    """What a policy's key is called: of a dotted name, its last two parts."""
+    """Return the title for a policy's key: the last two parts of a dotted name."""
     return "" if key is None else ".".join(str(getattr(key, "__qualname__", key)).split(".")[-2:])
 
 
@@ -223,7 +223,7 @@ def title_of(key: Any) -> str:
 
 
 def coloured_by(panels: Sequence[Panel], component: str | None) -> list[tuple[Leaf, int]]:
-    """The leaf of each panel, and its component, by which rows are coloured.
+    """Return, for each panel, the leaf and the component by which its rows are coloured.
 
     Raises:
         OptionValueError: There is no such component.
@@ -242,10 +242,10 @@ def coloured_by(panels: Sequence[Panel], component: str | None) -> list[tuple[Le
 
 
 def cells_of(rows: Sequence[Row], *, slim: bool) -> NDArray[np.float64]:
-    """``(decisions, 4, 2)``: the corners of what is to be coloured of each decision, row by row."""
+    """Return ``(decisions, 4, 2)``: the corners of each decision's coloured cell, row by row."""
     cells = []
     for number, row in enumerate(rows):
-        # Decisions of the same time share what goes by until the next one.
+        # Decisions at the same time divide the time until the next one among them.
         times, which, same = np.unique(row.at.astype(float), return_inverse=True, return_counts=True)
         each = (np.diff(times, append=max(row.end, times[-1])) / same)[which]
         begin = times[which] + each * (np.arange(len(row.at)) - np.searchsorted(row.at, row.at))
@@ -261,14 +261,14 @@ def cells_of(rows: Sequence[Row], *, slim: bool) -> NDArray[np.float64]:
 
 
 def _collections(collected: Any) -> dict[str, Mapping[Any, Trajectories]]:
-    """What was given to be drawn, by what it is called."""
+    """Return the collections to draw, by their labels."""
     if isinstance(collected, Mapping) and any(isinstance(value, Mapping) for value in collected.values()):
         return {str(label): by_policy(value) for label, value in collected.items()}
     return {"": by_policy(collected)}
 
 
 def groups_of(collected: Any, per: str) -> dict[str, dict[str, NDArray[Any]]]:
-    """Returns of episodes, by what they are the returns of, and by the collection."""
+    """Return the returns of episodes, by label of the row, and by collection."""
     groups: dict[str, dict[str, NDArray[Any]]] = {}
     for label, parts in _collections(collected).items():
         of_policies = [(title_of(key), found.episodes[found.starts], found) for key, found in parts.items()]

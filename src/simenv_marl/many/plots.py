@@ -1,7 +1,7 @@
-"""Pictures of what ``collect_episodes`` has found: one episode as it went, and what many have brought.
+"""Plots of the trajectories from ``collect_episodes``: the timeline of one episode, and the returns of many.
 
-Matplotlib is only imported where something is drawn. Figures are made without pyplot, so that nothing of them is left
-behind when their user lets them go, and no window opens.
+Matplotlib is imported only when something is drawn. Figures are made without pyplot: no window opens, and a figure is
+freed when its user drops it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 __all__ = ["plot_returns", "plot_timeline"]
 
 DRAWN: Final = 4
-"""So many parts of an action at most are charted, and so many lines are drawn in each chart."""
+"""The largest number of parts of an action that are charted, and of lines in each chart."""
 
 LISTED: Final = 60
-"""So many rows of returns at most are drawn."""
+"""The largest number of rows of returns."""
 
 COLOURS: Final = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#332288", "#B5A900",
     "#882255", "#44AA99", "#999933", "#661100",
 )  # fmt: skip
-"""Of actions. The first ones are Okabe's and Ito's, which people of all kinds of sight can tell apart."""
+"""The colours of actions. The first ones are those of Okabe and Ito, which colour-blind people can tell apart."""
 
 INK, PALE, ABSENT, UNKNOWN = "#333333", "#C9C9C9", "#E9E9E9", "#BDBDBD"
 REWARDS: Final = ("#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B")
@@ -59,7 +59,7 @@ STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def style(what: str) -> Iterator[Any]:
-    """Draw in the style of these pictures; yields what makes a new figure of some inches.
+    """Set the style of these plots; yield a function that makes a new figure from its width and height in inches.
 
     Raises:
         MissingExtraError: Matplotlib is missing.
@@ -69,7 +69,7 @@ def style(what: str) -> Iterator[Any]:
 
     def new_figure(width: float, height: float) -> Any:
         figure: Any = make(figsize=(width, height), layout="constrained")
-        figure._repr_png_ = lambda: _png(figure)  # of notebooks that have not been told what figures are
+        figure._repr_png_ = lambda: _png(figure)  # for notebooks in which Matplotlib has not registered figures
         return figure
 
     with rc_context(STYLE):
@@ -77,7 +77,7 @@ def style(what: str) -> Iterator[Any]:
 
 
 def _png(figure: "Figure") -> bytes:
-    """What a notebook shows of a figure."""
+    """Return the image of a figure for a notebook."""
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
     return buffer.getvalue()
@@ -95,34 +95,34 @@ def plot_timeline(
     component: str | None = None,
     figure: "Figure | SubFigure | None" = None,
 ) -> "Figure | SubFigure":
-    """Draw one episode: who decided when, what, with which reward, and who was born and ended when.
+    """Draw one episode: when each agent decided what, with which reward, and when it was born and ended.
 
-    From left to right runs the simulation's time where it has a clock, else the number of the decision among all that
-    policies have answered in the episode.
+    The horizontal axis is the simulation's time or, without a clock, the number of the decision among all decisions
+    that policies answered in the episode.
 
-    Up to six agents have charts of their own: dots at the height of the action, stems of the height of its reward. Dots
-    are hollow where the decision was left to the model's rule. More agents have a row each, in the order of their
-    births, once coloured by the action, once by its reward; a colour lasts until the agent's next decision, and is slim
-    where the rule has decided, or grey where it is not known what. A cross is where an agent terminated, an upright
-    dash where it was truncated. Where an agent does not live, the ground is grey.
+    Up to six agents have charts of their own: dots at the height of the action, stems at the height of its reward. A
+    dot is hollow where the decision was left to the model's rule. More agents have one row each, in the order of their
+    births, once coloured by action and once by reward. A colour lasts until the agent's next decision. It is a slim bar
+    where the rule decided, and grey where the rule's action is unknown. A cross marks a termination, a vertical dash a
+    truncation. The background is grey where an agent does not live.
 
     Args:
-        trajectories: What ``collect_episodes`` has returned, or what it has returned under one key.
-        episode: The number of the episode, which is the place of its seed among the seeds.
-        agents: The names of those who are to be drawn. None: all who have decided in this episode.
-        action_names: What discrete actions are called: a sequence of names, or a dict from action to name; where
-            policies differ in it, a dict from their keys to these. None: their numbers.
-        component: Where actions have several components and agents a row each: by which one rows are coloured.
-            Components are called as they are indexed: ``"[1]"`` of a vector, ``"litres"`` of a ``Dict``,
-            ``"litres[1]"`` of a vector in it. None: by the first.
-        figure: Where to draw: a figure or one of its subfigures, whose size stays what it is. None: a new figure.
+        trajectories: The result of ``collect_episodes``, or its value for one key.
+        episode: The number of the episode, which is the index of its seed.
+        agents: The names of the agents to draw. None: all agents that decided in this episode.
+        action_names: The names of discrete actions: a sequence of names, or a dict from action to name; where policies
+            differ in them, a dict from their keys to these. None: the numbers of the actions.
+        component: The component of the action by which rows are coloured, where actions have several components. The
+            name of a component is its index: ``"[1]"`` in a vector, ``"litres"`` in a ``Dict``, ``"litres[1]"`` in a
+            vector of the dict. None: the first component.
+        figure: The figure or subfigure to draw in; its size does not change. None: a new figure.
 
     Returns:
-        The figure. Notebooks show a new one where it is the last value of a cell; ``savefig`` saves it.
+        The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
 
     Raises:
-        OptionValueError: There is no such episode, or no decision in it; or an argument cannot have its value.
-        UnknownAgentError: One of ``agents`` has not decided in this episode.
+        OptionValueError: The episode does not exist or has no decision, or an argument has an invalid value.
+        UnknownAgentError: One of ``agents`` did not decide in this episode.
         MissingExtraError: Matplotlib is missing.
     """
     parts = by_policy(trajectories)
@@ -155,7 +155,7 @@ def plot_timeline(
 
 
 def _draw_charts(panels: Sequence[Panel], figure: Any, begin: float, end: float) -> list[Any]:
-    """Draw a chart of the actions and one of the rewards for each agent. Returns them, from top to bottom."""
+    """Draw a chart of the actions and one of the rewards for each agent; return the charts, from top to bottom."""
     charts = [
         (panel, row, number)
         for panel in panels
@@ -191,7 +191,7 @@ def _chart_actions(axes: "Axes", row: Row, leaf: Leaf, values: NDArray[Any]) -> 
         label = leaf.component(place) if leaf.width > 1 else None
         axes.scatter(row.at[own], heights[own], size, **{**hollow, "color": colour}, label=label)
         axes.scatter(row.at[ruled], heights[ruled], size, edgecolors=colour, **hollow)
-    if not row.known.all():  # how high these would be is not known
+    if not row.known.all():  # their heights are unknown
         hidden = row.at[~row.known]
         ground = axes.get_xaxis_transform()
         axes.scatter(hidden, np.full(len(hidden), 0.04), 12, edgecolors=UNKNOWN, transform=ground, **hollow)
@@ -216,7 +216,7 @@ def _chart_rewards(axes: "Axes", row: Row) -> None:
 
 
 def beside(axes: "Axes", text: str, height: float, at: Any) -> None:
-    """Write something to the right of axes."""
+    """Write text to the right of axes."""
     axes.annotate(text, (1.0, height), (6, 0), at, "offset points", va="center", fontsize=8.5, annotation_clip=False)
 
 
@@ -224,15 +224,15 @@ def beside(axes: "Axes", text: str, height: float, at: Any) -> None:
 
 
 def _heights(panels: Sequence[Panel]) -> list[float]:
-    """How many inches the rows of each panel take."""
+    """Return the height of each panel's rows, in inches."""
     heights = [float(np.clip(0.16 * len(panel.rows), 1.2, 6.0)) for panel in panels]
     return [max(1.2, height * min(1.0, 9.0 / sum(heights))) for height in heights]
 
 
 def _draw_rows(panels: Sequence[Panel], figure: Any, component: str | None) -> list[list[Any]]:
-    """Draw a row for each agent, coloured by its actions and by its rewards. Returns the axes, by column."""
+    """Draw a row for each agent, coloured by its actions and by its rewards; return the axes, by column."""
     shown, heights = coloured_by(panels, component), _heights(panels)
-    share = 0.85 * figure.bbox.height / figure.dpi / sum(heights)  # of an inch that is left of one, in this figure
+    share = 0.85 * figure.bbox.height / figure.dpi / sum(heights)  # scales inches to the figure
     grid = figure.subplots(len(panels), 2, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
     for (left, right), panel, (leaf, place), height in zip(grid, panels, shown, heights, strict=True):
         values = np.concatenate([row.actions[panel.leaves.index(leaf)][:, place] for row in panel.rows])
@@ -261,7 +261,7 @@ def _draw_rows(panels: Sequence[Panel], figure: Any, component: str | None) -> l
 def _coloured(axes: "Axes", cells: NDArray[np.float64], **colours: Any) -> Any:
     from matplotlib.collections import PolyCollection
 
-    # In files of vectors, many cells are an image.
+    # In vector graphics, many cells become one image.
     return axes.add_collection(PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours))
 
 
@@ -269,7 +269,7 @@ def _colour_actions(figure: Any, axes: "Axes", rows: Sequence[Row], leaf: Leaf, 
     from matplotlib.patches import Patch
 
     known = np.concatenate([row.known for row in rows])
-    _coloured(axes, cells_of(rows, slim=False), facecolors="white")  # they live, however slim what they do is
+    _coloured(axes, cells_of(rows, slim=False), facecolors="white")  # white while the agent lives
     cells = cells_of(rows, slim=True)
     if not known.all():
         _coloured(axes, cells[~known], facecolors=UNKNOWN)
@@ -288,7 +288,7 @@ def _colour_rewards(figure: Any, axes: "Axes", rows: Sequence[Row]) -> None:
     from matplotlib.colors import LinearSegmentedColormap
 
     rewards = np.concatenate([row.found.rewards[row.rows] for row in rows])
-    # So that a few large ones do not make all others pale.
+    # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
     low, high = -most if rewards.min() < 0 else 0.0, most if rewards.max() > 0 else 0.0
     shades = REWARDS[0 if low else 2 : None if high or not low else 3]
@@ -306,7 +306,7 @@ def _bar(figure: Any, axes: "Axes", scale: Any, extend: str) -> None:
 
 
 def _mark_legend(axes: "Axes", rows: Sequence[Row], *, charts: bool) -> None:
-    """Say what marks mean, above the first axes, as far as there are such."""
+    """Explain the marks that occur, above the first axes."""
     from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
 
@@ -328,7 +328,7 @@ def _mark_legend(axes: "Axes", rows: Sequence[Row], *, charts: bool) -> None:
         handles = [Line2D([], [], **mark) for mark in marks.values()]
         spaces: dict[str, Any] = {"handlelength": 1.5, "handletextpad": 0.4, "columnspacing": 1.2, "borderaxespad": 0.2}
         above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "bbox_transform": axes.transAxes}
-        axes.add_artist(Legend(axes, handles, list(marks), ncols=len(marks), **spaces, **above))  # there may be another
+        axes.add_artist(Legend(axes, handles, list(marks), ncols=len(marks), **spaces, **above))  # there may be two
 
 
 # -- many episodes --------------------------------------------------------------------------------
@@ -342,24 +342,25 @@ def plot_returns(
 ) -> "Figure | SubFigure":
     """Draw the returns of many episodes, of one collection or of several side by side.
 
-    The return of an agent is the sum of its rewards in an episode, undiscounted. Each point is an episode. The bar is
-    from the lower to the upper quartile, its notch the median; the dot is the mean, the line through it its 95 %
-    interval (of 2000 bootstrapped samples of the episodes, always the same ones). Both are written beside it.
+    The return of an agent is the undiscounted sum of its rewards in an episode. Each point is an episode. The bar goes
+    from the lower to the upper quartile, and its notch is the median. The dot is the mean, and the line through it is
+    its 95 % confidence interval (of 2000 bootstrap samples of the episodes, always the same ones). The numbers of both
+    stand beside the bar.
 
     Args:
-        collected: What ``collect_episodes`` has returned, what it has returned under one key, or a dict of such from
-            what they are to be called: ``{"rule": ..., "trained": ...}``.
-        per: What the point of an episode is. ``"policy"``: for each policy, the mean of the returns of the agents for
-            whom it has answered in the episode; of one agent, its return. ``"agent"``: for each agent, its return.
-            ``"team"``: the sum of the returns of all agents of all policies of a collection.
-        ax: Where to draw. None: in a new figure.
+        collected: The result of ``collect_episodes``, its value for one key, or a dict from labels to such values:
+            ``{"rule": ..., "trained": ...}``.
+        per: What one point shows. ``"policy"``: for each policy, the mean return of the agents it answered for in the
+            episode. ``"agent"``: for each agent, its return. ``"team"``: the sum of the returns of all agents of all
+            policies of a collection.
+        ax: The axes to draw in. None: a new figure.
 
     Returns:
-        The figure. Notebooks show a new one where it is the last value of a cell; ``savefig`` saves it.
+        The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
 
     Raises:
-        OptionValueError: There is nothing to draw, or an argument cannot have its value; more than 60 rows, such as
-            those of hundreds of agents, are too many.
+        OptionValueError: There is nothing to draw, an argument has an invalid value, or there would be more than 60
+            rows, as with hundreds of agents.
         MissingExtraError: Matplotlib is missing.
     """
     if per not in ("policy", "agent", "team"):
@@ -402,7 +403,7 @@ def plot_returns(
 def _draw_returns(axes: "Axes", height: float, returns: NDArray[np.float64], colour: str) -> None:
     number, mean = len(returns), float(returns.mean())
     low, median, high = np.quantile(returns, (0.25, 0.5, 0.75))
-    heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)  # spread evenly, in no order
+    heights = height + 0.26 * (2 * (np.arange(number) * 0.618034 % 1) - 1)  # spread evenly, in irregular order
     size = float(np.clip(900 / number, 2, 12))
     axes.scatter(returns, heights, size, color=colour, alpha=0.45, linewidths=0, zorder=2)
     axes.barh(height, high - low, left=low, height=0.62, color=colour, alpha=0.16, zorder=1)

@@ -1,4 +1,4 @@
-"""Whether it is known which actions the decisions of the model's rule are."""
+"""Checks that the actions which correspond to the rule's decisions are known."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .trajectories import Trajectories, answers
 def check_knowable(
     simulation: Any, policies: Mapping[Any, Any], keys: Iterable[Any], points: Any, options: Mapping[str, Any]
 ) -> None:
-    """Before anything runs: where the rule is going to decide, it must be known which actions its decisions are."""
+    """Check, before anything runs, that the actions of the rule can be known where the rule is going to decide."""
     plan, places = learners_plan(simulation, policies, points, options)
     for key in keys:
         if not defers(policies[key]):
@@ -30,7 +30,7 @@ def check_knowable(
 
 
 def check_known(found: Trajectories) -> None:
-    """Afterwards the same, for each decision that was left to the rule."""
+    """Check afterwards that the action of each decision that was left to the rule is known."""
     unknown = np.flatnonzero(~found.known)
     if len(unknown):
         agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]

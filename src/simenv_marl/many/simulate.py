@@ -1,4 +1,4 @@
-"""Policies back in the model: a simulation runs its own loop, and policies answer its decisions."""
+"""Policies in the model: one simulation runs its own loop, and policies answer its decisions."""
 
 from collections.abc import Mapping
 from typing import Any, Unpack
@@ -20,22 +20,23 @@ def simulate(
     seed: int | None = None,
     **options: Unpack[EpisodeOptions],
 ) -> Any:
-    """Run a simulation's own loop to its end, with policies answering and all else on its rule.
+    """Run a simulation's own loop to its end. Policies answer decisions; all other decisions follow the model's rule.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
-        policies: Who decides: from agent or decision point to a callable of the observation, or of the
-            observation and the info, that returns an action.
-        points: The decision points, as ``generate_env`` takes them. None and no policies: none.
-        seed: What the simulation is reset with, where its ``reset`` takes a seed; None: one is drawn.
-        **options: As ``aec_env`` takes them.
+        policies: The policies: a dict from an agent or a decision point to a callable. The callable gets the
+            observation, or the observation and the info, and returns an action.
+        points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor ``policies``, there are
+            no decision points and the plain model runs.
+        seed: The seed for the simulation's ``reset``, where ``reset`` takes one. None: a seed is drawn.
+        **options: The options of ``aec_env``.
 
     Returns:
         The simulation, after its ``run``.
 
     Raises:
-        SimEnvError: Something in it cannot work; the leaf says what.
-        BaseException: Whatever the model, a mapping or a policy raises.
+        SimEnvError: Something cannot work. The subclass tells what.
+        BaseException: Any exception of the model, a mapping or a policy.
     """
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
     with processes_kept():  # policies may branch

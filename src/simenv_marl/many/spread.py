@@ -1,4 +1,4 @@
-"""Work on many simulations that is spread over processes, here or elsewhere, by joblib."""
+"""Spreads the work on many simulations over processes, local or remote, with joblib."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .extras import needed
 
 
 def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
-    """A bar that shows how many simulations have ended, or whatever else is counted.
+    """Return a progress bar that counts simulations, or other units.
 
     Args:
-        total: How many there are.
-        unit: What is counted.
-        done: How many of them had ended before.
+        total: The number of units.
+        unit: The name of the unit.
+        done: The number of units that are done already.
 
     Raises:
         MissingExtraError: tqdm is not installed.
@@ -37,23 +37,23 @@ def spread(
     least: int,
     share: int = 4,
 ) -> Iterator[tuple[int, Any]]:
-    """Have worker processes do some work, each of a part of the seeds.
+    """Run a function in worker processes, each call on a part of the seeds.
 
     Args:
-        work: Called with the arguments and a list of seeds; a function of this package.
-        arguments: What it is called with.
-        seeds: All seeds, or whatever else is to be parted.
-        workers: How many processes; -1: as many as joblib's backend has.
-        least: How many seeds are not to be parted, if every worker is to have some.
-        share: How many parts there are for each process.
+        work: A function of this package. It is called with the arguments and a list of seeds.
+        arguments: The arguments.
+        seeds: All seeds, or other items to divide.
+        workers: The number of worker processes. -1: as many as joblib's backend has.
+        least: The smallest size of a part, as long as every worker gets some seeds.
+        share: The number of parts per process.
 
     Yields:
-        How many seeds a part has, and what came of it; in the order of the seeds.
+        The number of seeds of a part, and the function's result; in the order of the seeds.
 
     Raises:
         MissingExtraError: joblib is not installed.
-        WorkerError: An error in a worker cannot be brought here as itself.
-        BaseException: What the work raises.
+        WorkerError: An error in a worker could not be sent here as itself.
+        BaseException: Any exception of the function.
     """
     joblib = needed("joblib", f"workers={workers}", extra="many")
     processes = max(1, joblib.effective_n_jobs(workers))
@@ -62,7 +62,7 @@ def spread(
     parcel = packed_with_names((work, arguments))
     try:
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
-    except ValueError:  # this backend tells nothing before everything is done
+    except ValueError:  # this backend returns nothing before all work is done
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
     results = parallel(joblib.delayed(_work)(parcel, part) for part in parts)
     with _closing(results):
@@ -75,10 +75,10 @@ def spread(
 
 
 def packed_with_names(thing: Any) -> bytes:
-    """Pack something for workers, with what is told of in it by a dotted name that only this process's script has.
+    """Pickle an object for workers, with the functions of this process's script that it refers to by dotted name.
 
     Raises:
-        Exception: What pickling it raises.
+        Exception: Any exception of pickling it.
     """
     parcel, main = pack((thing, {})), sys.modules["__main__"]
     named = {name.decode(): getattr(main, name.decode(), None) for name in set(_IN_SCRIPT.findall(parcel))}
@@ -89,11 +89,11 @@ def packed_with_names(thing: Any) -> bytes:
 _IN_SCRIPT: Final = re.compile(rb"__main__\.([A-Za-z_]\w*)")
 
 _lent: Final[set[str]] = set()
-"""What stands in this process's main module, and was put there for names that come from another one."""
+"""Objects that were put into this process's main module, for names that come from another process's script."""
 
 
 def _unpacked(parcel: bytes) -> Any:
-    """In a worker: what was packed. What it names stands in the main module from now on."""
+    """Unpickle an object, in a worker. The functions it refers to by name are put into the main module."""
     thing, named = unpack(parcel)
     main = sys.modules["__main__"]
     for name, found in named.items():
@@ -105,23 +105,23 @@ def _unpacked(parcel: bytes) -> Any:
 
 @contextmanager
 def _closing(results: Any) -> Iterator[None]:
-    """Cancel what is still to be done where its results are not awaited any more."""
+    """Cancel the remaining work when the caller stops reading results."""
     try:
         yield
     finally:
         close = getattr(results, "close", None)
         if close is not None:
-            with warnings.catch_warnings():  # that it cancels what it was to cancel
+            with warnings.catch_warnings():  # joblib warns that it cancels
                 warnings.simplefilter("ignore")
                 close()
 
 
 def _work(parcel: bytes, seeds: list[Any]) -> tuple[bool, bytes]:
-    """In a worker: do the work.
+    """Run the function, in a worker.
 
     Returns:
-        Whether that has failed, and a parcel with what came of it or with the error, which joblib's backends would pass
-        on each in its own guise.
+        Whether it failed, and a pickle of its result or of the error. The error is pickled here because each of
+        joblib's backends would pass it on in its own way.
     """
     try:
         work, arguments = _unpacked(parcel)

@@ -1,7 +1,8 @@
-"""What learners want to know of many episodes: who decided what, on what observation, and what came of it.
+"""Trajectories of many episodes: observations, actions, rewards and what else a learner needs.
 
-While the episodes run, a *ledger* has a page for each group of decisions, on which they stand in the order in which
-they were answered. What learners get are the same rows by policy, episode, agent and step, whatever that order was.
+While the episodes run, a ``Ledger`` has a page for each group of decisions. A page has the decisions in the order in
+which they were answered. Learners get the same rows sorted by policy, episode, agent and step, independent of that
+order.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,43 +30,45 @@ from .batch import Group, PolicyKey
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """What the agents that one policy answers for have lived through, in one or many episodes. Immutable.
+    """The trajectories of all agents that one policy answered for, in one or many episodes. Immutable.
 
-    There are N rows, one for each decision, and M trajectories, one for each agent in each episode in which it has
-    decided. The rows of a trajectory follow each other in the order of its decisions; trajectories stand in the order
-    of the episodes and, within one, in that of their first decisions. Where spaces are ``Dict`` or ``Tuple``, there is
-    a dict or a tuple of arrays in place of one array; where they have no shape (text, graphs, ...), arrays of objects.
+    There are N rows, one for each decision, and M trajectories, one for each agent in each episode in which it decided.
+    The rows of a trajectory are consecutive, in the order of its decisions. Trajectories are sorted by episode and,
+    within an episode, by their first decision. For ``Dict`` and ``Tuple`` spaces, an attribute is a dict or a tuple of
+    arrays instead of one array. For spaces without a shape (text, graphs, ...), it is an array of objects.
 
     Attributes:
-        observations: ``(N, *shape)``, in the dtype of the observation space: what was decided on.
-        actions: ``(N, *shape)``, in the dtype of the action space: what was decided. Where it was left to the rule, the
-            action that the rule's decision corresponds to, by ``rule_action_mapping`` or, without one, by ``choices``
-            or a dict ``action_space_mapping``; zero where that is not known.
-        rewards: ``(N,)`` float64: of that action, as an AEC environment has it.
-        terminations: ``(N,)`` bool: whether it was the agent's last one, and its episode then ended.
-        truncations: ``(N,)`` bool: whether it was the agent's last one, and its episode then was truncated.
-        last_observations: ``(M, *shape)``: what each trajectory has come to, to value what is still to come where it
-            was truncated.
-        last_turns: ``(M,)`` int64: how many decisions the episode had seen when the trajectory ended, in the numbers of
+        observations: ``(N, *shape)``, in the dtype of the observation space: the observations at the decisions.
+        actions: ``(N, *shape)``, in the dtype of the action space: the actions. Where the rule decided, this is the
+            action that corresponds to the rule's decision, by ``rule_action_mapping`` or, without one, by ``choices``
+            or a dict ``action_space_mapping``; zero where this action is unknown.
+        rewards: ``(N,)`` float64: the rewards of the actions, as an AEC environment has them.
+        terminations: ``(N,)`` bool: whether this was the agent's last decision and the agent then terminated.
+        truncations: ``(N,)`` bool: whether this was the agent's last decision and the agent then was truncated.
+        last_observations: ``(M, *shape)``: the final observation of each trajectory, for bootstrapping the value of
+            truncated ones.
+        last_turns: ``(M,)`` int64: the number of decisions in the episode when the trajectory ended, counted as in
             ``turns``.
-        starts: ``(M,)`` int64: in which row each trajectory begins.
-        episodes: ``(N,)`` int64: the number of the episode, which is the place of its seed among the seeds.
-        seeds: The seeds of all episodes: row i is of ``seeds[episodes[i]]``.
-        agents: ``(N,)`` int64: whose decision it was, as a place in ``names``.
-        names: The names of the agents, in the order in which they appear.
+        starts: ``(M,)`` int64: the first row of each trajectory.
+        episodes: ``(N,)`` int64: the number of the episode, which is the index of its seed in ``seeds``.
+        seeds: The seeds of all episodes. The seed of row i is ``seeds[episodes[i]]``.
+        agents: ``(N,)`` int64: the deciding agent, as an index into ``names``.
+        names: The names of the agents, in order of appearance.
         steps: ``(N,)`` int64: the number of the decision in its trajectory, from 0.
-        turns: ``(N,)`` int64: its number among those of all agents of all policies in the episode, from 0.
-        by_rule: ``(N,)`` bool: whether the policy has left it to the model's rule.
-        known: ``(N,)`` bool: whether ``actions`` has what was decided.
-        action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such: the legal actions. None where all are.
+        turns: ``(N,)`` int64: the number of the decision among those of all agents of all policies in the episode, from
+            0.
+        by_rule: ``(N,)`` bool: whether the policy left the decision to the model's rule.
+        known: ``(N,)`` bool: whether ``actions`` has the action that was taken.
+        action_masks: ``(N, n)`` int8, for a ``MultiDiscrete`` a tuple of such arrays: the legal actions. None where all
+            actions are legal.
         times: ``(N,)`` float64: the simulation's time at the decision. None where it has no clock.
-        elapsed: ``(N,)`` float64: how much time has gone by until the reward was known, at the agent's next decision or
-            its end. None where there is no clock.
-        extras: By name, ``(N, ...)``: what else the policy has returned of each decision.
-        observation_space, action_space: Of the decision point. None where no agent has decided, and it is not known
-            at which point they would have.
-        collected: What ``collect`` has returned of each episode's simulation, in the order of the seeds. None where it
-            was not asked for.
+        elapsed: ``(N,)`` float64: the time from the decision until its reward was known, at the agent's next decision
+            or its end. None where there is no clock.
+        extras: A dict from name to array, ``(N, ...)``: what the policy returned besides the actions.
+        observation_space, action_space: The spaces of the decision point. None where no agent decided and the decision
+            point is not known.
+        collected: What ``collect`` returned for each episode's simulation, in the order of the seeds. None where there
+            was no ``collect``.
     """
 
     _: KW_ONLY
@@ -94,7 +97,7 @@ class Trajectories:
     collected: tuple[Any, ...] | None = None
 
     def __len__(self) -> int:
-        """N, the number of decisions."""
+        """Return N, the number of decisions."""
         return len(self.rewards)
 
     def __repr__(self) -> str:
@@ -105,17 +108,17 @@ class Trajectories:
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
-        """``(M,)`` int64: how many decisions each trajectory has."""
+        """``(M,)`` int64: the number of decisions in each trajectory."""
         return np.diff(self.starts, append=len(self))
 
     @cached_property
     def returns(self) -> NDArray[np.float64]:
-        """``(M,)`` float64: the sum of the rewards of each trajectory, none of them discounted."""
+        """``(M,)`` float64: the undiscounted return of each trajectory, the sum of its rewards."""
         return np.add.reduceat(self.rewards, self.starts) if len(self) else np.zeros(0)
 
     @cached_property
     def next_observations(self) -> Any:
-        """``(N, *shape)``: what the agent observed next, at its next decision or its end."""
+        """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
         if not len(self):
             return self.observations
         number = len(self)
@@ -126,7 +129,7 @@ class Trajectories:
 
 
 def merged(parts: Sequence[Trajectories]) -> Trajectories:
-    """One after the other, the trajectories of one policy in several lots of episodes."""
+    """Concatenate the trajectories of one policy in several parts of the episodes."""
     seeds = tuple(seed for part in parts for seed in part.seeds)
     first_episodes = np.cumsum([0, *(len(part.seeds) for part in parts)])
     first_rows = np.cumsum([0, *(len(part) for part in parts)])
@@ -164,18 +167,18 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
 
 @dataclass
 class _Life:
-    """What is noted of one trajectory, which stays without an end where its episode fails.
+    """The record of one trajectory. If its episode fails, the trajectory has no end.
 
     Attributes:
-        page: The page on which its decisions stand.
-        number: Its number on the page.
+        page: The page that has its decisions.
+        number: The number of the trajectory on the page.
         policy: The place of its policy.
         episode: The place of its episode.
-        first_turn, last_turn: How many decisions the episode had seen when it began, and when it ended.
+        first_turn, last_turn: The number of decisions in the episode when the trajectory began, and when it ended.
         name: The name of its agent.
-        row: Where its latest decision stands.
-        steps: How many decisions there have been.
-        last_observation: What it has come to.
+        row: The row of its latest decision.
+        steps: The number of its decisions so far.
+        last_observation: Its final observation.
         terminated, truncated: How it ended.
     """
 
@@ -194,7 +197,7 @@ class _Life:
 
 
 class _Page:
-    """What is noted of one group: rows in the order of their answers, and trajectories in that of their beginnings."""
+    """The records of one group: rows in the order of the answers, trajectories in the order of their beginnings."""
 
     def __init__(self, group: Group) -> None:
         definition = group.point.definition
@@ -204,7 +207,7 @@ class _Page:
         self.stack_actions = stacker(definition.action_space)
         self.blank = blank(definition.action_space)
         self.asked = group.asked
-        # Of rows, or of as many at a time as were answered at once.
+        # One entry per row, or one per batch of answers.
         self.observations: list[Any] = []
         self.actions: list[Any] = []
         self.masks: list[Any] = []
@@ -213,7 +216,7 @@ class _Page:
         self.steps: list[int] = []
         self.turns: list[int] = []
         self.by_rule: list[bool] = []
-        self.rule_actions: dict[int, Any] = {}  # by row, as far as they are known
+        self.rule_actions: dict[int, Any] = {}  # by row; only those that are known
         self.times: list[float] = []
         self.rewards: list[float] = []
         self.elapsed: list[float] = []
@@ -226,7 +229,7 @@ class _Page:
         return life
 
     def all_actions(self) -> Any:
-        """What was decided, in all rows."""
+        """Return the actions of all rows."""
         actions = joined(self.actions)
         if not self.rule_actions:
             return actions
@@ -237,13 +240,13 @@ class _Page:
 
 
 class Ledger:
-    """What is noted of episodes while they run."""
+    """Records the decisions of episodes while they run."""
 
     def __init__(self) -> None:
         self._pages: list[_Page] = []
 
     def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
-        """Decisions are going to be answered: see ``Watcher``."""
+        """Record the decisions that are about to be answered: see ``Watcher``."""
         page: _Page = group.book
         if page is None:
             page = group.book = _Page(group)
@@ -270,14 +273,14 @@ class Ledger:
             page.times.extend([agent.now for agent in agents])  # the policy may have been given the info
 
     def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
-        """They have been: see ``Watcher``."""
+        """Record the answers: see ``Watcher``."""
         page: _Page = group.book
         by_rule = [action is RULE for action in actions]
         if True in by_rule:
             actions = [page.blank if action is RULE else action for action in actions]
         page.by_rule += by_rule
         page.actions.append(page.stack_actions(actions))
-        # Copied, for policies may use their arrays again; in two steps, for tensors cannot be copied in one.
+        # Copied because policies may reuse their arrays; in two steps because np.array cannot copy every tensor.
         arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
@@ -288,7 +291,7 @@ class Ledger:
         page.extras.append(arrays)
 
     def moved(self, episode: Episode) -> None:
-        """An episode stands at its next decision, or is over: see ``Watcher``."""
+        """Record the reward when an episode reaches its next decision or its end: see ``Watcher``."""
         if episode.pending is not None:
             self._pay(episode.pending)
         for agent in episode.just_ended:
@@ -299,7 +302,7 @@ class Ledger:
                 self._close(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
     def _pay(self, agent: Agent) -> None:
-        """Note what an agent's latest action has brought."""
+        """Record the reward of the agent's latest action."""
         life = agent.notes
         if life is None:  # it has not decided before
             return
@@ -319,16 +322,16 @@ class Ledger:
     # -- afterwards -------------------------------------------------------------------------------
 
     def trajectories(self, plan: Plan, keys: Mapping[Any, int], seeds: Sequence[int]) -> dict[int, Trajectories]:
-        """What has been noted, by the places of the policies.
+        """Return the recorded trajectories, by the place of their policy.
 
         Args:
             plan: The plan of the episodes.
-            keys: The keys of the policies, with their places.
-            seeds: Of the episodes.
+            keys: The places of the policies, by their keys.
+            seeds: The seeds of the episodes.
 
         Raises:
-            AgentError: One agent has decided at several points.
-            OptionValueError: A policy has returned something else besides actions now and then.
+            AgentError: One policy key answered at several points whose spaces differ.
+            OptionValueError: A policy did not always return the same extras.
         """
         found: dict[int, Trajectories] = {}
         pages = [_Sorted(page) for page in self._pages]
@@ -345,7 +348,7 @@ class Ledger:
 
 
 class _Sorted:
-    """A page, for its rows to be taken by policy, in the order in which learners get them."""
+    """A page whose rows are sorted as learners get them, to be selected by policy."""
 
     def __init__(self, page: "_Page") -> None:
         _check_extras(page.extras)
@@ -413,7 +416,7 @@ def _check_extras(extras: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
-    """What there is to know of a policy that was never asked."""
+    """Return the empty trajectories of a policy that was never asked."""
     point = next((point for point in plan.points if answers(plan, point, place)), None)
     definition = None if point is None else point.definition
     floats, whole, flags = np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.bool_)
@@ -436,6 +439,6 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
 
 
 def answers(plan: Plan, point: BoundPoint, place: int) -> bool:
-    """Whether it is known beforehand that a policy, by its place, answers at a decision point."""
+    """Return whether it is known beforehand that the policy at this place answers at a decision point."""
     policy = point.policy if point.agent is None else plan.policies.get(point.agent, point.policy)
     return isinstance(policy, PolicyKey) and policy.place == place

@@ -1,4 +1,4 @@
-"""Exact continuations of an episode that is going on, for planning, counterfactuals and studies of variance."""
+"""Exact continuations of an episode, for planning, counterfactuals and studies of variance."""
 
 import copy
 import os
@@ -27,10 +27,10 @@ Result = TypeVar("Result")
 METHODS: Final = ("fork", "replay")
 
 DEEPEST: Final = 4
-"""How deep branches can be nested. In each of them there may be as many as there are cores, and so on."""
+"""The largest depth of nested branches. Each level can run as many branches as there are cores."""
 
 _depth: ContextVar[int] = ContextVar("simenv_marl.branching", default=0)
-"""How deep a branch this is."""
+"""The depth of this branch."""
 
 
 def branch(
@@ -42,39 +42,42 @@ def branch(
     seeds: Sequence[int] | None = None,
     time_limit: float = 600.0,
 ) -> list[Result]:
-    """Call a function on exact continuations of an environment that stands in mid-episode.
+    """Call a function on exact continuations of an environment in mid-episode.
 
-    Each of them stands where ``env`` stands, in everything: the model and its random numbers, the environment's
-    generators, wrappers. They are the same bit for bit as long as they are given the same actions. ``env`` itself
-    does not move. With ``seeds`` the present is the same in all of them, and the chance that lies ahead is not.
+    Each continuation starts in exactly the state of ``env``: the model and its random numbers, the environment's
+    generators, and its wrappers. Continuations that take the same actions are identical, bit for bit. ``env`` itself
+    does not move. With ``seeds``, the continuations share the present state but draw different random numbers from then
+    on.
 
     Args:
-        env: An environment of a single simulation, in any view, in wrappers or not.
-        function: Called with the continuation and its number, from 0 to ``n - 1``. It may do as it likes with it.
-        n: How many continuations.
-        method: "fork": each in a process of its own, split off with the simulation suspended (POSIX, and
-            ``driver="greenlet"``), with open files and global generators of its own. They run on as many cores as
-            there are, and their results are pickled. "replay": one after the other in this process, in a new
-            simulation with the same seed that is given the same actions; the policies of the option ``policies``
-            answer as they did, and from there on are asked themselves. None: "fork" where that is possible. It is
-            not where the simulation has opened what two processes cannot both go on with: threads, sockets, child
-            processes.
-        seeds: A seed for each continuation; the same one gives the same future, by either method. The simulation's
-            ``reseed(seed)`` is called there, on its user's side as ``state`` is; with ``global_rng=True`` the global
-            generators that the simulation finds are seeded. So are, while the function runs, those of the process,
-            Python's, NumPy's and torch's. None: what lies ahead is what lies ahead of ``env``.
-        time_limit: After how many seconds a forked continuation is ended.
+        env: An environment of a single simulation, in any view, with or without wrappers.
+        function: Called with the continuation and its number, from 0 to ``n - 1``. It may do anything with it.
+        n: The number of continuations.
+        method: "fork": each continuation runs in a process of its own, forked while the simulation is suspended (POSIX,
+            and ``driver="greenlet"``). It has its own open files and global generators. Processes run on all available
+            cores, and their results are pickled. "replay": the continuations run one after the other in this process.
+            Each is a new simulation with the same seed, to which the same actions are given. The policies of the option
+            ``policies`` repeat their answers, and are called from the present on. None: "fork" if it is possible, else
+            "replay". Forking is not possible if the simulation has opened something that two processes cannot share:
+            threads, sockets, child processes.
+        seeds: A seed for each continuation. The same seed gives the same future, by either method. The simulation's
+            ``reseed(seed)`` is called in each continuation, on the caller's side like ``state``. With
+            ``global_rng=True`` the simulation's own global generators are seeded. While the function runs, the
+            generators of the process are seeded, too: Python's, NumPy's and torch's. None: each continuation has the
+            exact future of ``env``.
+        time_limit: The time after which a forked continuation is ended, in seconds.
 
     Returns:
-        What the function has returned, in the order of the numbers.
+        The results of the function, in the order of the numbers.
 
     Raises:
-        ResetNeededError: There is no episode that could be continued.
-        BranchError: A forked continuation has died, took too long, or has returned what cannot be pickled; it could
-            not go on with what the simulation has opened; a replay did not come to the same decision; or there are
-            ``seeds``, and neither a ``reseed`` nor ``global_rng=True``.
-        OptionValueError: There is no such method, or not here; or ``seeds`` are not n non-negative integers.
-        BaseException: What the function or ``reseed`` raises, with a note that says in which continuation.
+        ResetNeededError: There is no episode to continue.
+        BranchError: A forked continuation died, took too long, or returned something that cannot be pickled; it cannot
+            go on with what the simulation has opened; a replay did not reach the same decision; or ``seeds`` are given
+            without a ``reseed`` or ``global_rng=True``.
+        OptionValueError: The method does not exist or is not available here, or ``seeds`` are not n non-negative
+            integers.
+        BaseException: Any exception of the function or ``reseed``, with a note that names the continuation.
     """
     view = _checked(env, n, method, time_limit)
     forks = _can_fork(view)
@@ -94,7 +97,7 @@ def branch(
 
 
 def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
-    """The environment that is to be continued, without its wrappers.
+    """Return the unwrapped environment to continue.
 
     Raises:
         SimEnvError: As ``branch``.
@@ -133,7 +136,7 @@ def _can_fork(view: View) -> bool:
 
 
 def _checked_seeds(seeds: Any, n: int) -> list[int]:
-    """The seeds as python integers.
+    """Return the seeds as Python integers.
 
     Raises:
         OptionValueError: They are not n non-negative integers.
@@ -145,7 +148,7 @@ def _checked_seeds(seeds: Any, n: int) -> list[int]:
 
 
 def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) -> Callable[[Any, int], Result]:
-    """A function that first draws anew, in its continuation, the chance that lies ahead."""
+    """Return a function that reseeds its continuation first."""
 
     def reseed_and_call(env: Any, number: int) -> Result:
         seed_process(seeds[number])
@@ -161,7 +164,7 @@ def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) 
 def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
     deeper = _depth.set(_depth.get() + 1)
     try:
-        with process_kept():  # the model may draw from the process's generators, now as then
+        with process_kept():  # the model may draw from the process's generators, then and now
             return _run_replayed(env, view, function, number)
     finally:
         _depth.reset(deeper)
@@ -171,7 +174,7 @@ def _run_replayed(env: Any, view: View, function: Callable[[Any, int], Result], 
     twin = view.replayed()
     try:
         twin.begin_branch()
-        # Of the wrappers around it each is copied, with all that it remembers.
+        # Each wrapper is copied with its state.
         result = function(copy.deepcopy(env, {id(view): twin}), number)
     except BaseException as error:
         annotate(error, f"simenv_marl: in branch {number}")
@@ -185,11 +188,11 @@ def _run_replayed(env: Any, view: View, function: Callable[[Any, int], Result], 
 
 
 _A_WHILE: Final = 3600.0
-"""For how many seconds is waited at once: ``poll`` takes no more than some weeks, and a time limit may be infinite."""
+"""The longest wait at once, in seconds: ``poll`` takes no more than some weeks, and a time limit may be infinite."""
 
 
 class _Child:
-    """A process with a continuation, as its parent sees it."""
+    """A forked process with a continuation, as its parent sees it."""
 
     def __init__(self, number: int, process: int, pipe: int, time_limit: float) -> None:
         self.number, self.process, self.pipe = number, process, pipe
@@ -197,14 +200,14 @@ class _Child:
         self.received = bytearray()
 
     def end(self) -> None:
-        """Bring it to its end."""
+        """End the process."""
         os.close(self.pipe)
         os.kill(self.process, signal.SIGKILL)
         os.waitpid(self.process, 0)
 
 
 def _standing_alike(function: Callable[[Any, int], Result], standing: Standing) -> Callable[[Any, int], Result]:
-    """A function for forked processes, each of which first puts right what it shares with its parent."""
+    """Return a function for forked processes that first restores what the process shares with its parent."""
 
     def resume_and_call(env: Any, number: int) -> Result:
         standing.resume()
@@ -227,7 +230,7 @@ def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: f
                 children[child.pipe] = child
                 waiting.register(child.pipe, select.POLLIN)
                 started += 1
-            first = next(iter(children.values()))  # they all have the same time, and the dict the order of their starts
+            first = next(iter(children.values()))  # the oldest, whose time limit comes first
             left = first.deadline - time.monotonic()
             ready = waiting.poll(min(max(left, 0.0), _A_WHILE) * 1000)
             if not ready and left <= _A_WHILE:
@@ -248,7 +251,7 @@ def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: f
 
 def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: list[int], time_limit: float) -> _Child:
     for stream in (sys.stdout, sys.stderr):
-        with suppress(Exception):  # what is in it would be written by both processes
+        with suppress(Exception):  # else both processes would write what is buffered
             stream.flush()
     parent = os.getpid()
     reading, writing = os.pipe()
@@ -262,10 +265,10 @@ def _fork(env: Any, function: Callable[[Any, int], Any], number: int, pipes: lis
 
 
 def _unwarned() -> AbstractContextManager[Any]:
-    """Say nothing of a fork beside threads.
+    """Suppress the warning about a fork beside threads.
 
-    Python warns of it from 3.12 on: locks that threads hold are never released in the child. It does no more than the
-    function does, and has a time limit.
+    Python 3.12 and later warns because the child never releases locks that threads hold. The child only runs the
+    function, and has a time limit.
     """
     if sys.version_info < (3, 12):
         return nullcontext()
@@ -273,13 +276,13 @@ def _unwarned() -> AbstractContextManager[Any]:
 
 
 def _be_child(env: Any, function: Callable[[Any, int], Any], number: int, others: list[int], pipe: int) -> NoReturn:
-    """Answer, and end without anything that ends with the parent."""
+    """Send the answer, and end without any of the parent's exit handlers."""
     try:
         for other in others:
             os.close(other)
         torch = sys.modules.get("torch")
         if torch is not None:
-            torch.set_num_threads(1)  # its threads have stayed behind, and would be waited for
+            torch.set_num_threads(1)  # its threads do not exist in the child, and torch would wait for them
         try:
             message = pickle.dumps((True, _answer(function(env, number))))
         except BaseException as error:
@@ -305,7 +308,7 @@ def _unpicklable(error: Exception) -> BranchError:
 
 
 def _result(child: _Child) -> Any:
-    """The answer of a child that has ended."""
+    """Return the answer of a child that has ended."""
     number = child.number
     os.close(child.pipe)
     status = os.waitpid(child.process, 0)[1]
@@ -317,12 +320,12 @@ def _result(child: _Child) -> Any:
     if answered:
         try:
             return unpack(parcel)
-        except Exception as problem:  # what can be pickled cannot always be made again
+        except Exception as problem:  # not everything that can be pickled can be unpickled
             error: BaseException = _unpicklable(problem)
             error.__cause__ = problem
     else:
         error = unpack_error(parcel)
-    if not isinstance(error, Exception):  # which is not to be raised here, as an exit or an interrupt
+    if not isinstance(error, Exception):  # an exit or an interrupt must not be raised here
         raise BranchError(f"branch {number} has raised {told(error)}") from error
     if type(error) is WorkerError:
         raise BranchError(f"branch {number}: {error}") from error.__cause__ or error.__context__

@@ -1,4 +1,4 @@
-"""Callbacks that C code calls: what is raised in them surfaces where C was called."""
+"""Callbacks that C code calls: exceptions in them are raised where C was called."""
 
 import sys
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from .hooks.stacks import stack_of
 
 
 class CallbackGuard:
-    """Carries what is raised in callbacks past the C code that has called them.
+    """Carries exceptions of callbacks past the C code that called them.
 
-    An exception cannot cross frames of C: ctypes and cffi print it, answer C with zero, and C goes on. A guard keeps
-    the first exception of a callback, asks C to stop, keeps all other callbacks from running, and raises the exception
-    once C has returned. That holds for errors, for Ctrl-C, and for the unwinding of a simulation in mid-episode. It
-    serves outside an environment, too::
+    An exception cannot cross C frames: ctypes and cffi print it, return zero to C, and C goes on. A guard keeps the
+    first exception of a callback, asks C to stop, skips all further callbacks, and raises the exception when C has
+    returned. This applies to errors, to Ctrl-C, and to the unwinding of a simulation in mid-episode. It also works
+    outside an environment::
 
         class Model:
             def __init__(self):
@@ -30,9 +30,9 @@ class CallbackGuard:
                 with self.guard:
                     library.run(self.on_step)
 
-    To be made once for each simulation. The block may be entered again, also from within a callback: an exception
-    surfaces at the innermost block around the C code that has called back. Outside any block callbacks are called as
-    they are.
+    Make one guard for each simulation. The block may be nested, also within a callback: an exception is raised at the
+    end of the innermost block around the C code that called the callback. Outside a block, the guard does not affect
+    callbacks.
     """
 
     __slots__ = ("__weakref__", "_depth", "_error", "_patience", "_stop")
@@ -41,8 +41,8 @@ class CallbackGuard:
         """Make a guard.
 
         Args:
-            stop: Asks the C code to return; called within the callback that has failed. None: C returns by itself,
-                or because of what it is answered.
+            stop: Asks the C code to return. It is called within the callback that failed. None: C returns by itself, or
+                because of the callback's result.
         """
         self._stop = stop
         self._depth = 0
@@ -53,15 +53,15 @@ class CallbackGuard:
 
         Args:
             function: The function.
-            result: What C is answered by the call that has failed, and by those that come after it. 0 serves for
-                numbers, pointers and void functions of ctypes; void functions of cffi take None.
+            result: The result that C gets from the call that failed, and from all later calls. 0 works for numbers,
+                pointers and void functions of ctypes; void functions of cffi need None.
 
         Returns:
-            The function to be given to ctypes, cffi, or whatever calls it from C.
+            The function to pass to ctypes, cffi, or another caller in C.
         """
         guard = self
 
-        @wraps(function, updated=())  # it is no decision point, should the function be one
+        @wraps(function, updated=())  # the wrapper of a decision function is not a decision function
         def callback(*args: Any) -> Any:
             try:
                 if guard._error is None:
@@ -89,12 +89,12 @@ class CallbackGuard:
         try:
             raise error
         finally:
-            # What C code's caller has raised for having been stopped says nothing, and the error's own context does.
+            # The exception that C's caller raised because it was stopped says nothing; the error's own context does.
             object.__setattr__(error, "__context__", context)
             del error, context, raised
 
     def _keep(self, error: BaseException) -> None:
-        """Have an error surface where C was called, and C return there."""
+        """Keep an error to be raised where C was called, and ask C to return."""
         kept = self._error
         if kept is None:
             self._patience = monotonic() + SECONDS_TO_UNWIND
@@ -107,7 +107,7 @@ class CallbackGuard:
                 self._error = problem
 
     def _wait(self) -> None:
-        """C calls on: do not let the environment's user wait for ever."""
+        """End the wait of the environment's user if C goes on calling."""
         if monotonic() < self._patience:
             return
         self._patience = monotonic() + SECONDS_TO_UNWIND
@@ -121,9 +121,9 @@ _CALLBACK: Final[CodeType] = CallbackGuard().callback(int).__code__
 
 
 class _Rescue:
-    """Stands before ``sys.unraisablehook`` once a guard was entered; to what is not a guard's it changes nothing.
+    """Wraps ``sys.unraisablehook`` once a guard was entered. It passes on everything that does not concern a guard.
 
-    Ctrl-C mostly comes while C code runs, and is then raised before the first line of the callback that is called next.
+    Ctrl-C mostly arrives while C code runs, and is then raised before the first line of the next callback.
     """
 
     __slots__ = ("_before",)

@@ -1,9 +1,8 @@
-"""Decision points: functions of a model that decide something, and how an environment may decide it.
+"""Decision points: functions of a model that decide something, and definitions of how an environment decides it.
 
-``make_step`` makes a ``Definition``. Applied to a function, the definition gives a *decision function*: it
-looks and behaves like the function, whose body is the *rule*, but asks the environment for its decision
-where the simulation that calls it runs behind one. What is asked is the ``DecisionPoint``: one for every
-rule, however many definitions there are of it.
+``make_step`` makes a ``Definition``. Applied to a function, the definition gives a *decision function*. It looks and
+behaves like the function, whose body is the *rule*. But if the calling simulation runs in an environment, it asks the
+environment for its decision. A ``DecisionPoint`` is what is asked: one for every rule, with any number of definitions.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -24,7 +23,7 @@ from .hooks.places import stays, unbind
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
 Mapped = Callable[..., Any]
-"""A mapping: called with the arguments of the decision call as they were passed."""
+"""A mapping: a callable of the decision call's arguments, as they were passed."""
 
 
 # -- definitions ----------------------------------------------------------------------------------
@@ -32,10 +31,10 @@ Mapped = Callable[..., Any]
 
 @dataclass(frozen=True, eq=False)
 class Definition:
-    """How an environment sees and decides a decision point. Made by ``make_step``; immutable.
+    """The definition of a decision point: how an environment observes, decides and rewards it.
 
-    Applying it to a function, staticmethod, classmethod or method of a class gives the decision function.
-    The attributes are the arguments of ``make_step``.
+    Made by ``make_step``; immutable. Apply it to a function, staticmethod, classmethod or method of a class to get the
+    decision function. Its attributes are the arguments of ``make_step``.
     """
 
     _: KW_ONLY
@@ -56,7 +55,7 @@ class Definition:
     compute_reward: Callable[[Any, Any, Any], Any] | None
 
     def __post_init__(self) -> None:
-        """Check the definition, and make callables of dicts; for ``dataclasses.replace``, too.
+        """Check the definition, and make callables of dicts; also after ``dataclasses.replace``.
 
         Raises:
             DefinitionError: The definition cannot work.
@@ -72,12 +71,11 @@ class Definition:
         """Make the decision function.
 
         Args:
-            function: The function that decides, as it stands in the model: a function, a staticmethod, a
-                classmethod, or any of these as an attribute of its class.
+            function: The model's function that decides: a function, a staticmethod, a classmethod, or any of these as
+                an attribute of its class.
 
         Returns:
-            The decision function, bound as ``function`` was; what goes in as a staticmethod or classmethod
-            comes out as one.
+            The decision function, bound like ``function``. A staticmethod or classmethod stays one.
 
         Raises:
             PatchError: ``function`` is none of these.
@@ -89,7 +87,7 @@ class Definition:
             hook = Hook(given, name, bound=binding is not staticmethod)
         elif not isinstance(hook.function, FunctionType):
             raise PatchError(f"{shown(hook.function)} cannot be a decision point: it is no function written in Python")
-        elif not hook.for_good:  # fetched while it was set for a while
+        elif not hook.for_good:  # fetched while its hook was set temporarily
             stays(hook)
         point = point_for(hook)
         wrapper = hook.stand_in(self)
@@ -116,43 +114,41 @@ def make_step(
     desired_goal_mapping: Mapped | None = None,
     compute_reward: Callable[[Any, Any, Any], Any] | None = None,
 ) -> Definition:
-    """Define a decision point (paper, section 3.3).
+    """Define a decision point: what its agent observes, may do and is rewarded with (paper, section 3.3).
+
+    Each callable except ``compute_reward`` may have a keyword-only parameter ``_simulation``, which gets the simulation.
 
     Args:
         observation_space: The space of the agent's observations.
-        observation_space_mapping: Called with the arguments of the decision call as they were passed
-            (``self`` first for a method); returns the observation, which is cast to the space's dtype.
+        observation_space_mapping: A callable of the decision call's arguments as they were passed (``self`` first for a
+            method). It returns the observation, which is cast to the dtype of the space.
         action_space: The space of the agent's actions.
-        action_space_mapping: What the action decides: a callable of the action, or a dict with an entry
-            for each action of a ``Discrete`` space. Its value is what the decision function returns.
-        reward_mapping: Called like ``observation_space_mapping``, at each decision of the agent and at its
-            end; returns the reward of the agent's action before.
-        apply: Instead of ``action_space_mapping``: called with the action and the call's arguments, in the
-            simulation and in place of the rule; what it returns is what the decision function returns.
-        choices: Called with the call's arguments, returns the sequence of legal answers. The action is an
-            index into it; ``action_space`` is a ``Discrete`` (from 0) of the largest length, and the mask
-            follows by itself. The answer is returned; ``apply`` gets it in place of the action, if given.
-        rule_action_mapping: Which action a decision of the rule corresponds to, for those who learn from it: a
-            callable of the decision (and of the call's arguments, where it takes more than one), which returns an
-            action or None for none; or a dict from decision to action. After a decision that was left to the rule,
-            the agent's next info has that action as ``"rule_action"``.
-        agent: The name of the agent that decides here, or a callable of the call's arguments that names
-            it (None: the rule decides). By default the function's letters in lower case and a
-            number, such as ``choosewateramount_0``.
-        action_mask_mapping: Called with the call's arguments, returns which actions of a ``Discrete`` or
-            ``MultiDiscrete`` are legal: 1 or 0 for each.
-        removed_by: The model's functions whose calls end an agent's episode: a dotted name, several, or a
-            dict from such a name to a callable of that call's arguments that names the agent. Without one
-            it is the agent that ``agent`` names for the call's first argument, or has named for it last.
-        goal_space: The space of goals; with it, and the three below, the single view is goal-based.
-        achieved_goal_mapping: Called like ``observation_space_mapping``; returns the goal that was achieved.
-        desired_goal_mapping: Called likewise; returns the goal that is desired.
-        compute_reward: Called with achieved goals, desired goals and infos, of one step or stacked of many
-            (shape ``(n, *goal_space.shape)``); returns the reward of each, for learners that replay episodes
-            with other goals.
-
-    All but the spaces and ``compute_reward`` get the simulation, too, as the keyword-only parameter ``_simulation``,
-    if they have one.
+        action_space_mapping: The decision for an action: a callable of the action, or a dict with an entry for each
+            action of a ``Discrete`` space. Its value is what the decision function returns.
+        reward_mapping: A callable like ``observation_space_mapping``, called at each decision of the agent and at its
+            end. It returns the reward of the agent's previous action.
+        apply: An alternative to ``action_space_mapping``: a callable of the action and the call's arguments, which runs
+            in the simulation instead of the rule. The decision function returns its result.
+        choices: A callable of the call's arguments that returns the sequence of legal answers. The action is an index
+            into it, ``action_space`` a ``Discrete`` (from 0) of the largest length. The action mask follows from it.
+            The decision function returns the chosen answer; with ``apply``, that gets the answer instead of the action.
+        rule_action_mapping: The action that corresponds to a decision of the rule, for learning from the rule: a
+            callable of the decision (and the call's arguments, if it takes more than one), which returns an action or
+            None; or a dict from decision to action. After a decision of the rule, the agent's next info has it as
+            ``"rule_action"``.
+        agent: The name of the deciding agent, or a callable of the call's arguments that returns it (None: the rule
+            decides). Default: the letters of the function's name in lower case and a number, such as
+            ``choosewateramount_0``.
+        action_mask_mapping: A callable of the call's arguments that returns the action mask of a ``Discrete`` or
+            ``MultiDiscrete``: 1 for each legal action, 0 for others.
+        removed_by: The functions of the model whose calls end an agent's episode: a dotted name, several, or a dict
+            from dotted name to a callable of that call's arguments that returns the agent's name. Without a callable,
+            it is the agent that ``agent`` names for the call's first argument, or that it named for it last.
+        goal_space: The space of goals. With it and the next three arguments, the single view is goal-based.
+        achieved_goal_mapping: A callable like ``observation_space_mapping`` that returns the achieved goal.
+        desired_goal_mapping: A callable like ``observation_space_mapping`` that returns the desired goal.
+        compute_reward: A callable of achieved goals, desired goals and infos, of one step or stacked (shape ``(n,
+            *goal_space.shape)``). It returns the reward of each, for learners that replay with other goals.
 
     Returns:
         The definition, which is a decorator for the function that decides.
@@ -166,11 +162,11 @@ def make_step(
 REQUIRED = ("observation_space_mapping", "reward_mapping")
 ANSWERS = ("action_space_mapping", "apply", "choices")
 GOALS = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
-"""Arguments of ``make_step``: what must be given, of what one must be given, and all or none."""
+"""Arguments of ``make_step``: required ones; those of which one is required; those that belong together."""
 
 
 def _check_kinds(definition: Definition) -> None:
-    """Make sure that each part of a definition is what it is to be."""
+    """Check the type of each part of a definition."""
     for name in ("observation_space", "action_space", "goal_space"):
         space = getattr(definition, name)
         if not isinstance(space, spaces.Space) and (name != "goal_space" or space is not None):
@@ -189,7 +185,7 @@ def _check_kinds(definition: Definition) -> None:
 
 
 def _check_together(definition: Definition) -> None:
-    """Make sure that the parts of a definition go together."""
+    """Check that the parts of a definition fit together."""
     given = [name for name in ANSWERS if getattr(definition, name) is not None]
     if len(given) != 1 and given != ["apply", "choices"]:
         raise DefinitionError(
@@ -238,7 +234,7 @@ def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[
 
 
 def answers_of(definition: Definition) -> Mapping[Any, Any] | None:
-    """From action to decision, where ``action_space_mapping`` is a dict, or was one; None where it is a callable."""
+    """Return the dict from action to decision that was given as ``action_space_mapping``; None for a callable."""
     mapping: Any = definition.action_space_mapping
     if isinstance(mapping, Mapping):
         return mapping
@@ -247,13 +243,13 @@ def answers_of(definition: Definition) -> Mapping[Any, Any] | None:
 
 
 def inverse(definition: Definition) -> dict[Any, Any] | None:
-    """From decision to action, where ``action_space_mapping`` is a dict that can be read backwards."""
+    """Return the dict from decision to action, if ``action_space_mapping`` is a dict that can be inverted."""
     answers = answers_of(definition)
     if answers is None:
         return None
     try:
         actions = {decision: action for action, decision in answers.items()}
-    except TypeError:  # decisions that cannot be looked up
+    except TypeError:  # unhashable decisions
         return None
     return actions if len(actions) == len(answers) else None
 
@@ -261,20 +257,20 @@ def inverse(definition: Definition) -> dict[Any, Any] | None:
 # -- decision points ------------------------------------------------------------------------------
 
 BY_NAME: Final = "simenv_marl_point"
-"""An attribute of functions that are found by a name of a simulation's own, and not in a module: that name."""
+"""The attribute with the name of a function that a simulation names itself and that is not in a module."""
 
 _REGISTRY: "WeakValueDictionary[str, DecisionPoint]" = WeakValueDictionary()
-"""The points that ``make_step`` has decorated, by dotted name. Weak: a model that goes takes them along."""
+"""The decorated points, by dotted name. Weak, so that a model can be garbage-collected with its points."""
 
 
 class DecisionPoint:
-    """One function of a model that decides something: what is asked, under whatever definition.
+    """A function of a model that decides something, under any definition.
 
     Attributes:
         hook: The hook of the function.
-        definition: The latest definition, which the bare name means; None for a point that was named from
-            outside and is a decision point for some environments alone.
-        removed_by: What ends its agents under every definition, as ``removed_by`` of ``make_step``; functions or names.
+        definition: The latest definition, which the bare name means; None for a point that was named from outside the
+            model and is a decision point for some environments only.
+        removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
     """
 
     __slots__ = ("__weakref__", "definition", "hook", "removed_by")
@@ -292,51 +288,51 @@ class DecisionPoint:
 
     @property
     def name(self) -> str:
-        """Its dotted name, ``package.module.Class.function``."""
+        """The dotted name, ``package.module.Class.function``."""
         return self.hook.name
 
     @property
     def rule(self) -> Any:
-        """The function itself, which decides where no environment or policy does."""
+        """The undecorated function, which decides where no environment or policy does."""
         return self.hook.function
 
     @property
     def kind(self) -> str:
-        """What a call of it returns: "function" (its value), "generator" or "coroutine"."""
+        """What a call returns: "function" (a value), "generator" or "coroutine"."""
         return self.hook.kind
 
     @property
     def alone(self) -> bool:
-        """Whether every call has one argument, which is what it is called on."""
+        """Whether every call has one argument, the object it is called on."""
         return self.hook.alone
 
     @property
     def bound(self) -> bool:
-        """Whether its first argument is what it is called on, which is never passed by keyword."""
+        """Whether its first argument is the object it is called on, which is never passed by keyword."""
         return self.hook.bound
 
     @property
     def wrappers(self) -> WeakSet[FunctionType]:
-        """Its decision functions."""
+        """The decision functions of this point."""
         return self.hook.stand_ins
 
     @property
     def letters(self) -> str:
-        """The function's letters in lower case, of which its agent's default name is made."""
+        """The letters of the function's name in lower case, for the default name of its agent."""
         name = self.name.rpartition(".")[2].lower()
         return "".join(letter for letter in name if "a" <= letter <= "z") or "agent"
 
     def wrap(self, definition: Definition | None) -> FunctionType:
-        """Make a decision function of this point, which stands for a definition where it is named as a point."""
+        """Make a decision function of this point. Named as a point, it stands for the definition."""
         return self.hook.stand_in(definition)
 
     def family(self) -> "list[DecisionPoint]":
-        """The other points of the same rule."""
+        """Return the other points of the same rule."""
         return [hook.point for hook in MADE_OF[self.rule] if hook.point is not None and hook is not self.hook]
 
 
 def point_for(hook: Hook) -> "DecisionPoint":
-    """The decision point of a hook, whether it was one before or not."""
+    """Return the decision point of a hook, which may be new."""
     if hook.point is None:
         hook.point = DecisionPoint(hook)
     point: DecisionPoint = hook.point
@@ -344,7 +340,7 @@ def point_for(hook: Hook) -> "DecisionPoint":
 
 
 def point_of(function: Any) -> "tuple[DecisionPoint, Definition | None] | None":
-    """The point of a decision function and the definition that it was made with; None for anything else."""
+    """Return the point of a decision function and its definition; None for anything else."""
     hook = hook_of(function)
     if hook is None:
         return None
@@ -355,22 +351,22 @@ def point_of(function: Any) -> "tuple[DecisionPoint, Definition | None] | None":
 
 
 def unwrapped(function: Any) -> Any:
-    """The function that a decision function or an exposed one stands in front of; any other as it is, unbound."""
+    """Return the function behind a decision function or an exposed function; any other function itself, unbound."""
     return beneath(getattr(function, "__func__", function))
 
 
 def registered(name: str) -> "DecisionPoint | None":
-    """The decorated decision point of that dotted name."""
+    """Return the decorated decision point with that dotted name."""
     return _REGISTRY.get(name)
 
 
 def decision_points() -> list[str]:
-    """The dotted names of all decorated decision points, in the order of their decoration."""
+    """Return the dotted names of all decorated decision points, in the order of decoration."""
     return list(_REGISTRY)
 
 
 def _redefined(point: "DecisionPoint", definition: Definition | None) -> None:
-    """Give a point that was restored its definition, which may lead back to it, unless it has one of this process."""
+    """Set the definition of an unpickled point, unless it has one of this process. The two may refer to each other."""
     if point.definition is None and definition is not None:
         point.definition = definition
         _REGISTRY.setdefault(point.name, point)
@@ -380,10 +376,10 @@ def _redefined(point: "DecisionPoint", definition: Definition | None) -> None:
 
 
 class Difference:
-    """A mapping that returns by how much another has changed. Made by ``difference``."""
+    """A mapping that returns the change of another mapping's value. Made by ``difference``."""
 
     def __init__(self, function: Mapped) -> None:
-        if not DIFFERENCES:  # one will do
+        if not DIFFERENCES:  # one is enough
             DIFFERENCES.append(getattr(function, "__qualname__", None) or shown(function))
         self._function = function
         update_wrapper(self, function)
@@ -392,29 +388,29 @@ class Difference:
         return Difference, (self._function,)  # which notes, in another process too, that there are differences
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """The change of the function's value at these arguments."""
+        """Return the change of the function's value for these arguments."""
         value = self._function(*args, **kwargs)
         evaluation = EVALUATING.get(getcurrent())
         memory = None if evaluation is None else evaluation.memory
         if memory is None:
             return 0.0
         before = memory.get(self, value)
-        memory[self] = copy(value) if isinstance(value, np.ndarray) else value  # which may change in place
+        memory[self] = copy(value) if isinstance(value, np.ndarray) else value  # an array may change in place
         return value - before
 
 
 def difference(function: Mapped) -> Difference:
-    """Make a mapping that returns by how much ``function(*arguments)`` has changed.
+    """Make a mapping that returns the change of ``function(*arguments)``.
 
-    The change is counted since it was last asked for the same agent in the same episode; the first time it
-    is 0.0. It may be a mapping itself or be called by one, and so replaces the global that a reward such
-    as "the water used since then" would otherwise need (paper, supplement S2).
+    The change is the difference from its value at the last call for the same agent in the same episode; it is 0.0 at
+    the first call. The result can be used as a mapping, or be called in one. It replaces the global variable that a
+    reward such as "water used since the last decision" would need (paper, supplement S2).
 
     Args:
-        function: A callable of the arguments of the decision call, which returns a number.
+        function: A callable of the decision call's arguments that returns a number.
 
     Returns:
-        The mapping. Outside the evaluation of an environment's mapping it returns 0.0.
+        The mapping. It returns 0.0 when it is not called for an environment's mapping.
 
     Raises:
         DefinitionError: ``function`` is not callable.

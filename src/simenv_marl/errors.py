@@ -1,43 +1,43 @@
-"""The tree of errors: one root, and leaves that are also the builtins that Python users expect.
+"""The errors of this library: one root, and subclasses that are also the builtin errors that Python users expect.
 
 ::
 
     SimEnvError
     |-- DefinitionError      (ValueError)    a definition that cannot work
-    |-- SimulationError      (TypeError)     something that is no simulation
-    |-- UnknownPointError    (LookupError)   a decision point that is not to be found
+    |-- SimulationError      (TypeError)     an object that is not a simulation
+    |-- UnknownPointError    (LookupError)   a decision point that does not exist
     |-- PatchError           (TypeError)     a function that cannot be made a decision point or exposed
-    |-- UnknownTargetError   (LookupError)   a function to extend that is not to be found
+    |-- UnknownTargetError   (LookupError)   a function to extend that does not exist
     |-- HandlerError         (ValueError)    a handler that does not fit, or is not attached
-    |-- AgentError           (ValueError)    names of agents that clash or are none
+    |-- AgentError           (ValueError)    names of agents that clash or are not strings
     |-- UnknownAgentError    (LookupError)   an agent that the environment does not know
     |-- ViewError            (ValueError)    a view that these decision points do not allow
-    |-- CopyError            (TypeError)     a vector environment that was to be copied
-    |-- BranchError          (RuntimeError)  a branch of an episode that could not be made, or died
+    |-- CopyError            (TypeError)     a vector environment that cannot be copied
+    |-- BranchError          (RuntimeError)  a branch of an episode that cannot be made, or died
     |-- UnknownOptionError   (TypeError)     an option that does not exist
-    |-- OptionValueError     (ValueError)    an option that cannot have this value
-    |-- InvalidActionError   (ValueError)    an action that is not legal; nothing has moved
+    |-- OptionValueError     (ValueError)    an option with an invalid value
+    |-- InvalidActionError   (ValueError)    an illegal action; the simulation has not moved
     |-- ObservationError     (ValueError)    an observation that does not fit its space
     |-- MaskError            (ValueError)    a mask that does not fit its action space
-    |-- RewardError          (ValueError)    a reward that is no finite number
-    |-- NoDecisionError      (RuntimeError)  an episode in which nothing was decided
-    |-- ResetNeededError     (RuntimeError)  there is no episode to go on with
-    |   |-- NotResetError                    ... because there was none yet
+    |-- RewardError          (ValueError)    a reward that is not a finite number
+    |-- NoDecisionError      (RuntimeError)  an episode without a decision
+    |-- ResetNeededError     (RuntimeError)  there is no running episode
+    |   |-- NotResetError                    ... because there was no reset yet
     |   |-- EpisodeOverError                 ... because it has ended or failed
     |   `-- ClosedError                      ... because the environment was closed
-    |-- ReentrancyError      (RuntimeError)  an environment used while it is moving
-    |-- WrongThreadError     (RuntimeError)  a thread or process that cannot go on from here
-    |-- MissingExtraError    (ImportError)   a package that only an extra installs
-    |-- ProcessError         (RuntimeError)  a simulator in another process, and what went wrong with it
-    |   |-- ProcessDiedError    (ChildProcessError)  ... it could not be started, has ended, or has closed its pipe
-    |   |-- ProcessTimeoutError (TimeoutError)  ... it has not answered, or not read what it was sent
-    |   |-- RemoteError                         ... its model has raised an error
-    |   `-- WireError           (ValueError)    ... it has sent, or was to be sent, what the wire does not allow
+    |-- ReentrancyError      (RuntimeError)  an environment that is used while its simulation runs
+    |-- WrongThreadError     (RuntimeError)  a simulation or decision in the wrong thread or process
+    |-- MissingExtraError    (ImportError)   a package of an extra that is not installed
+    |-- ProcessError         (RuntimeError)  an error of a simulator in another process
+    |   |-- ProcessDiedError    (ChildProcessError)  ... the process did not start, ended, or closed its pipe
+    |   |-- ProcessTimeoutError (TimeoutError)  ... the process did not answer or read in time
+    |   |-- RemoteError                         ... the model in the process raised an error
+    |   `-- WireError           (ValueError)    ... a message that the wire does not allow
     |-- StoreError           (OSError)       a store of an experiment that cannot be read or written
-    |-- WorkerError          (RuntimeError)  a process with simulations that died, or has raised what cannot be told
-    `-- CheckFailedError     (AssertionError) a simulation in which a check has found errors
+    |-- WorkerError          (RuntimeError)  a worker process that died, or an error that cannot be pickled
+    `-- CheckFailedError     (AssertionError) a simulation that failed a check
 
-Every error is raised with its message alone, so that it survives pickling.
+Every error has its message as the only argument, so that it can be pickled.
 """
 
 import reprlib
@@ -89,7 +89,7 @@ __all__ = [
 _PACKAGE = str(Path(__file__).parent)
 
 LONGEST: Final = 200
-"""How many characters of a value stand in a message."""
+"""The largest number of characters of a value in a message."""
 
 _repr = reprlib.Repr()
 _repr.maxlist = _repr.maxtuple = _repr.maxset = _repr.maxfrozenset = _repr.maxdict = _repr.maxdeque = 20
@@ -97,31 +97,31 @@ _repr.maxstring = _repr.maxother = _repr.maxlong = LONGEST
 
 
 def shown(value: Any, longest: int = LONGEST) -> str:
-    """What a value of a user's looks like in a message: in short, and also where its ``repr`` fails."""
+    """Return a short text of a user's value for a message, even if its ``repr`` fails."""
     try:
         text = _repr.repr(value)
-    except Exception:  # as of an integer of many thousand digits
+    except Exception:  # for example of an integer of many thousand digits
         text = object.__repr__(value)
     return text if len(text) <= longest else f"{text[: longest - 23]}...{text[-20:]}"
 
 
 def meant(name: object, known: Iterable[str], beneath: str = "") -> str:
-    """A hint for messages about an unknown name.
+    """Return a hint for a message about an unknown name.
 
     Args:
         name: The unknown name.
         known: The names that exist.
-        beneath: What is put before each of these, such as "package.".
+        beneath: A prefix for each of these, such as "package.".
 
     Returns:
-        "; did you mean this or that?", or nothing where no known name is close.
+        "; did you mean this or that?", or an empty string if no known name is close.
     """
     close = get_close_matches(name, known, n=3) if isinstance(name, str) else []
     return f"; did you mean {' or '.join(beneath + other for other in close)}?" if close else ""
 
 
 def text_of(error: BaseException) -> str:
-    """The text of an error, also where its ``str`` fails."""
+    """Return the text of an error, even if its ``str`` fails."""
     try:
         return str(error)
     except Exception:
@@ -129,12 +129,12 @@ def text_of(error: BaseException) -> str:
 
 
 def told(error: BaseException) -> str:
-    """The class and the text of an error."""
+    """Return the class and the text of an error."""
     return f"{type(error).__name__}: {text_of(error)}"
 
 
 def notes_of(error: BaseException) -> list[str]:
-    """The notes of an error, also where it has something else in their place."""
+    """Return the notes of an error, even if its ``__notes__`` is not a list."""
     notes = None
     with suppress(Exception):
         notes = error.__notes__
@@ -142,7 +142,7 @@ def notes_of(error: BaseException) -> list[str]:
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn, and point at the line outside this package that has led here."""
+    """Warn at the innermost line outside this package."""
     level, frame = 1, sys._getframe(0)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
         level, frame = level + 1, frame.f_back
@@ -150,18 +150,18 @@ def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
 
 
 def annotate(error: BaseException, note: str) -> None:
-    """Add a note to an error, also to one that refuses to be changed, as a frozen dataclass does."""
+    """Add a note to an error, even if it is immutable, as a frozen dataclass."""
     try:
         error.add_note(note)
     except Exception:
-        with suppress(Exception):  # an error without its note is better than another one
+        with suppress(Exception):  # better an error without its note than another error
             notes = vars(error).setdefault("__notes__", [])
             if isinstance(notes, list):
                 notes.append(note)
 
 
 def close_after(error: BaseException, close: Callable[[], None], what: str) -> None:
-    """Close something after an error, which stays the one that is seen should closing raise another one."""
+    """Close something after an error. If closing fails, too, the first error stays the one that is raised."""
     try:
         close()
     except Exception as problem:
@@ -169,17 +169,17 @@ def close_after(error: BaseException, close: Callable[[], None], what: str) -> N
 
 
 def clear_frames(error: BaseException) -> None:
-    """Have this package's frames in an error's traceback let go of what they hold, such as arguments of a model's."""
+    """Clear this package's frames in an error's traceback, which may hold arguments of the model."""
     trace = error.__traceback__
     while trace is not None:
         frame, trace = trace.tb_frame, trace.tb_next
         if frame.f_code.co_filename.startswith(_PACKAGE):
-            with suppress(RuntimeError):  # it is still running
+            with suppress(RuntimeError):  # the frame is still running
                 frame.clear()
 
 
 class SimEnvError(Exception):
-    """Root of all errors that this library raises on its own account."""
+    """The root of all errors that this library raises."""
 
 
 class DefinitionError(SimEnvError, ValueError):
@@ -187,51 +187,51 @@ class DefinitionError(SimEnvError, ValueError):
 
 
 class SimulationError(SimEnvError, TypeError):
-    """What was given as a simulation is none, or does what none may do."""
+    """An object is not a simulation, or a simulation does something forbidden."""
 
 
 class UnknownPointError(SimEnvError, LookupError):
-    """A decision point was named that is not to be found."""
+    """A decision point does not exist."""
 
 
 class PatchError(SimEnvError, TypeError):
-    """A function was named that cannot be made a decision point, or be exposed to plugins."""
+    """A function cannot be made a decision point, or be exposed to plugins."""
 
 
 class UnknownTargetError(SimEnvError, LookupError):
-    """A function was to be extended that is not to be found."""
+    """A function to extend does not exist."""
 
 
 class HandlerError(SimEnvError, ValueError):
-    """A handler cannot be called like its target, there is no such position, or it is not attached."""
+    """A handler cannot be called like its target, its position does not exist, or it is not attached."""
 
 
 class AgentError(SimEnvError, ValueError):
-    """The names of agents clash, or what should name an agent is no string."""
+    """The names of agents clash, or the name of an agent is not a string."""
 
 
 class UnknownAgentError(SimEnvError, LookupError):
-    """An agent was named that the environment does not know."""
+    """The environment does not know an agent of that name."""
 
 
 class ViewError(SimEnvError, ValueError):
-    """A view was asked for that the active decision points do not allow."""
+    """The active decision points do not allow this view."""
 
 
 class CopyError(SimEnvError, TypeError):
-    """A vector environment was to be copied or pickled."""
+    """A vector environment cannot be copied or pickled."""
 
 
 class BranchError(SimEnvError, RuntimeError):
-    """A branch of an episode could not be made, or has died without an answer."""
+    """A branch of an episode cannot be made, or died without an answer."""
 
 
 class UnknownOptionError(SimEnvError, TypeError):
-    """An option was given that does not exist."""
+    """An option does not exist."""
 
 
 class OptionValueError(SimEnvError, ValueError):
-    """An option was given a value that it cannot have."""
+    """An option or argument has an invalid value."""
 
 
 class InvalidActionError(SimEnvError, ValueError):
@@ -251,11 +251,11 @@ class RewardError(SimEnvError, ValueError):
 
 
 class NoDecisionError(SimEnvError, RuntimeError):
-    """The simulation came to its end without asking for a decision."""
+    """The simulation ended without asking for a decision."""
 
 
 class ResetNeededError(SimEnvError, RuntimeError):
-    """There is no episode to go on with; ``reset`` begins one."""
+    """There is no running episode; ``reset`` begins one."""
 
 
 class NotResetError(ResetNeededError):
@@ -271,35 +271,35 @@ class ClosedError(ResetNeededError):
 
 
 class ReentrancyError(SimEnvError, RuntimeError):
-    """An environment was stepped, reset or closed while its own simulation was moving."""
+    """An environment was stepped, reset or closed while its own simulation was running."""
 
 
 class WrongThreadError(SimEnvError, RuntimeError):
-    """A simulation is in another thread or process, or a thread that it has started was to decide something."""
+    """A simulation is in another thread or process, or one of its own threads asked for a decision."""
 
 
 class WorkerError(SimEnvError, RuntimeError):
-    """A process with simulations in it died, or something was raised there that cannot be told here as it was."""
+    """A worker process died, or raised an error that cannot be sent to this process as itself."""
 
 
 class ProcessError(SimEnvError, RuntimeError):
-    """Something went wrong with a simulator in another process; the leaf says what."""
+    """A simulator in another process failed. The subclass tells how."""
 
 
 class ProcessDiedError(ProcessError, ChildProcessError):
-    """The process could not be started, has ended, or has closed its pipe."""
+    """The process did not start, has ended, or has closed its pipe."""
 
 
 class ProcessTimeoutError(ProcessError, TimeoutError):
-    """The process has not answered in time, or has not read what it was sent."""
+    """The process did not answer in time, or did not read a message in time."""
 
 
 class RemoteError(ProcessError):
-    """The model in the process has raised an error. Its text stands here; nothing of it is imported."""
+    """The model in the process raised an error. This error has its text; nothing of it is imported."""
 
 
 class WireError(ProcessError, ValueError):
-    """The process has sent, or was to be sent, what the wire does not allow."""
+    """A message from or to the process breaks the rules of the wire."""
 
 
 class StoreError(SimEnvError, OSError):
@@ -307,8 +307,8 @@ class StoreError(SimEnvError, OSError):
 
 
 class MissingExtraError(SimEnvError, ImportError):
-    """A package is missing that one of the extras installs."""
+    """A package of one of the extras is missing."""
 
 
 class CheckFailedError(SimEnvError, AssertionError):
-    """A check of a simulation has found what must not be. Its message is what was found."""
+    """A simulation failed a check. The message is the check's report."""

@@ -1,4 +1,4 @@
-"""Into the registries of Gymnasium and PettingZoo, with entry points that specs can be written down with."""
+"""Registers simulations with Gymnasium and PettingZoo, with string entry points, so that specs can be serialised."""
 
 import importlib
 import re
@@ -29,32 +29,32 @@ class _Recipe:
 
 
 _RECIPES: dict[str, _Recipe] = {}
-"""By name and version: what the entry points below make environments of."""
+"""The recipes of the entry points below, by name and version."""
 
 
 def register_simulation(
     simulation: Any, points: Points = None, *, name: str | None = None, version: int = 0, **options: Unpack[ViewOptions]
 ) -> list[str]:
-    """Register the environments of a simulation.
+    """Register the environments of a simulation with Gymnasium and PettingZoo.
 
-    With Gymnasium: ``name/<Point>-v0`` for the single view of each decision point whose agent has a name of its
-    own (the function's name in CamelCase; all other points run their rule), and ``name/Joint-v0``. With
-    PettingZoo: ``name/coop_v0``, AEC and parallel. To be called where the simulation's module is imported, so
-    that ``gymnasium.make("module:name/Joint-v0")`` finds it.
+    Gymnasium ids: ``name/<Point>-v0`` is the single view of a decision point whose agent has a fixed name (the
+    function's name in CamelCase; all other points follow their rule), and ``name/Joint-v0`` is the joint view.
+    PettingZoo id: ``name/coop_v0``, as AEC and parallel environment. Call this where the simulation's module is
+    imported, so that ``gymnasium.make("module:name/Joint-v0")`` finds it.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The decision points, as ``generate_env`` takes them.
-        name: The namespace of the ids, of letters, digits, ``_`` and ``-``; None: the name of the variant, if the
+        name: The namespace of the ids, made of letters, digits, ``_`` and ``-``. None: the name of the variant, if the
             simulation is one.
-        version: Their version.
-        **options: As ``aec_env`` takes them.
+        version: The version in the ids.
+        **options: The options of ``aec_env``.
 
     Returns:
         The ids, Gymnasium's first.
 
     Raises:
-        SimEnvError: Something in it cannot work; the leaf says what.
+        SimEnvError: Something cannot work. The subclass tells what.
     """
     if name is None:
         if not isinstance(simulation, Variant):
@@ -89,7 +89,7 @@ def register_simulation(
 
 
 def _titles(points: list[str]) -> list[str]:
-    """What decision points are called in ids: the function's name, with its class where that alone is taken."""
+    """Return the names of decision points in ids: the function's name, with its class if the name alone is taken."""
     whole = [re.sub(r"[^\w.]", "", point) for point in points]  # no <locals>
     styles = [[_camel(point, 1) for point in whole], [_camel(point, 2) for point in whole], whole]
     return [
@@ -105,13 +105,13 @@ def _camel(point: str, parts: int) -> str:
 
 
 def _register_gymnasium(identity: str, maker: str, **kwargs: Any) -> None:
-    gymnasium.registry.pop(identity, None)  # registered again, as when a notebook's cell runs again
+    gymnasium.registry.pop(identity, None)  # it may be registered again, as when a notebook's cell is rerun
     gymnasium.register(identity, f"{__name__}:{maker}", vector_entry_point=f"{__name__}:{maker}_vector", kwargs=kwargs)
 
 
 def _recipe(recipe: str, module: str) -> _Recipe:
     if recipe not in _RECIPES and module != "__main__":
-        importlib.import_module(module)  # as in a process that knows no more than a spec
+        importlib.import_module(module)  # as in a process that has only the spec
     try:
         return _RECIPES[recipe]
     except KeyError:
@@ -122,13 +122,13 @@ def _recipe(recipe: str, module: str) -> _Recipe:
 
 
 def make_single(recipe: str, module: str, point: str, **options: Any) -> Any:
-    """The entry point of the single views: all points but one run their rule, or the policy they have."""
+    """Make a single view. All other points follow their rule, or their policy."""
     known = _recipe(recipe, module)
     return _make(known, "single", _single_options(known, point, options))
 
 
 def make_single_vector(recipe: str, module: str, point: str, num_envs: int, **options: Any) -> Any:
-    """The entry point of the vector view over such single views."""
+    """Make a vector view of single views."""
     known = _recipe(recipe, module)
     return _make_vector(known, "single", num_envs, _single_options(known, point, options))
 
@@ -143,21 +143,21 @@ def _single_options(known: _Recipe, point: str, options: dict[str, Any]) -> dict
 
 
 def make_joint(recipe: str, module: str, **options: Any) -> Any:
-    """The entry point of the joint view."""
+    """Make a joint view."""
     known = _recipe(recipe, module)
     return _make(known, "joint", {**known.options, "flatten": known.flatten, **options})
 
 
 def make_joint_vector(recipe: str, module: str, num_envs: int, **options: Any) -> Any:
-    """The entry point of the vector view over joint views."""
+    """Make a vector view of joint views."""
     known = _recipe(recipe, module)
     return _make_vector(known, "joint", num_envs, {**known.options, "flatten": known.flatten, **options})
 
 
 def _make(known: _Recipe, view: str, options: dict[str, Any]) -> Any:
-    """Make a Gymnasium view; where the simulation lacks the render mode, with the wrapper that makes up for it.
+    """Make a Gymnasium view; with a wrapper that supplies the render mode if the simulation lacks it.
 
-    Gymnasium itself looks for this in the metadata of classes, which entry points of many simulations cannot have.
+    Gymnasium itself reads render modes from the metadata of a class, which an entry point for many simulations lacks.
     """
     mode = options.pop("render_mode", None)
     plan = Plan.draw_up(known.simulation, known.points, options)
@@ -172,19 +172,19 @@ def _make(known: _Recipe, view: str, options: dict[str, Any]) -> Any:
 
 
 def _make_vector(known: _Recipe, view: str, num_envs: int, options: dict[str, Any]) -> Any:
-    """Make a vector view; ``max_episode_steps``, which ``make_vec`` hands on, is what ``max_steps`` is here."""
+    """Make a vector view; ``max_episode_steps``, which ``make_vec`` passes on, becomes ``max_steps``."""
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
     options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
     return vector_env(known.simulation, known.points, num_envs=num_envs, view=view, **options)
 
 
 def make_aec(recipe: str, module: str, **options: Any) -> Any:
-    """The entry point of the AEC view."""
+    """Make an AEC view."""
     known = _recipe(recipe, module)
     return aec_env(known.simulation, known.points, **{**known.options, **options})
 
 
 def make_parallel(recipe: str, module: str, **options: Any) -> Any:
-    """The entry point of the parallel view."""
+    """Make a parallel view."""
     known = _recipe(recipe, module)
     return parallel_env(known.simulation, known.points, **{**known.options, **options})

@@ -1,4 +1,4 @@
-"""What a simulation is to this library, and the two words that it and its user may say."""
+"""The interface of simulations, and the sentinels ``RULE`` and ``TRUNCATED``."""
 
 import copy
 import inspect
@@ -13,7 +13,7 @@ from .errors import SimulationError, shown, told
 
 @final
 class Sentinel:
-    """A value that is equal to itself alone, and stays itself through copies and pickles."""
+    """A value that equals only itself and survives copies and pickles."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -26,64 +26,64 @@ class Sentinel:
 
 
 RULE: Final = Sentinel("RULE")
-"""As an action: let the model's own rule decide (accepted by every view's ``step``)."""
+"""An action that lets the model's own rule decide (accepted by every view's ``step``)."""
 
 TRUNCATED: Final = Sentinel("TRUNCATED")
-"""As the result of ``run()``: the episode ended at a limit of time, not at an end of the task."""
+"""The result of a ``run()`` that ended at a time limit, not at an end of the task."""
 
 
 class SimulationInterface(ABC):
-    """A simulation that is in the lead of its own main loop (paper, section 3.3).
+    """A simulation that runs its own main loop (paper, section 3.3).
 
-    Deriving from this class is a convenience: any object with ``run`` and ``reset`` serves. What
-    a simulation may define beside the methods below:
+    Deriving from this class is optional: any object with ``run`` and ``reset`` works. Besides the methods below, a
+    simulation may define:
 
-    - ``reset(self, seed=None)`` or ``reset(self, seed=None, options=None)`` instead of ``reset(self)``:
-      it then always gets an integer seed, and the ``options`` of the environment's ``reset``.
-    - ``points``: the decision points that environments use unless they are told otherwise (a dotted
-      name, a decision function, a list of these, or a dict from these to definitions).
-    - ``expected_calls(self, point)``: the argument tuples with which the decision point of that dotted
-      name is going to be called, so that agents can be observed before their first decision.
-    - ``close(self)``: lets go of what must stay open until the last observations were made (files, connections,
-      licences). Called once for each ``reset`` that has succeeded: before the next one, when the environment is
-      closed, or when it is gone. ``close(self, last)`` is told whether it is one of the latter two, for what it keeps
-      from one episode to the next (a process, a connection).
-    - ``time(self)``: its clock, from which ``info["time"]`` and ``info["elapsed"]`` come.
-    - ``reseed(self, seed)``: seeds its generators in place, so that the chance that lies ahead is drawn anew: for
-      ``branch`` with ``seeds``. ``reseed_generators(self, seed)`` does it for the usual cases.
+    - ``reset(self, seed=None)`` or ``reset(self, seed=None, options=None)`` instead of ``reset(self)``: it then always
+      gets an integer seed, and the ``options`` of the environment's ``reset``.
+    - ``points``: the default decision points of its environments (a dotted name, a decision function, a list of these,
+      or a dict from these to definitions).
+    - ``expected_calls(self, point)``: the argument tuples of the next calls of the decision point with that dotted
+      name, so that agents can be observed before their first decision.
+    - ``close(self)``: releases what must stay open until the last observations were made (files, connections,
+      licences). It is called once for each successful ``reset``: before the next ``reset``, when the environment is
+      closed, or when it is garbage-collected. ``close(self, last)`` gets True in the latter two cases, to release what
+      it keeps between episodes (a process, a connection).
+    - ``time(self)``: its clock, the source of ``info["time"]`` and ``info["elapsed"]``.
+    - ``reseed(self, seed)``: seeds its generators in place, so that future random numbers are drawn anew: for
+      ``branch`` with ``seeds``. ``reseed_generators(self, seed)`` does this in the usual cases.
     - ``state(self)``: all that a centralised critic may see, as an array.
-    - ``render(self, mode)``: a picture of the present state, for a ``mode`` out of ``render_modes``; with
-      ``render_fps``, how many of them make a second of a film (4).
+    - ``render(self, mode)``: an image of the present state, for a ``mode`` out of ``render_modes``; ``render_fps`` is
+      the number of images per second of a video (default 4).
     """
 
     @abstractmethod
     def reset(self) -> None:
-        """Return the simulation to the initial state of an episode."""
+        """Reset the simulation to the initial state of an episode."""
 
     @abstractmethod
     def run(self) -> Any:
-        """Run the main loop of one episode; its return ends the episode.
+        """Run the main loop of one episode. When it returns, the episode ends.
 
         Returns:
-            ``TRUNCATED`` where the end is a limit of time; anything else is an end of the task.
+            ``TRUNCATED`` if the episode ends at a time limit; anything else means an end of the task.
         """
 
-    def end_agent(self, name: str) -> None:  # noqa: B027 - nothing is to be done outside of an environment
-        """Say that an agent's episode ends here: it gets its last reward and observation, and takes no part any more.
+    def end_agent(self, name: str) -> None:  # noqa: B027 - outside an environment it has no effect
+        """End an agent's episode: it gets its last reward and observation, and takes no further part.
 
-        To be called from the model while it runs, for agents that end without a call that ``removed_by=`` could name.
-        For what is no live agent of the environment, and outside of one, nothing comes of it.
+        Call this from the running model for agents that end without a call that ``removed_by=`` could name. It has no
+        effect outside an environment, or if no live agent has this name.
 
         Args:
-            name: The agent, by the name that ``agent=`` gives it.
+            name: The name of the agent, as ``agent=`` gives it.
         """
 
-    def stop(self) -> None:  # noqa: B027 - leaving it out is allowed, and then nothing is to be done
-        """Ask the main loop to end; called before a simulation is unwound in mid-episode."""
+    def stop(self) -> None:  # noqa: B027 - optional; the default does nothing
+        """Ask the main loop to end. It is called before a simulation is unwound in mid-episode."""
 
 
 def make_simulation(source: Any) -> Any:
-    """Make one simulation of an environment's own.
+    """Make a new simulation for an environment.
 
     Args:
         source: An instance (which is copied), a class or a zero-argument factory.
@@ -92,7 +92,7 @@ def make_simulation(source: Any) -> Any:
         The new simulation.
 
     Raises:
-        SimulationError: ``source`` is none of these, cannot be copied, or makes no simulation.
+        SimulationError: ``source`` is none of these, cannot be copied, or does not make a simulation.
     """
     if not isinstance(source, type) and hasattr(source, "run"):
         try:
@@ -115,14 +115,14 @@ def make_simulation(source: Any) -> Any:
 
 
 def resetter(simulation: Any) -> Callable[[int | None, dict[str, Any] | None], None]:
-    """Find out what the simulation's ``reset`` takes.
+    """Find out which arguments the simulation's ``reset`` takes.
 
     Args:
         simulation: The simulation.
 
     Returns:
-        A function of seed and options that resets the simulation with as much of them as it takes. Its
-        attribute of the signature is looked at once, here.
+        A function of seed and options that resets the simulation and passes on the arguments that ``reset`` takes. The
+        signature is inspected once, here.
     """
     seeded, optioned = _taken(simulation.reset, "seed"), _taken(simulation.reset, "options")
 
@@ -138,10 +138,10 @@ def resetter(simulation: Any) -> Callable[[int | None, dict[str, Any] | None], N
 
 
 def closer(simulation: Any) -> Callable[[bool], None] | None:
-    """Find out whether a simulation has a ``close``, and what that takes.
+    """Find out whether a simulation has a ``close``, and what it takes.
 
     Returns:
-        A function of whether no reset follows; None where there is nothing to close.
+        A function of a bool: whether no reset follows. None if there is no ``close``.
     """
     close = getattr(simulation, "close", None)
     if close is None:
@@ -150,11 +150,11 @@ def closer(simulation: Any) -> Callable[[bool], None] | None:
 
 
 _TAKEN: WeakKeyDictionary[Any, dict[str, bool]] = WeakKeyDictionary()
-"""By function: what it takes. To find that out takes longer than all else that a simulation is made ready by."""
+"""The keyword arguments of functions. Inspecting a signature takes longer than all other preparation."""
 
 
 def _taken(method: Any, name: str) -> bool:
-    """Whether a method of a simulation takes a keyword argument of that name."""
+    """Return whether a method of a simulation takes a keyword argument of that name."""
     function = method.__func__ if type(method) is MethodType and type(method.__func__) is FunctionType else None
     if function is None:
         return takes(method, name)
@@ -165,7 +165,7 @@ def _taken(method: Any, name: str) -> bool:
 
 
 def takes(function: Callable[..., Any], name: str) -> bool:
-    """Whether a function can be called with a keyword argument of that name."""
+    """Return whether a function takes a keyword argument of that name."""
     try:
         parameters = inspect.signature(function).parameters
     except (TypeError, ValueError):
@@ -177,7 +177,7 @@ def takes(function: Callable[..., Any], name: str) -> bool:
 
 
 def positional(function: Callable[..., Any]) -> list[inspect.Parameter]:
-    """The parameters of a function that can be passed by position; none where its signature is not known."""
+    """Return the positional parameters of a function; none if its signature is unknown."""
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Simulations of models that are made with a seed and then stepped, as Mesa's are."""
+"""Simulations of models that are made with a seed and then stepped, such as Mesa's models."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,39 +8,39 @@ from .simulation import TRUNCATED, SimulationInterface, takes
 
 
 class SteppedSimulation(SimulationInterface):
-    """A simulation of a model that is seeded where it is made, and has a method ``step``.
+    """A simulation of a model that gets its seed when it is made and has a method ``step``.
 
     ::
 
         prison = SteppedSimulation(PdGrid, 200, width=30)
         env = aec_env(prison, {"mesa.examples.advanced.pd_grid.agents.PDAgent.step": make_step(...)})
 
-    Each ``reset`` makes a new model, with its seed as the argument ``seed``, or ``rng`` where it takes no ``seed``. For
-    a model that takes a scenario, give a function::
+    Each ``reset`` makes a new model. The seed is passed as the argument ``seed``, or as ``rng`` if the model does not
+    take ``seed``. For a model that takes a scenario, give a function::
 
         SteppedSimulation(lambda seed, **given: WolfSheep(WolfSheepScenario(rng=seed, **given)), 200, width=30)
 
-    The loop ends when the attribute ``running`` of the model is false, or is truncated.
+    The loop ends when the model's attribute ``running`` is false, or when it is truncated.
 
     Attributes:
-        model: The model of the episode; None before the first.
-        parameters: With what it is made.
+        model: The model of the episode; None before the first episode.
+        parameters: The keyword arguments of the model.
     """
 
     points: Any = ()
     """The decision points of the model are named where environments are made."""
 
     def __init__(self, model: Callable[..., Any], steps: int | None = None, /, **parameters: Any) -> None:
-        """Say what is stepped.
+        """Define the model and its arguments.
 
         Args:
-            model: The model's class, or a function that makes one.
-            steps: After how many steps an episode is truncated. None: only the model ends it.
-            **parameters: With what the model is made besides.
+            model: The model's class, or a function that returns a model.
+            steps: The number of steps after which an episode is truncated. None: only the model ends it.
+            **parameters: Further keyword arguments for the model.
 
         Raises:
             SimulationError: ``model`` cannot be called, or takes a scenario that would hold its seed.
-            OptionValueError: ``steps`` is no positive integer.
+            OptionValueError: ``steps`` is not a positive integer.
         """
         if not callable(model):
             raise SimulationError(f"a stepped simulation needs the class of a model, not {shown(model)}")
@@ -64,10 +64,10 @@ class SteppedSimulation(SimulationInterface):
             raise SimulationError(f"{shown(self.model)} has no method step(), by which a stepped simulation goes on")
 
     def run(self) -> Any:
-        """Step the model.
+        """Step the model until it ends.
 
         Returns:
-            ``TRUNCATED`` after the last step that was allowed.
+            ``TRUNCATED`` if the number of steps reached its limit.
         """
         model = self.model
         while getattr(model, "running", True):
@@ -78,5 +78,5 @@ class SteppedSimulation(SimulationInterface):
         return None
 
     def time(self) -> float:
-        """How many steps were made."""
+        """Return the number of steps so far."""
         return float(self._done)

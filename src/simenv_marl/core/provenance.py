@@ -1,4 +1,4 @@
-"""What an environment was made of, in a form that can be written into a results file."""
+"""The provenance of an environment, in a form that can be written to a results file."""
 
 import importlib.metadata
 import platform
@@ -20,38 +20,38 @@ DEPENDENCIES = ("greenlet", "gymnasium", "numpy", "pettingzoo", "simenv-marl")
 def provenance(
     simulation: Any, points: Points = None, *, seed: int | None = None, **options: Unpack[ViewOptions]
 ) -> dict[str, Any]:
-    """Say what an environment of these arguments is made of, as ``env.unwrapped.provenance()`` does.
+    """Return the provenance of an environment with these arguments, as ``env.unwrapped.provenance()`` does.
 
     Args:
         simulation: A simulation, its class, a factory, or a ``Variant``.
         points: The decision points, as ``generate_env`` takes them.
-        seed: What it is going to be reset with.
-        **options: As ``aec_env`` takes them.
+        seed: The seed of the episode.
+        **options: The options of ``aec_env``.
 
     Returns:
-        Nothing but dicts, lists, strings, numbers, bools and None, ready for ``json.dump``:
+        A dict of dicts, lists, strings, numbers, bools and None, ready for ``json.dump``:
 
         - ``simulation``: the dotted name of its class or factory;
-        - ``packages``: by name, the version of each package that it and its decision points come from (None where
-          it has none);
-        - ``variant``, ``parameters``: those of the variant, if it was made of one;
-        - ``points``: by dotted name, the agent of each decision point that is decided (None: named at each call);
-        - ``plugins``: of each its ``handler``, ``target`` and ``position``;
-        - ``policies``: by agent or point, the name of each policy;
-        - ``options``: all others that differ from what they are without being given;
-        - ``seed``: of the latest episode;
-        - ``python`` and ``dependencies``: the versions of what it runs on.
+        - ``packages``: the versions of the packages of the simulation and its decision points, by name (None if a
+          package has no version);
+        - ``variant``, ``parameters``: the variant's name and parameters, if there is one;
+        - ``points``: the agent of each active decision point, by dotted name (None: named at each call);
+        - ``plugins``: the ``handler``, ``target`` and ``position`` of each;
+        - ``policies``: the name of each policy, by agent or point;
+        - ``options``: all other options that differ from their defaults;
+        - ``seed``: the seed of the latest episode;
+        - ``python`` and ``dependencies``: the versions of Python and of the libraries.
 
-        Functions and classes stand there by their dotted names, all else that is none of these by its ``repr``.
+        Functions and classes are given by their dotted names, other objects by their ``repr``.
 
     Raises:
-        SimEnvError: No environment can be made of these arguments; the leaf says why.
+        SimEnvError: No environment can be made of these arguments. The subclass tells why.
     """
     return describe(Plan.draw_up(simulation, points, options), seed)
 
 
 def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
-    """Say what an environment of a plan is made of: the result of ``provenance``."""
+    """Return the provenance of an environment of a plan, as ``provenance`` does."""
     name = _dotted_name(plan.maker)
     options = {
         option.name: written_plainly(getattr(plan.options, option.name))
@@ -88,7 +88,7 @@ def _key(key: Any) -> str:
 
 
 def written_plainly(value: Any) -> Any:
-    """A value in what JSON knows."""
+    """Return a value as JSON data."""
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
     if isinstance(value, np.generic):
@@ -112,7 +112,7 @@ def written_plainly(value: Any) -> Any:
 
 
 def _version(package: str) -> str | None:
-    """The version of an importable package: of the distribution that it comes from, or its own."""
+    """Return the version of an importable package: that of its distribution, or its own."""
     for distribution in _distributions().get(package, ()):
         return _version_of_distribution(distribution)
     version = getattr(sys.modules.get(package), "__version__", None)

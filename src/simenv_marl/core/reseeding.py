@@ -1,4 +1,4 @@
-"""Finding the random generators that a simulation holds, for futures that are drawn anew."""
+"""Finds the random generators of a simulation and seeds them anew, for other futures."""
 
 import random
 from collections.abc import Iterator
@@ -14,30 +14,31 @@ from .rng import HELD, SHARED, is_seed, reseed_one, streams
 _GENERATORS: Final = (random.Random, np.random.Generator, np.random.RandomState, np.random.BitGenerator)
 
 _ELSEWHERE: Final = (type, ModuleType, CodeType, np.ndarray, str, int, float, random.SystemRandom)
-"""What leads to all that is in the process, or to nothing; functions do, too."""
+"""Classes that are not searched: they lead to everything in the process, or to nothing. Nor are functions."""
 
 
 def reseed_generators(simulation: Any, seed: int) -> int:
-    """Seed all random generators that a simulation holds, each with a stream of its own.
+    """Seed all random generators of a simulation, each with a stream of its own.
 
-    They are those of its attributes, of what its attributes hold, and so on: ``random.Random``, and NumPy's
-    ``Generator``, ``RandomState`` and ``BitGenerator``; with a model of Mesa its ``random`` and ``rng``, which all that
-    is in it shares. Each is seeded in place, for all that refer to it. The same seed gives the same states, whatever
-    was drawn before; of several generators in one ``set`` each gets its stream in the order of that.
+    The generators are found in its attributes, in the attributes of these, and so on: ``random.Random``, and NumPy's
+    ``Generator``, ``RandomState`` and ``BitGenerator``. In a Mesa model these are ``random`` and ``rng``, which all of
+    its agents share. Each generator is seeded in place, so that all references to it stay valid. The same seed gives
+    the same states, whatever was drawn before. Several generators in one ``set`` get their streams in the order of the
+    set.
 
-    Not looked into are modules, classes, functions and arrays. The global generators of Python and NumPy are left
-    alone: with ``global_rng=True`` an environment seeds its own of these by itself.
+    Modules, classes, functions and arrays are not searched. The global generators of Python and NumPy are left alone:
+    an environment with ``global_rng=True`` seeds its own copies of these.
 
     Args:
-        simulation: The simulation, which calls this in its method ``reseed(self, seed)``; or any object.
+        simulation: The simulation, which calls this in its method ``reseed(self, seed)``; or any other object.
         seed: A non-negative integer.
 
     Returns:
-        How many generators were seeded.
+        The number of generators.
 
     Raises:
-        SimulationError: There are none.
-        OptionValueError: The seed is no non-negative integer.
+        SimulationError: There are no generators.
+        OptionValueError: The seed is not a non-negative integer.
     """
     if not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer, not {shown(seed)}")
@@ -55,16 +56,16 @@ def reseed_generators(simulation: Any, seed: int) -> int:
 
 
 def _generators(simulation: Any) -> Iterator[Any]:
-    """The generators that an object holds, the nearest first, each of them once."""
+    """Yield the generators that an object holds, the nearest first, each of them once."""
     known = {id(generator) for generator in SHARED}
-    kinds: dict[type, bool | None] = {}  # whether a thing of a class is a generator; None: it is not looked at
+    kinds: dict[type, bool | None] = {}  # whether objects of a class are generators; None: they are not searched
     level = [simulation]
     while level:
         following = []
         for thing in level:
             kind = type(thing)
             if kind not in kinds:
-                elsewhere = issubclass(kind, _ELSEWHERE) or hasattr(kind, "__globals__")  # as functions have them
+                elsewhere = issubclass(kind, _ELSEWHERE) or hasattr(kind, "__globals__")  # as functions have
                 kinds[kind] = None if elsewhere else issubclass(kind, _GENERATORS)
             wanted = kinds[kind]
             if wanted is None or id(thing) in known:

@@ -1,8 +1,8 @@
-"""Variants: one model, many experiments, each with a name for all that it changes.
+"""Variants: one model, many experiments, each with a name for all of its changes.
 
-A variant holds what makes an experiment on a model different from another one: parameters of the model, plugins,
-definitions of decision points, and policies that decide in place of others. It serves wherever a simulation is
-asked for. What is given beside it there comes on top of it.
+A variant holds the differences between experiments on a model: parameters of the model, plugins, definitions of
+decision points, and policies that decide instead of agents. A variant can be given wherever a simulation is expected.
+Further arguments there add to those of the variant.
 """
 
 import inspect
@@ -18,18 +18,18 @@ from .points import Points, portable
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A simulation with everything that an experiment changes about it, under one name. Immutable.
+    """A simulation with all changes of an experiment, under one name. Immutable.
 
-    To vary it further, use ``dataclasses.replace``.
+    Use ``dataclasses.replace`` to derive another variant.
 
     Attributes:
-        name: What it is called in results.
+        name: Its name in results.
         simulation: A simulation (which is copied), its class, or a factory.
-        parameters: What the class or factory is called with, by keyword.
+        parameters: The keyword arguments of the class or factory.
         points: The decision points and their definitions, as ``generate_env`` takes them.
-        plugins: Handlers for its simulations alone, as the option ``plugins`` takes them; more of them can be given
-            where the variant is used, and run after these.
-        policies: Who decides without being an agent, as the option ``policies`` takes them.
+        plugins: Handlers for its simulations alone, as the option ``plugins`` takes them. Handlers that are given where
+            the variant is used run after these.
+        policies: Policies that decide without being agents, as the option ``policies`` takes them.
         options: All other options of its environments.
     """
 
@@ -54,7 +54,7 @@ class Variant:
             value = getattr(self, name)
             if not isinstance(value, Mapping):
                 raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {shown(value)}")
-            # It cannot be changed from outside: what is frozen is the variant and all that it names.
+            # Copied, so that later changes of the arguments do not change the variant.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         twice = [name for name in ("plugins", "policies") if name in self.options]
         if twice:
@@ -78,11 +78,11 @@ class Variant:
                 f"{getattr(source, '__qualname__', None) or shown(source)} cannot be called with the parameters of the"
                 f" variant {self.name!r}: {error}"
             ) from error
-        except ValueError:  # a builtin, which cannot say what it takes
+        except ValueError:  # a builtin without a signature
             pass
 
     def __reduce__(self) -> Any:
-        # Functions go by their names: while environments are in use, others may stand in their places.
+        # Functions are pickled by name: while environments are in use, hooks may stand in their places.
         points, plugins = self.points, [(handler, portable(target), *rest) for handler, target, *rest in self.plugins]
         if isinstance(points, Mapping):
             points = {portable(key): definition for key, definition in points.items()}
@@ -100,11 +100,11 @@ class Variant:
         )
 
     def applied(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
-        """What an environment is made of that is made of this variant.
+        """Return the arguments of an environment of this variant.
 
         Args:
-            points: The decision points that are given beside it; None: its own.
-            options: The options that are given beside it.
+            points: The decision points that are given with it. None: the variant's own.
+            options: The options that are given with it.
 
         Returns:
             The source of its simulation, the decision points, and the options.

@@ -1,4 +1,4 @@
-"""Views: thin readings of an episode as PettingZoo and Gymnasium environments."""
+"""Views: an episode as a PettingZoo or Gymnasium environment."""
 
 import sys
 from typing import Any, Final, Unpack
@@ -9,7 +9,7 @@ from ..core.options import ViewOptions, explain_options
 from ..core.plan import Plan
 from ..core.points import Points
 from ..errors import OptionValueError, meant, shown
-from . import asked  # noqa: F401 - the environments that policies are given
+from . import asked  # noqa: F401 - registers the environments that policies get
 from .aec import SimulationAECEnv
 from .base import View
 from .joint import SimulationJointEnv
@@ -38,11 +38,11 @@ VIEWS: Final = ("aec", "parallel", "single", "joint")
 
 
 def view_class(plan: Plan, view: str | None) -> Any:
-    """The class of a view of a plan.
+    """Return the class of a view of a plan.
 
     Args:
         plan: The plan.
-        view: One of ``VIEWS``. None: single where one point with one agent is active, AEC otherwise.
+        view: One of ``VIEWS``. None: single if one point with one agent is active, else AEC.
 
     Raises:
         OptionValueError: There is no such view.
@@ -65,24 +65,24 @@ def view_class(plan: Plan, view: str | None) -> Any:
 def generate_env(
     simulation: Any, points: Points = None, *, view: str | None = None, **options: Unpack[ViewOptions]
 ) -> Any:
-    """Make an environment class of a simulation (paper, section 3.3).
+    """Make an environment class for a simulation (paper, section 3.3).
 
     Args:
         simulation: A simulation (which every environment copies), its class, a zero-argument factory, or a ``Variant``.
-        points: The active decision points: a dotted name, a decision function, a list of these, or a dict
-            from dotted name or function to its definition, which leaves the model undecorated. None: the
-            simulation's attribute ``points``, else all decorated points of the one package that has any.
-        view: "aec", "parallel", "single" or "joint". None: single where one point with one agent is active, or one
-            agent is named with ``agent=``, AEC otherwise.
+        points: The active decision points: a dotted name, a decision function, a list of these, or a dict from dotted
+            name or function to its definition. With a dict, the model needs no decorators. None: the simulation's
+            attribute ``points``, else all decorated points, which must then belong to one package.
+        view: "aec", "parallel", "single" or "joint". None: single if one point with one agent is active, or if
+            ``agent=`` names one agent; else AEC.
         **options: Any of these:
 
             {options}
 
     Returns:
-        A class, whose instances take options as keywords to change those given here.
+        A class. Its constructor takes options as keyword arguments, which override those given here.
 
     Raises:
-        SimEnvError: Something in it cannot work; the leaf says what.
+        SimEnvError: Something cannot work. The subclass tells what.
     """
     plan = Plan.draw_up(simulation, points, options)
     base = view_class(plan, view)
@@ -105,7 +105,7 @@ def generate_env(
 
 @explain_options
 def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationAECEnv:
-    """Make a PettingZoo AEC environment, in which decision points are agents.
+    """Make a PettingZoo AEC environment whose agents decide at the decision points.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
@@ -115,14 +115,14 @@ def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOption
             {options}
 
     Raises:
-        SimEnvError: Something in it cannot work; the leaf says what.
+        SimEnvError: Something cannot work. The subclass tells what.
     """
     return SimulationAECEnv(Plan.draw_up(simulation, points, options))
 
 
 @explain_options
 def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationParallelEnv:
-    """Make a PettingZoo parallel environment, in which decision points are agents.
+    """Make a PettingZoo parallel environment whose agents decide at the decision points.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
@@ -132,17 +132,17 @@ def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewO
             {options}
 
     Raises:
-        SimEnvError: Something in it cannot work; the leaf says what.
+        SimEnvError: Something cannot work. The subclass tells what.
     """
     return SimulationParallelEnv(Plan.draw_up(simulation, points, options))
 
 
 @explain_options
 def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationEnv:
-    """Make a Gymnasium environment of the one agent that is active.
+    """Make a Gymnasium environment for the one active agent.
 
-    Where its decision point has a goal, the environment is goal-based: its observations are dicts of
-    ``observation``, ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
+    If its decision point has a goal, the environment is goal-based: its observations are dicts of ``observation``,
+    ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
@@ -152,8 +152,8 @@ def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOpt
             {options}
 
     Raises:
-        ViewError: Not just one agent is active.
-        SimEnvError: Something else in it cannot work; the leaf says what.
+        ViewError: There is not exactly one active agent.
+        SimEnvError: Something else cannot work. The subclass tells what.
     """
     plan = Plan.draw_up(simulation, points, options)
     return single_view(plan)(plan)
@@ -161,7 +161,7 @@ def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOpt
 
 @explain_options
 def joint_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationJointEnv:
-    """Make a Gymnasium environment whose one agent takes all decisions.
+    """Make a Gymnasium environment with one agent that takes all decisions.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
@@ -172,7 +172,7 @@ def joint_env(simulation: Any, points: Points = None, **options: Unpack[ViewOpti
 
     Raises:
         ViewError: Not all agents are known beforehand, or the spaces cannot be flattened.
-        SimEnvError: Something else in it cannot work; the leaf says what.
+        SimEnvError: Something else cannot work. The subclass tells what.
     """
     return SimulationJointEnv(Plan.draw_up(simulation, points, options))
 
@@ -190,28 +190,28 @@ def vector_env(
     context: Any = None,
     **options: Unpack[ViewOptions],
 ) -> SimulationVectorEnv:
-    """Make a Gymnasium vector environment: many simulations of a kind, stepped together.
+    """Make a Gymnasium vector environment: many copies of a simulation, stepped together.
 
-    It tells, step by step, what ``gymnasium.vector.SyncVectorEnv`` tells of as many single (or joint) views.
+    Each step returns what ``gymnasium.vector.SyncVectorEnv`` would return for as many single (or joint) views.
 
     Args:
         simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
         points: The active decision points, as ``generate_env`` takes them.
-        num_envs: How many simulations.
-        workers: Over how many processes they are spread; 0: all of them are suspended in this one.
-        view: "single" or "joint". None: single where one point with one agent is active, joint otherwise.
-        copy: Whether ``reset`` and ``step`` return observations of the caller's own; else they return the same
-            arrays again, which the next call changes.
-        autoreset_mode: When a simulation whose episode has ended begins the next one, as Gymnasium has it:
+        num_envs: The number of simulations.
+        workers: The number of worker processes. 0: all simulations are suspended in this process.
+        view: "single" or "joint". None: single if one point with one agent is active, else joint.
+        copy: Whether ``reset`` and ``step`` return new arrays of observations. Otherwise they return the same arrays
+            every time, and the next call overwrites them.
+        autoreset_mode: When a simulation is reset after its episode has ended, as in Gymnasium:
             ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
-        context: How workers are started: "spawn" (what None means), "forkserver", "fork", or a context of
+        context: The start method of workers: "spawn" (the default), "forkserver", "fork", or a context of
             ``multiprocessing``.
         **options: Any of these:
 
             {options}
 
     Raises:
-        SimEnvError: Something in it cannot work; the leaf says what.
+        SimEnvError: Something cannot work. The subclass tells what.
     """
     return SimulationVectorEnv(
         Recipe(simulation, points, options, view),

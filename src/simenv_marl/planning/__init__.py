@@ -1,11 +1,11 @@
-"""Planning: what actions are worth in the futures that an episode may have, and policies that decide by that.
+"""Planning: estimates the values of actions on possible futures of an episode; policies that decide by these values.
 
 Each module imports only from those below it::
 
     tree            a policy that looks several decisions ahead
-    policy          one that looks one decision ahead
-    values          what each candidate is worth
-    futures         candidates tried out on common futures, in branches
-    lookahead       how far and by what a future is valued, and what one is worth
-    players         how the agent that decides goes through a branch, in each view
+    policy          a policy that looks one decision ahead
+    values          the values of candidate actions
+    futures         tries candidates on common futures, in branches
+    lookahead       the horizon and discount of a try, and its return
+    players         the deciding agent in a branch, in each view
 """

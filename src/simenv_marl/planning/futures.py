@@ -1,4 +1,4 @@
-"""Candidates for one decision, tried out on common futures in branches."""
+"""Tries candidate actions for one decision on common futures, in branches."""
 
 from __future__ import annotations
 
@@ -16,30 +16,31 @@ from .lookahead import Lookahead
 from .players import player_of
 
 _KEY: Final = 0x706C616E
-"""Keeps the seeds of futures apart from others that are made of the episode's seed."""
+"""Separates the seeds of futures from other seeds that are derived from the episode's seed."""
 
 
 class Futures:
-    """The futures of a pending decision. The same number stands for the same future, whatever the candidate.
+    """The futures of a pending decision. Future number i is the same for all candidates.
 
     Attributes:
         actions: The candidates.
-        endless: Whether there are as many futures as one likes; else there is the one that lies ahead.
-        returns: By candidate, what its tries have come to.
+        endless: Whether there are unlimited futures. Otherwise there is only the one exact future.
+        returns: The returns of each candidate's tries.
     """
 
     def __init__(self, env: Any, actions: Any, look: Lookahead, seed: int | None, *, legal: bool = False) -> None:
-        """Make ready.
+        """Prepare the futures.
 
         Args:
             env: The environment.
             actions: The candidates, as ``Player.candidates`` takes them.
-            look: How they are tried out.
-            seed: Tells these futures of the decision from others; None: it has its own.
-            legal: Whether candidates that are masked now are left out.
+            look: How candidates are tried.
+            seed: A number that distinguishes these futures from others of the same decision. None: the decision's own
+                futures.
+            legal: Whether masked candidates are left out.
 
         Raises:
-            SimEnvError: Something in this cannot work; the leaf says what.
+            SimEnvError: Something cannot work. The subclass tells what.
         """
         self._env, self._look = env, look
         player = player_of(env, look.base)
@@ -60,16 +61,16 @@ class Futures:
             )
 
     def run(self, candidates: Iterable[int], more: int, *, progress: bool = False) -> None:
-        """Try out candidates in their next futures.
+        """Try candidates on their next futures.
 
         Args:
-            candidates: Which ones.
-            more: In how many futures each; in one at most where there are no others.
-            progress: Whether to show a bar.
+            candidates: The places of the candidates.
+            more: The number of futures for each candidate; at most one if there is only one future.
+            progress: Whether to show a progress bar.
 
         Raises:
-            BranchError: A branch has died, or has taken too long.
-            BaseException: What the model, a mapping or the base raises in a branch.
+            BranchError: A branch died, or took too long.
+            BaseException: Any exception of the model, a mapping or the base in a branch.
         """
         pairs = [
             (candidate, future)
@@ -86,13 +87,13 @@ class Futures:
                     bar.update(len(part))
 
     def play(self, tries: Sequence[tuple[tuple[int, ...], int]]) -> list[list[float]]:
-        """Try out candidates, and what is done after them.
+        """Try sequences of candidates.
 
         Args:
-            tries: Of each the actions, by their places, and the future.
+            tries: For each try, the places of its actions, and the number of the future.
 
         Returns:
-            Of each what ``Lookahead.play`` tells.
+            For each try, the result of ``Lookahead.play``.
         """
         look, seeds = self._look, None
         if self.endless:
@@ -111,7 +112,7 @@ class Futures:
         return brought
 
     def _tried(self, twin: Any, places: tuple[int, ...], future: int) -> list[float]:
-        """In a branch: try out actions, by their places."""
+        """Try actions, given by their places, in a branch."""
         actions = [self.actions[place] for place in places]
         try:
             return self._look.play(twin, actions)
@@ -120,11 +121,11 @@ class Futures:
             raise
 
     def seeds(self, number: int) -> list[int]:
-        """The seeds of the first futures."""
+        """Return the seeds of the first futures."""
         return [int(word) for word in np.random.SeedSequence(self._entropy).generate_state(number)]
 
     def table(self) -> NDArray[np.float64]:
-        """The returns, in a row for each candidate; nan where it was not tried."""
+        """Return the returns, one row for each candidate; nan where it was not tried."""
         table = np.full((len(self.returns), max(map(len, self.returns))), np.nan)
         for row, values in enumerate(self.returns):
             table[row, : len(values)] = values

@@ -1,4 +1,4 @@
-"""How far and by what a future is valued, and what a candidate is worth in one."""
+"""How a future is valued: horizon, discount and terminal value, and the return of a candidate."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ..simulation import RULE
 from .players import Player, player_of
 
 UNITS: Final = ("decision", "time")
-"""By what horizons and discounts count."""
+"""The units of horizons and discounts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lookahead:
-    """How candidates are tried out: see ``action_values``, which has the same parameters."""
+    """The parameters of tries; ``action_values`` has the same ones and describes them."""
 
     base: Any = RULE
     futures: int = 16
@@ -51,11 +51,11 @@ class Lookahead:
             )
 
     def check(self, player: Player) -> None:
-        """Make sure that a player can go by this.
+        """Check that the parameters fit a player.
 
         Raises:
-            OptionValueError: It cannot.
-            UnknownAgentError: The base is one of an agent that there is not.
+            OptionValueError: They do not.
+            UnknownAgentError: The base names an agent that does not exist.
         """
         player.check_base()
         if self._timed and player.episode.clock is None:
@@ -63,19 +63,19 @@ class Lookahead:
 
     @property
     def _timed(self) -> bool:
-        """Whether the simulation's time is asked for."""
+        """Whether the simulation's time is needed."""
         return "time" in (self.discount_by, self.horizon_by)
 
     def play(self, env: Any, actions: Sequence[Any]) -> list[float]:
-        """In a branch: take actions, one after the other, and go on by the base.
+        """Take actions in a branch, one after the other, and go on with the base.
 
         Args:
             env: The branch.
-            actions: The candidate, and what is tried out at the agent's decisions after it. Where one of these is
-                illegal by then, the base decides.
+            actions: The candidate, followed by actions for the agent's next decisions. If one of these is illegal when
+                its decision arises, the base decides.
 
         Returns:
-            What each decision of the agent has brought, discounted; what comes after the horizon is the last one's.
+            The discounted reward of each decision of the agent. The terminal value is added to the last one.
         """
         planning = PLANNING.set(True)
         try:
@@ -109,15 +109,15 @@ class Lookahead:
 
 
 def is_count(value: Any) -> bool:
-    """Whether something is a positive integer."""
+    """Return whether a value is a positive integer."""
     return hasattr(value, "__index__") and not isinstance(value, bool) and value >= 1
 
 
 def is_number(value: Any) -> bool:
-    """Whether something is one finite number."""
+    """Return whether a value is one finite number."""
     return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
 
 
 def within_a_branch() -> bool:
-    """Whether this runs in a branch in which a candidate is tried out: planners are their own bases there."""
+    """Return whether this runs in a branch that tries a candidate. There, planners act as their bases."""
     return PLANNING.get()

@@ -1,7 +1,7 @@
-"""How the agent that decides goes through a branch, in each view: its candidate first, and then its base.
+"""The deciding agent in a branch, in each view: it takes its candidate first, and then follows its base.
 
-An environment may be in wrappers. Actions of the agent go through them, and observations and rewards are theirs.
-``RULE``, which is an action of the bare environment alone, is put in the place of what the wrappers have let through.
+The environment may have wrappers. The agent's actions go through them, and its observations and rewards come from them.
+``RULE``, which only the unwrapped environment knows, replaces the action that the wrappers let through.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Player:
     """The agent whose decision is pending.
 
     Attributes:
-        env: The environment, in wrappers or not.
-        view: The environment without them.
+        env: The environment, with or without wrappers.
+        view: The unwrapped environment.
         episode: Its episode.
         agent: The name of the agent.
-        own: What the episode knows of it.
+        own: The episode's record of the agent.
         over: Whether the agent's episode has ended.
     """
 
@@ -39,7 +39,7 @@ class Player:
 
         Args:
             env: The environment.
-            base: Who decides after the candidate: ``RULE``, a policy of the agent, or policies by agent.
+            base: What decides after the candidate: ``RULE``, a policy of the agent, or a dict of policies by agent.
         """
         self.env, self.view, self.base = env, env.unwrapped, base
         self.episode = self.view.episode
@@ -47,26 +47,26 @@ class Player:
         self.agent = self.own.name
         self.over = False
         self._policies: dict[str, Any] = {}
-        self._seen: Any = None  # the observation and the info that the latest step has brought
+        self._seen: Any = None  # the observation and the info of the latest step
 
     # -- before anything moves --------------------------------------------------------------------
 
     @property
     def space(self) -> spaces.Space[Any]:
-        """The action space, as the wrappers have it."""
+        """The action space of the wrapped environment."""
         space: spaces.Space[Any] = self.env.action_space
         return space
 
     def candidates(self, actions: Any, *, legal: bool = False) -> list[Any]:
-        """The candidates for the pending decision.
+        """Return the candidates for the pending decision.
 
         Args:
-            actions: The candidates; None: all legal actions of a ``Discrete``.
-            legal: Whether those that are masked now are left out, and no error.
+            actions: The candidates. None: all legal actions of a ``Discrete``.
+            legal: Whether masked candidates are left out. Otherwise they are an error.
 
         Raises:
-            OptionValueError: They are none.
-            InvalidActionError: One of them is not legal.
+            OptionValueError: These are not candidates.
+            InvalidActionError: A candidate is not legal.
         """
         if actions is None:
             space = self.space
@@ -98,7 +98,7 @@ class Player:
             raise InvalidActionError(f"the action {shown(action)} is masked; the mask is {shown(self.own.mask)}")
 
     def _is_masked(self, action: Any) -> bool:
-        """Whether a mask, which wrappers may have made that of another space, forbids an action."""
+        """Return whether the mask forbids an action; wrappers may have replaced the space of the mask."""
         space, mask = self.own.point.definition.action_space, self.own.mask
         if mask is None or action is RULE or self.space != space:
             return False
@@ -106,11 +106,11 @@ class Player:
         return known is not ILLEGAL and not mask_allows(space, mask, known)
 
     def check_base(self) -> None:
-        """Make sure that the base can be asked.
+        """Check that the base can answer.
 
         Raises:
-            OptionValueError: It is no policy.
-            UnknownAgentError: It is one of an agent that there is not.
+            OptionValueError: It is not a policy.
+            UnknownAgentError: It names an agent that does not exist.
         """
         base = self.base
         for policy in base.values() if isinstance(base, Mapping) else [base]:
@@ -124,13 +124,13 @@ class Player:
                 )
 
     def _may_be(self, name: Any) -> bool:
-        """Whether there is an agent of that name, or may be one."""
+        """Return whether an agent of that name exists, or may appear."""
         found: bool = self.episode.may_be(name)
         return found
 
     @property
     def entropy(self) -> list[int]:
-        """What tells this decision from all others, however the episode is played."""
+        """Return numbers that distinguish this decision from all others, however the episode is played."""
         episode = self.episode
         number = self.own.consultations - 1 if self.own.consultations else episode.turns
         return [episode.seed, number, crc32(self.agent.encode(errors="surrogatepass"))]
@@ -138,34 +138,34 @@ class Player:
     # -- in a branch ------------------------------------------------------------------------------
 
     def now(self) -> float:
-        """The simulation's time."""
+        """Return the simulation's time."""
         return float(self.episode.clock())
 
     def begin(self) -> None:
-        """Make ready for what is done in a branch."""
+        """Prepare a branch."""
         self.view.stop_showing()
 
     def step(self, action: Any) -> float:
-        """Take an action, and go on to the agent's next decision, or to its end; return the reward of that."""
+        """Take an action, go on to the agent's next decision or its end, and return the reward."""
         observation, reward, terminated, truncated, info = self._through(action)
         self._seen, self.over = (observation, info), terminated or truncated
         return float(reward)
 
     def allows(self, action: Any) -> bool:
-        """Whether an action that was legal at another decision is so now."""
+        """Return whether an action that was legal at another decision is legal now."""
         return not self._is_masked(action)
 
     def decide(self) -> Any:
-        """What the base says the agent is to do."""
+        """Return the agent's action by its base."""
         return self._ask(self.agent, *(self._seen or self._observed(self.own)))
 
     def _observed(self, agent: Agent) -> tuple[Any, dict[str, Any]]:
-        """What an agent has observed last."""
+        """Return the latest observation and info of an agent."""
         seen = agent.point.blank() if agent.observation is None else duplicate(agent.observation)
         return seen, dict(agent.info)
 
     def _ask(self, name: str, observation: Any, info: Any) -> Any:
-        """What an agent's base answers."""
+        """Return the answer of an agent's base."""
         policy: Any = self._policies.get(name)
         if policy is None:
             own: Any = self.base if name == self.agent or isinstance(self.base, Mapping) else RULE
@@ -178,19 +178,19 @@ class Player:
         return policy(observation, info)
 
     def _through(self, action: Any) -> Any:
-        """Step through the wrappers; ``RULE`` reaches the bare environment as it is."""
+        """Step through the wrappers; ``RULE`` reaches the unwrapped environment unchanged."""
         if self.env is self.view or action is not RULE:
             return self.env.step(action)
         return self._replacing(lambda given: action, self._placeholder(self.space, self.episode.pending))
 
     @staticmethod
     def _placeholder(space: spaces.Space[Any], agent: Agent) -> Any:
-        """A legal action for wrappers to look at, where something else is done."""
+        """Return a legal action that wrappers see in place of another one."""
         mask = agent.mask if space == agent.point.definition.action_space else None
         return space.sample() if mask is None else space.sample(mask)
 
     def _replacing(self, replace: Callable[[Any], Any], placeholder: Any) -> Any:
-        """Step through the wrappers with a placeholder, whose place something else takes behind them."""
+        """Step through the wrappers with a placeholder, and replace it behind them."""
         view, step = self.view, type(self.view).step
         vars(view)["step"] = lambda given: step(view, replace(given))
         try:
@@ -200,17 +200,17 @@ class Player:
 
 
 class SinglePlayer(Player):
-    """The agent of a single view. All others are led in the simulation."""
+    """The agent of a single view. The simulation answers for all other agents."""
 
     def begin(self) -> None:
-        """Make ready for what is done in a branch."""
+        """Prepare a branch."""
         super().begin()
         if isinstance(self.base, Mapping):
             self.episode.leave_to(self.base)
 
 
 class JointPlayer(Player):
-    """The one agent of a joint view, of which the agents of the roster are parts."""
+    """The one agent of a joint view, whose action holds the actions of the roster's agents."""
 
     def __init__(self, env: Any, base: Any) -> None:
         super().__init__(env, base)
@@ -223,7 +223,7 @@ class JointPlayer(Player):
             super()._check(self._without_rules(action))
 
     def _without_rules(self, action: Any) -> Any:
-        """A joint action in which other actions stand for the parts that are ``RULE``."""
+        """Return a joint action in which legal actions replace the parts that are ``RULE``."""
         if not isinstance(action, Mapping):
             return action
         space: Any = self.space
@@ -233,7 +233,7 @@ class JointPlayer(Player):
         return False
 
     def allows(self, action: Any) -> bool:
-        """Whether an action that was legal at another decision is so now."""
+        """Return whether an action that was legal at another decision is legal now."""
         try:
             self._check(action)
         except InvalidActionError:
@@ -241,7 +241,7 @@ class JointPlayer(Player):
         return True
 
     def check_base(self) -> None:
-        """Make sure that the base can be asked.
+        """Check that the base can answer.
 
         Raises:
             OptionValueError, UnknownAgentError: It cannot.
@@ -254,7 +254,7 @@ class JointPlayer(Player):
         return name in self.view.joint.roster
 
     def decide(self) -> Any:
-        """What the base says all agents are to do."""
+        """Return the actions of all agents by the base."""
         if not isinstance(self.base, Mapping):
             seen: Any = self._seen or (self.view.joint.observe(self.episode), {})
             return self._ask(self.agent, *seen)
@@ -289,12 +289,12 @@ class AECPlayer(Player):
 
     @property
     def space(self) -> spaces.Space[Any]:
-        """The action space, as the wrappers have it."""
+        """The action space of the wrapped environment."""
         space: spaces.Space[Any] = self.env.action_space(self.env.agent_selection)
         return space
 
     def step(self, action: Any) -> float:
-        """Take an action, and have all others decide, until the agent is selected once more."""
+        """Take an action; all other agents decide until this agent is selected again."""
         env = self.env
         self._through(action)
         while env.agents:
@@ -309,11 +309,11 @@ class AECPlayer(Player):
         return 0.0
 
     def decide(self) -> Any:
-        """What the base says the agent is to do."""
+        """Return the agent's action by its base."""
         return self._decision_of(self.agent)
 
     def _decision_of(self, name: str) -> Any:
-        """What the base of the selected agent answers."""
+        """Return the answer of the selected agent's base."""
         if self.base is RULE or (name != self.agent and not isinstance(self.base, Mapping)):
             return RULE
         observation, _, _, _, info = self.env.last()
@@ -321,7 +321,7 @@ class AECPlayer(Player):
 
 
 class ParallelPlayer(Player):
-    """An agent of a parallel view, whose decisions are parts of rounds."""
+    """An agent of a parallel view, whose actions are part of rounds."""
 
     def __init__(self, env: Any, base: Any) -> None:
         super().__init__(env, base)
@@ -329,12 +329,12 @@ class ParallelPlayer(Player):
 
     @property
     def space(self) -> spaces.Space[Any]:
-        """The action space, as the wrappers have it."""
+        """The action space of the wrapped environment."""
         space: spaces.Space[Any] = self.env.action_space(self.agent)
         return space
 
     def step(self, action: Any) -> float:
-        """Play a round, and others without an action of the agent's until its decision is pending again."""
+        """Play a round, and further rounds without an action of the agent until its decision is pending again."""
         reward = self._round({self.agent: action})
         while not self.over and self.episode.pending is not self.own:
             reward += self._round({})
@@ -354,11 +354,11 @@ class ParallelPlayer(Player):
         observations, rewards, terminations, truncations, infos = results
         self._seen = {name: (observations[name], infos.get(name, {})) for name in observations}
         over = terminations.get(self.agent, True) or truncations.get(self.agent, True)
-        self.over = bool(over or self.own.ended)  # padded, those who have ended stay
+        self.over = bool(over or self.own.ended)  # with padded=True, ended agents stay
         return float(rewards.get(self.agent, 0.0))
 
     def decide(self) -> Any:
-        """What the base says the agent is to do."""
+        """Return the agent's action by its base."""
         return self._decision_of(self.agent)
 
     def _decision_of(self, name: str) -> Any:
@@ -371,14 +371,14 @@ PLAYERS: dict[type, type[Player]] = {
     SimulationJointEnv: JointPlayer,
     SimulationEnv: SinglePlayer,
 }
-"""By the class of a view."""
+"""The players, by the class of the view."""
 
 
 def player_of(env: Any, base: Any) -> Player:
-    """The agent whose decision is pending.
+    """Return the player of the agent whose decision is pending.
 
     Raises:
-        ViewError: It is no environment of one simulation.
+        ViewError: ``env`` is not an environment of one simulation.
         ResetNeededError, ReentrancyError: No decision is pending.
     """
     view = getattr(env, "unwrapped", env)

@@ -1,4 +1,4 @@
-"""Policies that try out candidates before they decide."""
+"""Policies that try candidates before they decide."""
 
 from collections.abc import Callable, Iterable, Mapping
 from math import ceil, log2
@@ -15,17 +15,17 @@ from .values import ActionValues, base_value, valued
 
 
 class RolloutPolicy:
-    """A policy that looks one decision ahead of a base, and spends its branches on the candidates that are in the race.
+    """A policy that looks one decision ahead: it tries candidate actions in branches and takes the best one.
 
-    By sequential halving (Karnin, Koren and Somekh, 2013): the budget is divided among rounds, in each of which all
-    candidates that are left are tried out on the same futures; the better half of them goes on.
+    It uses sequential halving (Karnin, Koren and Somekh, 2013). The budget is divided among rounds. In each round, all
+    remaining candidates are tried on the same futures, and the better half of them goes on.
 
-    It serves wherever a policy for one decision at a time does, by ``_environment``. In a branch of a planner it is its
-    own base.
+    The policy can be used like any policy that answers one decision at a time; it gets the environment as
+    ``_environment``. In a branch of a planner it acts as its own base.
 
     Attributes:
-        base: Who decides after a candidate.
-        budget: How many branches a decision may take; None: as many as candidates times ``futures``.
+        base: What decides after a candidate.
+        budget: The number of branches per decision. None: the number of candidates times ``futures``.
     """
 
     def __init__(
@@ -47,22 +47,22 @@ class RolloutPolicy:
         """Make a policy.
 
         Args:
-            actions: The candidates. Those that are masked at a decision are left out there. None: all legal actions of
-                a ``Discrete``.
-            base: As ``action_values`` takes it, and so are all others that are not named here.
-            futures: In how many futures a candidate is tried on average, where there is no ``budget``.
-            horizon: How far a future reaches.
-            horizon_by: By what it is counted.
-            terminal_value: What comes after it.
-            discount: By what a reward is discounted.
-            discount_by: By what that is counted.
-            budget: How many branches a decision may take.
-            seed: Tells the futures from those of another planner.
-            method: As ``branch`` takes it.
-            time_limit: After how many seconds a branch is ended.
+            actions: The candidates. Candidates that are masked at a decision are left out there. None: all legal
+                actions of a ``Discrete``.
+            base: What decides after a candidate, as ``action_values`` takes it.
+            futures: The mean number of futures per candidate, if there is no ``budget``.
+            horizon: The length of a future, as ``action_values`` takes it.
+            horizon_by: The unit of the horizon, as ``action_values`` takes it.
+            terminal_value: The value after the horizon, as ``action_values`` takes it.
+            discount: The discount factor, as ``action_values`` takes it.
+            discount_by: The unit of discounting, as ``action_values`` takes it.
+            budget: The number of branches per decision.
+            seed: A number that distinguishes the futures from those of another planner.
+            method: The method of branching, as ``branch`` takes it.
+            time_limit: The time after which a branch is ended, in seconds.
 
         Raises:
-            OptionValueError: An argument cannot have its value.
+            OptionValueError: An argument has an invalid value.
         """
         if budget is not None and not is_count(budget):
             raise OptionValueError(f"budget must be a number of branches or None, not {shown(budget)}")
@@ -73,22 +73,21 @@ class RolloutPolicy:
         self.base, self.budget = base, budget
         self._actions: Any = actions
         if isinstance(actions, Iterable) and not isinstance(actions, (str, Mapping)):
-            self._actions = list(actions)  # which are asked for at each decision
+            self._actions = list(actions)  # an iterator would be used up by the first decision
         self._seed = checked_seed(seed)
 
     def choose(self, env: Any) -> ActionValues:
-        """Find out which candidate for the pending decision of an environment is best.
+        """Find the best candidate for the pending decision of an environment.
 
         Args:
             env: The environment, as ``action_values`` takes it. It does not move.
 
         Returns:
-            The values. ``best`` is one of those that were in the race to the end. Where there is one candidate, it is
-            not tried.
+            The values. ``best`` is one of the candidates of the last round. A single candidate is not tried.
 
         Raises:
             OptionValueError: The budget is too small to try each candidate.
-            SimEnvError: As ``action_values`` does; so are all other errors.
+            SimEnvError: As ``action_values`` raises it; this holds for all other errors, too.
         """
         if within_a_branch():
             return base_value(env, self.base)
@@ -100,7 +99,7 @@ class RolloutPolicy:
         return valued(found, self._search(found, budget) if number > 1 else [0])
 
     def _search(self, found: Futures, budget: int) -> list[int]:
-        """Try out candidates; return the places of those that the best is one of."""
+        """Try candidates; return the places of the finalists."""
         left = list(range(len(found.actions)))
         for rounds in range(ceil(log2(len(left))), 0, -1):
             more = min(max(1, budget // (len(left) * rounds)), budget // len(left))
@@ -113,9 +112,9 @@ class RolloutPolicy:
         return left
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
-        """Decide, as policies do.
+        """Answer a decision, as policies do.
 
         Returns:
-            The best action; within a branch what the base decides.
+            The best action; within a branch, the answer of the base.
         """
         return self.choose(_environment).best

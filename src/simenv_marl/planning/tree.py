@@ -9,34 +9,35 @@ from .lookahead import is_count, is_number
 from .policy import RolloutPolicy
 
 AT_ONCE: Final = 8
-"""So many branches are under way between two looks at what was found: the same for every number of cores."""
+"""The number of branches that run before the tree is updated. It does not depend on the number of cores."""
 
 Node = tuple[int, ...]
-"""The places of the candidates that lead to it, decision by decision."""
+"""A node: the places of the candidates that lead to it, decision by decision."""
 
 
 class TreeSearchPolicy(RolloutPolicy):
-    """A policy that tries out what it does now together with what it does next: open-loop UCT over branches.
+    """A policy that looks several decisions ahead, by open-loop UCT over branches.
 
-    At each of the next ``depth`` decisions it tries the candidates that seem best, and those that it knows little of
-    (UCB1); then the base decides. A node of the tree is a sequence of candidates, whatever chance has brought in
-    between. Each candidate for the pending decision meets the same futures in the same order.
+    At each of the next ``depth`` decisions it tries the candidates that seem best, and those of which it knows little
+    (UCB1); then the base decides. A node of the tree is a sequence of candidates, whatever chance events lie between
+    them. All candidates for the pending decision meet the same futures in the same order.
 
-    It needs more branches than ``RolloutPolicy``, and is worth them where the worth of an action shows only with the
-    right ones after it.
+    It needs more branches than ``RolloutPolicy``. They pay off if an action is only good with the right actions after
+    it.
     """
 
     def __init__(self, actions: Any = None, *, depth: int = 2, exploration: float = 1.0, **options: Any) -> None:
         """Make a policy.
 
         Args:
-            actions: The candidates, for this decision and the next ones; at those the base decides where one is masked.
-            depth: How many decisions are tried out, this one included.
-            exploration: How much is spent on candidates of which little is known, by the spread of the returns.
-            **options: As ``RolloutPolicy`` takes them.
+            actions: The candidates for this decision and the next ones. If a candidate is masked at a next decision,
+                the base decides there.
+            depth: The number of decisions that are tried, including this one.
+            exploration: The weight of exploration, in units of the spread of the returns.
+            **options: The arguments of ``RolloutPolicy``.
 
         Raises:
-            OptionValueError: An argument cannot have its value.
+            OptionValueError: An argument has an invalid value.
         """
         if not is_count(depth):
             raise OptionValueError(f"depth must be a number of decisions, not {shown(depth)}")
@@ -59,20 +60,20 @@ class TreeSearchPolicy(RolloutPolicy):
 
 
 class _Tree:
-    """What was found out about sequences of candidates.
+    """The results of sequences of candidates.
 
     Attributes:
-        visits: By node, how often it was tried, tries under way included.
+        visits: The number of tries of each node, including those that are running.
     """
 
     def __init__(self, candidates: int, depth: int, exploration: float) -> None:
         self._candidates, self._depth, self._exploration = candidates, depth, exploration
         self.visits: dict[Node, int] = {}
-        self._returns: dict[Node, list[float]] = {}  # from the node's own decision on
+        self._returns: dict[Node, list[float]] = {}  # returns from the node's own decision on
         self._least, self._most = inf, -inf
 
     def descend(self) -> Node:
-        """Choose what is tried out next: down to a node that was not tried, or to the depth."""
+        """Choose the sequence to try next: descend to an untried node, or to the depth."""
         node: Node = ()
         while len(node) < self._depth:
             below = [(*node, place) for place in range(self._candidates)]
@@ -87,16 +88,16 @@ class _Tree:
         return node
 
     def _bound(self, node: Node, doubt: float) -> float:
-        """What a node is worth, and so much more as is in doubt; or less."""
+        """Return the confidence bound of a node's value: upper for a positive ``doubt``, lower for a negative one."""
         returns, spread = self._returns[node], self._most - self._least
         return sum(returns) / len(returns) + doubt * self._exploration * spread / sqrt(self.visits[node])
 
     def learn(self, node: Node, brought: list[float]) -> None:
-        """Note what a try has brought, decision by decision; the agent may have ended before the node."""
+        """Add the rewards of a try, decision by decision; the agent may have ended before the node."""
         for depth in range(min(len(node), len(brought))):
             self._returns.setdefault(node[: depth + 1], []).append(sum(brought[depth:]))
         self._least, self._most = min(self._least, sum(brought)), max(self._most, sum(brought))
 
     def best(self) -> int:
-        """The candidate that is worth most when all doubts are held against it."""
+        """Return the candidate with the largest lower confidence bound."""
         return max(range(self._candidates), key=lambda place: self._bound((place,), -1.0))

@@ -1,4 +1,4 @@
-"""What candidate actions of a pending decision are worth."""
+"""The values of candidate actions for a pending decision."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ from .players import player_of
 
 @dataclass(frozen=True, eq=False)
 class ActionValues:
-    """What candidate actions are worth. Made by ``action_values`` and by planners.
+    """The estimated values of candidate actions. Made by ``action_values`` and by planners.
 
     Attributes:
         actions: The candidates.
-        means: ``(candidates,)``: of each the mean return; nan where it was not tried.
-        standard_errors: ``(candidates,)``: of these means; nan where there are not two returns.
-        counts: ``(candidates,)`` int: in how many futures each was tried.
+        means: ``(candidates,)``: the mean return of each candidate; nan if it was not tried.
+        standard_errors: ``(candidates,)``: the standard errors of the means; nan with fewer than two returns.
+        counts: ``(candidates,)`` int: the number of futures in which each candidate was tried.
         best: The best candidate.
-        returns: ``(candidates, futures)``: the returns themselves, nan where a candidate was not tried. A column is one
-            future, so that the difference of two rows is free of what chance does to both alike.
+        returns: ``(candidates, futures)``: the returns, nan where a candidate was not tried. A column is one future, so
+            that the difference of two rows excludes the chance that affects both.
     """
 
     actions: tuple[Any, ...]
@@ -52,45 +52,47 @@ def action_values(
     time_limit: float = 600.0,
     progress: bool = False,
 ) -> ActionValues:
-    """Find out what each candidate action of the pending decision is worth, by trying it out in branches.
+    """Estimate the value of each candidate action of the pending decision by trying it in branches.
 
     In a branch the action is taken, and the agent's base decides from then on, up to the horizon or the agent's end.
-    The futures are the same for all candidates. ``env`` itself does not move.
+    All candidates meet the same futures. ``env`` itself does not move.
 
     Args:
-        env: An environment of one simulation, with a decision pending: in any view, in wrappers or not. In the
-            parallel view the agent is the one that is ``"deciding"``, and the others play the same rounds; in the joint
-            view it is all agents together.
+        env: An environment of one simulation with a pending decision, in any view, with or without wrappers. In the
+            parallel view, the agent is the one that is ``"deciding"``, and the others play the same rounds. In the
+            joint view, it is the one agent that stands for all.
         actions: The candidates; ``RULE`` may be among them. None: all legal actions of a ``Discrete``.
-        base: Who decides after the candidate: ``RULE``, a policy of the agent (a callable of the observation, or of the
-            observation and the info), or a dict of these by agent. Other agents of the environment follow their own
-            in the dict, else their rule; those in the option ``policies`` keep theirs.
-        futures: In how many futures each candidate is tried.
-        horizon: For how many decisions of the agent its rewards count, the candidate's being the first; with
-            ``horizon_by="time"`` up to its first decision so much later. None: up to its end.
-        horizon_by: "decision", or "time", the simulation's.
-        terminal_value: What comes after the horizon is worth, a callable of the environment. It is called in the branch
-            where the agent lives at the horizon.
-        discount: By what a reward is discounted, for each decision of the agent that lies before the rewarded one.
-        discount_by: "decision"; or "time", for each unit of the simulation's time that lies between the two.
-        seed: Tells the futures from others of the same decision. None: those that the seed of the episode and the
-            number of the decision give.
-        method: As ``branch`` takes it.
-        time_limit: After how many seconds a branch is ended.
-        progress: Whether to show a bar, by ``tqdm``.
+        base: What decides after the candidate: ``RULE``, a policy of the agent (a callable of the observation, or of
+            the observation and the info), or a dict of these by agent. Other agents of the environment follow their
+            entry in the dict, else their rule. Agents in the option ``policies`` keep their policies.
+        futures: The number of futures in which each candidate is tried.
+        horizon: The number of the agent's decisions whose rewards count, including the candidate. With
+            ``horizon_by="time"``: a duration; rewards count up to the agent's first decision after at least that time.
+            None: up to the agent's end.
+        horizon_by: The unit of the horizon: "decision", or "time" for the simulation's time.
+        terminal_value: The value of what comes after the horizon: a callable of the environment. It is called in the
+            branch if the agent still lives at the horizon.
+        discount: The discount factor, from 0 to 1.
+        discount_by: The unit of discounting: "decision" for each decision of the agent before the rewarded one, or
+            "time" for each unit of the simulation's time between the candidate and the rewarded decision.
+        seed: A number that distinguishes the futures from others of the same decision. None: the futures that follow
+            from the seed of the episode and the number of the decision.
+        method: The method of branching, as ``branch`` takes it.
+        time_limit: The time after which a branch is ended, in seconds.
+        progress: Whether to show a progress bar, by ``tqdm``.
 
     Returns:
-        The values. Where the simulation has no ``reseed``, and the environment no ``global_rng=True``, they are of the
-        one future that lies ahead, which a warning says.
+        The values. If the simulation has no ``reseed`` and the environment was not made with ``global_rng=True``, there
+        is only the one exact future, and a warning says so.
 
     Raises:
-        ViewError: It is no environment of one simulation.
+        ViewError: ``env`` is not an environment of one simulation.
         ResetNeededError: No decision is pending.
         InvalidActionError: A candidate is not legal.
-        UnknownAgentError: The base is one of an agent that there is not.
-        OptionValueError: An argument cannot have its value.
-        BranchError: A branch has died, has taken too long, or cannot be made.
-        BaseException: What the model, a mapping or the base raises in a branch.
+        UnknownAgentError: The base names an agent that does not exist.
+        OptionValueError: An argument has an invalid value.
+        BranchError: A branch died, took too long, or cannot be made.
+        BaseException: Any exception of the model, a mapping or the base in a branch.
     """
     look = Lookahead(
         base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
@@ -104,11 +106,11 @@ def action_values(
 
 
 def valued(found: Futures, left: Sequence[int]) -> ActionValues:
-    """The values of candidates that were tried out.
+    """Return the values of candidates that were tried.
 
     Args:
-        found: What was found.
-        left: Of which candidates the best is one.
+        found: The results of the tries.
+        left: The places of the candidates among which the best one is chosen.
     """
     table, counts = found.table(), np.array([len(values) for values in found.returns], np.int64)
     means, errors = np.full((2, len(counts)), np.nan)
@@ -122,7 +124,7 @@ def valued(found: Futures, left: Sequence[int]) -> ActionValues:
 
 
 def base_value(env: Any, base: Any) -> ActionValues:
-    """Within a branch: what the base says, of which nothing is found out."""
+    """Return the base's answer as the best action, without tries; within a branch."""
     player = player_of(env, base)
     nothing = np.full(1, np.nan)
     return ActionValues((action := player.decide(),), nothing, nothing, np.zeros(1, np.int64), action, np.zeros((1, 0)))

@@ -116,7 +116,7 @@ def make_step(
 ) -> Definition:
     """Define a decision point: what its agent observes, may do and is rewarded with (paper, section 3.3).
 
-    Each callable except ``compute_reward`` may have a keyword-only parameter ``_simulation``, which gets the simulation.
+    Callables other than ``compute_reward`` may have a keyword-only parameter ``_simulation``: it gets the simulation.
 
     Args:
         observation_space: The space of the agent's observations.

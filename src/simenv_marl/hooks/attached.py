@@ -1,4 +1,4 @@
-"""One handler at one position, made ready to be called, and what it may return."""
+"""A handler at a position of a target, and the objects that it may return."""
 
 import inspect
 from dataclasses import dataclass, field
@@ -11,20 +11,20 @@ CALLS: Final = ("before", "after", "instead")
 ITEMS: Final = ("before_next", "after_next", "instead_next")
 
 _MOST: Final = 12
-"""Arguments beyond these a handler of a function that takes any number need not be able to take."""
+"""The number of arguments that a handler must accept if its target accepts any number."""
 
 _NOTHING: Final = object()
 
 
 def title(key: Any) -> str:
-    """What to call what a user has named."""
+    """Return the name of what a user has named."""
     return key if isinstance(key, str) else getattr(key, "__qualname__", None) or shown(key)
 
 
 class ChangedArgs:
-    """What a ``before`` handler returns to replace all arguments of the call.
+    """A ``before`` handler returns this to replace all arguments of the call.
 
-    Later handlers, the function itself and the ``after`` handlers receive these.
+    Later handlers, the function itself and the ``after`` handlers get the new arguments.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -36,7 +36,7 @@ class ChangedArgs:
 
 
 class ChangedResult:
-    """What an ``after`` handler returns to replace the result of the call."""
+    """An ``after`` handler returns this to replace the result of the call."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
@@ -47,12 +47,12 @@ class ChangedResult:
 
 @dataclass
 class Call:
-    """One call, as ``trace`` has recorded it.
+    """A call that ``trace`` recorded.
 
     Attributes:
         target: The dotted name of the function.
-        arguments: What it was called with, in short.
-        result: What it has returned, in short; "raised ..." with an error; None while it runs.
+        arguments: The arguments, as a short text.
+        result: The result, as a short text; "raised ..." after an error; None while the call runs.
     """
 
     target: str
@@ -61,27 +61,27 @@ class Call:
 
     @classmethod
     def of(cls, target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> "Call":
-        """The entry of a call that begins."""
+        """Make the record of a call that begins."""
         given = [shown(value, 60) for value in args] + [f"{name}={shown(value, 60)}" for name, value in kwargs.items()]
         return cls(target, ", ".join(given))
 
 
 class Attached:
-    """A handler at a position of a target, made ready to be called.
+    """A handler at a position of a target, ready to be called.
 
     Attributes:
         handler: The handler.
-        target: What it is attached to.
-        position: Where.
+        target: The target.
+        position: The position.
     """
 
     __slots__ = ("_moved", "_wants_result", "handler", "position", "target")
 
     def __init__(self, handler: Any, target: Any, position: str) -> None:
-        """Make sure that a handler fits.
+        """Check that a handler fits its target.
 
         Raises:
-            HandlerError: It does not, or there is no such position here.
+            HandlerError: It does not, or the target has no such position.
         """
         if position not in target.positions:
             known = position in CALLS + ITEMS
@@ -97,10 +97,10 @@ class Attached:
         self._moved = self._fit(target.signature)
 
     def _fit(self, signature: inspect.Signature | None) -> frozenset[str]:
-        """Make sure that the handler can be called whenever the target can.
+        """Check that the handler can be called whenever the target can.
 
         Returns:
-            What may be passed to the target by keyword, and to the handler only by position.
+            The names of arguments that the target accepts by keyword, but the handler only by position.
         """
         try:
             own = inspect.signature(self.handler)
@@ -157,7 +157,7 @@ class Attached:
         return tuple(filled), left
 
     def annotate(self, error: Exception) -> None:
-        """Say in an error's notes which handler it came from."""
+        """Add a note to an error that names the handler."""
         if isinstance(error, StopIteration) and self.position == "instead_next":
             return  # that is how items end
         note = f"simenv_marl: in the handler {title(self.handler)}, attached {self.position} {self.target.name}"
@@ -166,7 +166,7 @@ class Attached:
 
 
 def _binds(signature: inspect.Signature, number: int, keywords: list[str]) -> bool:
-    """Whether so many arguments and these keywords can be passed."""
+    """Return whether a signature accepts this number of positional arguments and these keywords."""
     try:
         signature.bind(*[None] * number, **dict.fromkeys(keywords))
     except TypeError:

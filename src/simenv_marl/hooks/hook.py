@@ -1,8 +1,8 @@
 """Hooks: one for each function of a model that is decided or extended, with functions that stand in front of it.
 
-A *stand-in* looks and behaves like the function, with its signature, and costs next to nothing while the hook has no
-*takers*. Those are found by the greenlet in which a call arises: a driver enters the stack of its simulation for an
-episode, with the decision of the environment inside and the handlers around it, and takes it out at the end.
+A *stand-in* looks and behaves like the function, has its signature, and costs almost nothing while the hook has no
+*takers*. A call finds its taker by the greenlet it runs in. For an episode, a driver enters the stack of its
+simulation, with the environment's decision inside and the handlers around it; at the end it removes the entry.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .stacks import EVALUATING, LOCK, STACKS, Taker, spawner_of, stack_of
 _ABSENT: Final = object()
 
 _TAKEN: Final = ("ABSENT", "NOTHING", "bind", "rule")
-"""Names that mean something in what is written below."""
+"""Names that the code below uses."""
 
 _FILE: Final = "<stand-in for "
 
@@ -35,9 +35,9 @@ _SPAWNED: Final = 'a greenlet that the simulation has spawned on a hub of others
 
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 
-# What a call costs that has no takers is decided here. A method that takes nothing but
-# ``self`` costs two plain calls. Where arguments can be passed by keyword it costs three, because mappings and
-# handlers are to receive them as they were passed.
+# This determines the cost of a call without takers. A method without arguments besides ``self`` costs two plain calls.
+# If arguments can be passed by keyword it costs three, because mappings and handlers must get them as they were
+# passed.
 _WITHOUT_ARGUMENTS = """
 {define} stand_in({names}):
     if not TAKERS:
@@ -65,10 +65,10 @@ _VARIADIC = """
 
 
 def kind_of(function: Any, name: str) -> str:
-    """What a call of a function returns: "function" (its value), "generator" or "coroutine".
+    """Return what a call of a function returns: "function" (its value), "generator" or "coroutine".
 
     Raises:
-        PatchError: An async generator function, which has neither a value nor items at hand.
+        PatchError: It is an async generator function.
     """
     if inspect.isasyncgenfunction(function):
         raise PatchError(f"{name} is an async generator function, which cannot return a decision or call handlers")
@@ -78,12 +78,12 @@ def kind_of(function: Any, name: str) -> str:
 
 
 def is_method(function: Any, name: str) -> bool:
-    """Whether a function of that dotted name was written in a class."""
+    """Return whether a function of that dotted name was defined in a class."""
     return "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
 
 
 def is_alone(signature: inspect.Signature, *, bound: bool) -> bool:
-    """Whether every call has one argument, which is what it is called on and is never passed by keyword."""
+    """Return whether every call has one argument: the object it is called on, never passed by keyword."""
     parameters = list(signature.parameters.values())
     return bound and len(parameters) == 1 and _is_required(parameters[0])
 
@@ -97,20 +97,20 @@ def generate(
     alone: bool,
     namespace: Mapping[str, Any],
 ) -> FunctionType:
-    """Write a function that stands in front of another one.
+    """Generate the stand-in of a function.
 
     Args:
         rule: The function.
-        signature: Its own signature; None where that is not known.
+        signature: Its signature; None if it is unknown.
         name: Its dotted name.
-        kind: What a call of it returns, as ``kind_of`` has it.
-        alone: As ``is_alone`` has it.
-        namespace: What the names mean of which ``_ASK`` is made.
+        kind: What a call returns, as ``kind_of`` returns it.
+        alone: The result of ``is_alone``.
+        namespace: The values of the names in ``_ASK``.
     """
     parameters = signature.parameters.values() if signature is not None else ()
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
-    # Under its own name, by which it may be passed all the same where a staticmethod looks like a method.
+    # Keep the parameter's name: if a staticmethod looks like a method, it may be passed by keyword.
     alone = alone and positional[0].name not in {*namespace, *_TAKEN}
     if alone:
         names = [positional[0].name]
@@ -145,7 +145,7 @@ def generate(
         template = _VARIADIC
     scope: dict[str, Any] = {
         "ABSENT": _ABSENT,
-        "NOTHING": {},  # shared by all calls: it is only ever unpacked
+        "NOTHING": {},  # shared by all calls, since it is only unpacked
         "bind": signature.bind if signature is not None else _anything,
         "rule": rule,
         "__name__": __name__,
@@ -153,13 +153,13 @@ def generate(
     }
     exec(compile(template.format(**values), f"{_FILE}{name}>", "exec"), scope)
     function: FunctionType = scope["stand_in"]
-    function.__code__ = function.__code__.replace(co_name=getattr(rule, "__name__", "call"))  # what tracebacks show
+    function.__code__ = function.__code__.replace(co_name=getattr(rule, "__name__", "call"))  # the name in tracebacks
     update_wrapper(function, rule)
     return function
 
 
 def _anything(*args: Any, **kwargs: Any) -> None:
-    """Bind arguments of which nothing is known."""
+    """Accept any arguments, if the signature is unknown."""
 
 
 def _is_required(parameter: inspect.Parameter) -> bool:
@@ -168,19 +168,19 @@ def _is_required(parameter: inspect.Parameter) -> bool:
 
 
 def stands_in(function: Any) -> bool:
-    """Whether a function was generated here."""
-    # Told by what nothing can copy: other decorators take over a function's attributes.
+    """Return whether a function is a stand-in."""
+    # Checked by its code, not by an attribute: other decorators copy a function's attributes.
     return isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE)
 
 
 # -- hooks ----------------------------------------------------------------------------------------
 
 MADE_OF: Final[WeakKeyDictionary[Any, WeakSet[Hook]]] = WeakKeyDictionary()
-"""By function: the hooks in front of it, each of a decoration of its own."""
+"""The hooks in front of each function, one per decoration."""
 
 
 class _Takers(dict[Any, Taker]):
-    """Who takes part in the calls of one hook. A stand-in that is pickled by value finds them where it arrives."""
+    """The takers of one hook. A stand-in that is pickled by value finds those of the process where it is unpickled."""
 
     __slots__ = ("hook",)
 
@@ -197,12 +197,12 @@ def _takers_of(hook: Hook) -> _Takers:
 
 
 class Elsewhere:
-    """What a stand-in calls where its hook knows of no taker.
+    """What a stand-in calls if its hook has no taker for the call.
 
     Attributes:
         hook: The hook.
-        made_with: What the stand-in was made with, for the layer above. It is kept here so that it stays with the
-            stand-in when that is pickled by value, which takes along what its code names, and nothing else.
+        made_with: The object that the stand-in was made with, for the layer above. It is kept here because a stand-in
+            that is pickled by value takes along only what its code names.
     """
 
     __slots__ = ("hook", "made_with")
@@ -214,11 +214,11 @@ class Elsewhere:
         """Run a call.
 
         Raises:
-            WrongThreadError: It is a decision of a simulation that cannot wait here for its answer.
+            WrongThreadError: It is a decision, and the simulation cannot wait for its answer here.
         """
         hook = self.hook
         here = getcurrent()
-        if here.parent is None and not EVALUATING and here not in STACKS:  # a thread of the user's
+        if here.parent is None and not EVALUATING and here not in STACKS:  # a thread of the user
             taker = hook.takers.get(None)
         else:
             taker = hook.taker_at(here)
@@ -229,20 +229,20 @@ class Elsewhere:
 
 
 class Hook(Target):
-    """One function of a model, and who takes part in its calls.
+    """A function of a model that is decided or extended, with the takers of its calls.
 
     Attributes:
         function: The function.
-        rule: What a call runs innermost: the function, or what stands for it for a while.
-        kind: "function", "generator" or "coroutine": what a call of it returns.
-        bound: Whether its first argument is what it is called on, which nothing passes by keyword.
-        alone: Whether every call has one argument, which is what it is called on.
-        takers: Who takes part. By greenlet: in calls on the stack of a simulation; by plugins, and by None, in all
-            other calls while an environment with these plugins is at work, or none.
+        rule: The innermost part of a call: the function, or its temporary replacement.
+        kind: What a call returns: "function" (a value), "generator" or "coroutine".
+        bound: Whether its first argument is the object it is called on, which is never passed by keyword.
+        alone: Whether every call has one argument, the object it is called on.
+        takers: The takers of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
+            other calls while an environment with these plugins, or without plugins, is evaluated.
         stand_ins: The functions that stand in front of the function.
-        place: Where one of them is set for as long as the hook is held; None where nothing is to be set.
-        for_good: Whether one of them stands somewhere for good, as a decorated or exposed function.
-        point: What the layer above makes of the hook.
+        place: The place of a stand-in while the hook is held; None if none is to be set.
+        for_good: Whether a stand-in was set permanently, as a decorated or exposed function.
+        point: The object that the layer above makes of the hook.
     """
 
     def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None, place: Any = None) -> None:
@@ -251,12 +251,12 @@ class Hook(Target):
         Args:
             function: The function.
             name: Its dotted name.
-            bound: Whether, in a class, its first argument is what it is called on.
-            like: A function that tells what calls return, where the function only passes them on to it.
-            place: Where a stand-in is to be set for a while.
+            bound: Whether, in a class, its first argument is the object it is called on.
+            like: The function that determines what calls return, if ``function`` only forwards to it.
+            place: The place for a temporary stand-in.
 
         Raises:
-            PatchError: An async generator function, to which no position applies.
+            PatchError: It is an async generator function.
         """
         self.function = self.rule = function
         self.kind = kind_of(function if like is None else like, name)
@@ -266,7 +266,7 @@ class Hook(Target):
             self._own = inspect.signature(function, follow_wrapped=False)
             signature = inspect.signature(function)
         except (TypeError, ValueError):
-            self._own = None  # nothing is known of it
+            self._own = None  # the signature is unknown
         self.bound = bound and is_method(function, name)
         self.alone = self._own is not None and is_alone(self._own, bound=self.bound)
         self.takers = _Takers(self)
@@ -276,10 +276,10 @@ class Hook(Target):
         self.point: Any = None
         self._holders: set[object] = set()
         self._stands = False
-        self._set: FunctionType | None = None  # the stand-in that is set for a while
+        self._set: FunctionType | None = None  # the temporary stand-in
         iterates = self.kind == "generator"
         super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is no generator function", signature)
-        with suppress(TypeError):  # what cannot be referred to weakly
+        with suppress(TypeError):  # not all objects can be referenced weakly
             MADE_OF.setdefault(function, WeakSet()).add(self)
 
     def __reduce__(self) -> Any:
@@ -287,10 +287,10 @@ class Hook(Target):
         return _restored, made_of, self.point, None, None, _came_along
 
     def stand_in(self, made_with: Any = None) -> FunctionType:
-        """Make a function that stands in front of the hook's function for good.
+        """Make a permanent stand-in of the hook's function.
 
         Args:
-            made_with: What ``made_with`` is going to tell of it.
+            made_with: The object that the function ``made_with`` returns for it.
         """
         made = generate(
             self.function,
@@ -315,13 +315,13 @@ class Hook(Target):
         return self.place is not None and not self._holders and not self.place.is_free(self)
 
     def hold(self, holder: object) -> None:
-        """Have a stand-in set in its place until ``let_go``, by all who hold it.
+        """Set a stand-in in its place until every holder has called ``let_go``.
 
         Raises:
-            PatchError: The place refuses, or something else has been set there meanwhile.
+            PatchError: The place cannot be patched, or something else was set there meanwhile.
         """
         with LOCK:
-            # Noted at once: the collector may come in between and close an environment that holds it, too.
+            # Noted first: garbage collection may close another environment that holds it meanwhile.
             self._holders.add(holder)
             if self._stands or self.place is None:
                 return
@@ -335,7 +335,7 @@ class Hook(Target):
                 raise
 
     def let_go(self, holder: object) -> None:
-        """Undo ``hold``; the last one puts back what stood there. After an interrupt it is to be called again."""
+        """Undo ``hold``; the last one restores the original. After an interrupt, call it again."""
         with LOCK:
             self._holders.discard(holder)
             if not self._holders and self.place is not None and self._set is not None:
@@ -345,11 +345,11 @@ class Hook(Target):
     # -- who takes part ---------------------------------------------------------------------------
 
     def enter(self, stack: greenlet, decide: Taker | None, plugins: Any) -> None:
-        """Take part in calls on the stack of a simulation.
+        """Enter a taker for calls on the stack of a simulation.
 
         Args:
             stack: The stack.
-            decide: Who decides, in the rule's stead; None: the rule, where the plugins have handlers.
+            decide: What decides instead of the rule. None: the rule decides, with handlers if the plugins have some.
             plugins: The plugins of the simulation's environment.
         """
         if decide is not None:
@@ -360,28 +360,28 @@ class Hook(Target):
             self.takers.pop(stack, None)
 
     def leave(self, stack: greenlet) -> None:
-        """Take no part any more."""
+        """Remove the taker of a stack."""
         self.takers.pop(stack, None)
 
     def around(self, inner: Taker, plugins: Any) -> Taker:
-        """The handlers that there are for plugins, or else for the whole process, around what is inside them."""
+        """Return a taker that runs the handlers of plugins, or of the whole process, around ``inner``."""
         found = self.slot.get(plugins) or self.slot.get(None)
         return inner if found is None else partial(AROUND[self.kind], found, self.slot, inner)
 
     def run_rule(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Have the rule decide."""
+        """Run the rule."""
         return self.rule(*args, **kwargs)
 
     def replace_rule(self, rule: Any = None) -> None:
-        """Have something else run where the function does; None: the function again.
+        """Replace the rule; None restores the function.
 
-        Simulations whose ``run`` has begun keep what they had.
+        Simulations that are already running keep the rule they had.
         """
         self.rule = self.function if rule is None else rule
         self._changed()
 
     def taker_at(self, here: greenlet) -> Taker | None:
-        """Who takes part in a call in a greenlet; None: nothing but the rule."""
+        """Return the taker of a call in a greenlet; None if only the rule runs."""
         stack = stack_of(here)
         if stack is None:
             evaluation = EVALUATING.get(here)
@@ -401,7 +401,7 @@ class Hook(Target):
 
     def _changed(self) -> None:
         takers, slot = self.takers, self.slot
-        for plugins in list(slot) if self.rule is self.function else [None, *slot]:  # the collector may change it
+        for plugins in list(slot) if self.rule is self.function else [None, *slot]:  # garbage collection may change it
             takers[plugins] = self.around(self.run_rule, plugins)
         for key, taker in list(takers.items()):
             if not isinstance(key, greenlet):
@@ -414,7 +414,7 @@ class Hook(Target):
 
 
 def hook_of(function: Any) -> Hook | None:
-    """The hook of a stand-in; None for any other function."""
+    """Return the hook of a stand-in; None for any other function."""
     if stands_in(function):
         hook: Hook = function.__globals__["elsewhere"].__self__.hook
         return hook
@@ -422,18 +422,18 @@ def hook_of(function: Any) -> Hook | None:
 
 
 def made_with(function: FunctionType) -> Any:
-    """What a stand-in was made with."""
+    """Return the object that a stand-in was made with."""
     return function.__globals__["elsewhere"].__self__.made_with
 
 
 def beneath(function: Any) -> Any:
-    """What a stand-in stands in front of; any other function as it is."""
+    """Return the function behind a stand-in; any other function itself."""
     hook = hook_of(function)
     return function if hook is None else hook.function
 
 
 def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -> Hook:
-    """The hook of a function, in whichever process: the one that is there, or a new one."""
+    """Return the hook of an unpickled function: an existing one, or a new one."""
     for hook in MADE_OF.get(function, ()):
         if hook.name == name:
             return hook
@@ -443,4 +443,4 @@ def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -
 
 
 def _came_along(hook: Hook, point: Any) -> None:
-    """What the layer above had made of a hook has come along, and is by now what it makes of this one."""
+    """Do nothing: the layer above unpickles the point itself and gives it to the hook of this process."""

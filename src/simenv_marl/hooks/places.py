@@ -1,7 +1,7 @@
-"""Places in a model: where a function is found by its dotted name, set, and put back.
+"""Places in a model: a function is found there by its dotted name, a stand-in is set, and the original is restored.
 
-A *place* is an attribute of a class; or a function of a module, under all names that loaded modules have for it.
-While a hook is held whose function was neither decorated nor exposed, a stand-in is set at its place.
+A *place* is an attribute of a class; or a function of a module, under all names that loaded modules have for it. If a
+function was neither decorated nor exposed, a stand-in is at its place while its hook is held.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from .stacks import LOCK
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a name is looked up for, so that errors can say so.
+    """The purpose of looking up a name, for error messages.
 
     Attributes:
         noun: What is looked for.
-        error: What is raised where it is not to be found.
-        known: Returns the names that may have been meant.
+        error: The exception class for a name that does not exist.
+        known: A function that returns names for suggestions.
     """
 
     noun: str
@@ -37,7 +37,7 @@ class Purpose:
     known: Callable[[], list[str]]
 
     def unknown(self, name: str, why: str) -> Exception:
-        """The error that says that a name leads to nothing."""
+        """Return the error for a name that does not exist."""
         return self.error(f"the {self.noun} {name!r} is not to be found: {why}{meant(name, self.known())}")
 
 
@@ -45,11 +45,11 @@ class Purpose:
 
 
 def resolve(name: str, purpose: Purpose) -> tuple[Any, str]:
-    """Find the class or module in which a dotted name ends, importing what must be imported.
+    """Find the class or module that holds a dotted name, and import modules on the way.
 
     Raises:
-        PatchError: It ends in something else.
-        Exception: The purpose's own, where the name leads to nothing.
+        PatchError: The holder is something else.
+        Exception: The purpose's error, if the name does not exist.
     """
     parts = name.split(".")
     if len(parts) < 2 or not all(parts):
@@ -82,19 +82,19 @@ def _longest_module(parts: list[str]) -> tuple[ModuleType | None, list[str]]:
         except ModuleNotFoundError as error:
             if error.name is not None and (path == error.name or path.startswith(f"{error.name}.")):
                 return module, parts[length - 1 :]
-            raise  # the module is there, and imports one that is not
+            raise  # the module exists, but imports one that does not
         module = found
     return module, parts[-1:]
 
 
 def unbind(function: Any) -> tuple[FunctionType, type | None]:
-    """Find the plain function under a binding.
+    """Find the plain function behind a binding.
 
     Args:
         function: A function, staticmethod or classmethod, or one of these as an attribute of its class.
 
     Returns:
-        The function, and ``staticmethod`` or ``classmethod`` where it was bound so.
+        The function, and its binding: ``staticmethod``, ``classmethod`` or None.
 
     Raises:
         PatchError: It is something else.
@@ -111,7 +111,7 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
             f" {type(function.__self__).__name__}.{function.__name__}"
         )
     elif isinstance(function, FunctionType):
-        # A staticmethod that was fetched from its class is a plain function: see how the class holds it.
+        # A staticmethod, fetched from its class, is a plain function: check how the class holds it.
         owner: Any = modules.get(function.__module__)
         path = function.__qualname__.split(".")
         for name in path[:-1]:
@@ -124,12 +124,12 @@ def unbind(function: Any) -> tuple[FunctionType, type | None]:
 
 
 def leads_there(name: str) -> bool:
-    """Whether a dotted name is sure to lead to the same in another process."""
+    """Return whether a dotted name certainly refers to the same object in another process."""
     return "<" not in name and not name.startswith("__main__.")
 
 
 def owner_at_hand(function: FunctionType) -> type:
-    """Find the class that holds a function which is not found by its name, as inside another function.
+    """Find the class of a function that its dotted name does not lead to, such as one inside another function.
 
     Raises:
         PatchError: There is none.
@@ -144,7 +144,7 @@ def owner_at_hand(function: FunctionType) -> type:
 
 
 def all_classes(base: type = object) -> Iterator[type]:
-    """All classes that there are, or that derive from one."""
+    """Yield all existing classes, or those that derive from one."""
     seen: set[type] = set()
     left = [base]
     while left:
@@ -156,12 +156,12 @@ def all_classes(base: type = object) -> Iterator[type]:
 
 
 def plain(held: Any) -> Any:
-    """What a class or module holds, without its binding."""
+    """Return an attribute of a class or module without its binding."""
     return held.__func__ if isinstance(held, (staticmethod, classmethod)) else held
 
 
 def held_at(owner: Any, attribute: str) -> Any:
-    """What a class or module holds under a name, as it holds it (a staticmethod stays one)."""
+    """Return an attribute as the class or module holds it (a staticmethod stays one)."""
     for place in owner.__mro__ if isinstance(owner, type) else (owner,):
         if attribute in vars(place):
             return vars(place)[attribute]
@@ -169,7 +169,7 @@ def held_at(owner: Any, attribute: str) -> Any:
 
 
 def found_at(owner: Any, attribute: str) -> Any:
-    """What a class holds or inherits under a name, apart from what is set for a while in front of the inherited."""
+    """Return what a class holds or inherits under a name, without temporary stand-ins of the inherited function."""
     for place in owner.__mro__ if isinstance(owner, type) else (owner,):
         held = vars(place).get(attribute)
         hook = hook_of(plain(held))
@@ -187,18 +187,18 @@ class Place:
     Attributes:
         owner: The class or module.
         attribute: The function's name there.
-        held: What stood there, as it stood there.
-        function: The function, without its binding; where it is inherited, the base class's.
+        held: The original attribute, as the owner held it.
+        function: The function, without its binding; if it is inherited, that of the base class.
         binding: ``staticmethod``, ``classmethod`` or None.
         inherited: Whether the class only inherits it.
-        passes_on: Whether the rule finds the inherited function, and so stands in front of the base class's.
+        passes_on: Whether the rule looks up the inherited function and so runs in front of the base class's stand-in.
     """
 
     def __init__(self, name: str, owner: Any, attribute: str, purpose: Purpose) -> None:
-        """Look at a place.
+        """Inspect a place.
 
         Raises:
-            PatchError: What stands there cannot be patched.
+            PatchError: The attribute cannot be patched.
         """
         held = held_at(owner, attribute)
         function = plain(held)
@@ -214,25 +214,25 @@ class Place:
         self.inherited = self.passes_on = attribute not in vars(owner)
         self.binding: Any = type(held) if held is not function else None
         self._noun = purpose.noun
-        self._before: dict[tuple[Any, str], Any] = {}  # what stood under names of modules
+        self._before: dict[tuple[Any, str], Any] = {}  # the original attributes of modules
 
     @property
     def rule(self) -> Any:
-        """What runs there: the function, or what finds the inherited one."""
+        """Return the function to run: the function itself, or one that looks up the inherited one."""
         if not self.inherited:
             return self.function
         return _next_in_line(self.owner, self.attribute, self.function, self.binding)
 
     def is_free(self, hook: Hook) -> bool:
-        """Whether what stands there is what stood there at first, or a stand-in of a hook."""
+        """Return whether the place holds the original, or a stand-in of a hook."""
         there = vars(self.owner).get(self.attribute)
         return there is (None if self.inherited else self.held) or hook_of(plain(there)) is hook
 
     def put(self, hook: Hook, stand_in: FunctionType) -> None:
-        """Set a stand-in of a hook, unless one stands there already.
+        """Set a stand-in of a hook, unless one is there already.
 
         Raises:
-            PatchError: The place refuses, or something else has been set there meanwhile.
+            PatchError: The place cannot be patched, or something else was set there meanwhile.
         """
         if not self.is_free(hook):
             raise PatchError(f"{self.name} has been replaced since it was named as a {self._noun}")
@@ -245,18 +245,18 @@ class Place:
             raise PatchError(f"{self.name} cannot be a {self._noun}: {error}") from error
 
     def put_back(self, stand_in: FunctionType) -> None:
-        """Put back what stood there, unless something else has been set meanwhile."""
+        """Restore the original, unless something else was set meanwhile."""
         if not isinstance(self.owner, type):
             self._put_back_in_modules(stand_in)
         elif plain(vars(self.owner).get(self.attribute)) is not stand_in:
-            pass  # which is left alone
+            pass  # leave it alone
         elif self.inherited:
             delattr(self.owner, self.attribute)
         else:
             setattr(self.owner, self.attribute, self.held)
 
     def _put_in_modules(self, stand_in: FunctionType) -> None:
-        # A function is found also where other modules imported it by name, maybe before it was exposed.
+        # Other modules may have imported the function by name, maybe before it was exposed.
         for module, name, value in _names_in_modules():
             if value is self.function or (value is self.held and hook_of(value) is None):
                 self._before[module, name] = value
@@ -270,7 +270,7 @@ class Place:
 
 
 def _names_in_modules() -> list[tuple[ModuleType, str, Any]]:
-    """All that loaded modules have, with the names under which they have it."""
+    """Return all attributes of loaded modules, with their names."""
     return [
         (module, name, value)
         for module in list(modules.values())
@@ -280,29 +280,29 @@ def _names_in_modules() -> list[tuple[ModuleType, str, Any]]:
 
 
 def places_of(function: Any) -> list[tuple[Any, str]]:
-    """All names of loaded modules under which a function is found."""
+    """Return all modules and names under which a function is found."""
     return [(module, name) for module, name, value in _names_in_modules() if value is function]
 
 
 # -- hooks at places ------------------------------------------------------------------------------
 
 _PLACED: Final[WeakValueDictionary[Any, Hook]] = WeakValueDictionary()
-"""The hooks that are set for a while: by class and attribute, or by function of a module. Weak: they go with those who
-hold them."""
+"""The temporary hooks, by class and attribute, or by function of a module. Weak: they live as long as their
+holders."""
 
 
 def hook_at(name: str, owner: Any, attribute: str, purpose: Purpose) -> Hook:
-    """The hook of an attribute of a class or module: the one that stands there, or one that can be set there.
+    """Return the hook of an attribute of a class or module: the existing one, or one that can be set there.
 
     Raises:
-        PatchError: What stands there cannot be patched.
+        PatchError: The attribute cannot be patched.
     """
     with LOCK:
         held = held_at(owner, attribute)
         hook = hook_of(plain(held))
         if hook is not None and attribute in vars(owner):
             return hook
-        # A function of a module may have names in several modules, and is one place all the same.
+        # A function of a module is one place, even if several modules have it.
         key = (owner, attribute) if isinstance(owner, type) or not isinstance(held, FunctionType) else (held,)
         hook = _PLACED.get(key)
         if hook is None or not hook.place.is_free(hook):
@@ -314,22 +314,22 @@ def hook_at(name: str, owner: Any, attribute: str, purpose: Purpose) -> Hook:
 
 
 class Held:
-    """What is set in a model: until ``let_go``, and no longer than this object lives.
+    """Patches of a model, in force until ``let_go`` or until this object is garbage-collected.
 
     Attributes:
-        whole: Whether nothing of it was put back.
+        whole: Whether nothing was restored yet.
     """
 
     __slots__ = ("_holder", "_patches", "whole")
 
     def __init__(self, patches: Iterable[Any]) -> None:
-        """Set it.
+        """Set the patches.
 
         Args:
-            patches: Each with ``hold`` and ``let_go``.
+            patches: Objects with ``hold`` and ``let_go``.
 
         Raises:
-            PatchError: A place refuses, and nothing is set.
+            PatchError: A place cannot be patched; then no patch stays set.
         """
         self._holder, self.whole = object(), True
         self._patches = list(patches)
@@ -341,19 +341,19 @@ class Held:
             raise
 
     def let_go(self) -> None:
-        """Put back what stood there. After an interrupt it is to be called again, or does so itself when it is gone."""
+        """Restore the originals. After an interrupt, call it again; else garbage collection does."""
         self.whole = False
         while self._patches:
             self._patches[-1].let_go(self._holder)
             self._patches.pop()
 
     def __del__(self) -> None:
-        if getattr(self, "_patches", ()):  # else an interrupt came before it was made
+        if getattr(self, "_patches", ()):  # missing if an interrupt came in the constructor
             self.let_go()
 
 
 def stays(hook: Hook) -> None:
-    """A stand-in of a hook that was set for a while is going to stand somewhere for good."""
+    """Note that a temporary stand-in of a hook becomes permanent somewhere."""
     with LOCK:
         hook.for_good = True
         for key in [key for key, other in _PLACED.items() if other is hook]:
@@ -361,20 +361,20 @@ def stays(hook: Hook) -> None:
 
 
 def imported_elsewhere(hook: Hook, purpose: Purpose) -> None:
-    """See to it that an exposed function of a module is found where others had imported it before."""
+    """Expose a function of a module also where other modules imported it earlier."""
     if hook.place is not None or hook.slot or not isinstance(hook.function, FunctionType):
         return
     owner: Any = None
-    with suppress(Exception):  # where it is not found by its name, others may not find it either
+    with suppress(Exception):  # if its name does not lead to it, others may not have it either
         owner, attribute = resolve(hook.name, purpose)
     if isinstance(owner, ModuleType) and hook_of(held_at(owner, attribute)) is hook:
         hook.place = Place(hook.name, owner, attribute, purpose)
 
 
 def _next_in_line(owner: type, attribute: str, function: Any, binding: type | None) -> Any:
-    """Make the rule of an inherited function: what the class would find without the patch, whenever it is called.
+    """Make the rule of an inherited function: it calls what the class would find without the patch.
 
-    What is found is looked up at each call, so that a patch of the base class is not passed over.
+    The lookup happens at each call, so that a patch of the base class takes effect, too.
     """
     if binding is None:
 

@@ -1,8 +1,8 @@
-"""Extensions: handlers before, after and instead of a model's functions, without touching the model (paper).
+"""Extensions: handlers before, after and instead of a model's functions, without a change to the model (paper).
 
-Handlers are attached to functions, methods, generator and coroutine functions, iterables, and classes whose
-instances iterate; for the whole process (``attach_handler``), for a while (``handlers``), or for an environment
-alone (the option ``plugins``). What has none costs nothing, or, exposed by ``expose_to_plugins``, one test.
+Handlers are attached to functions, methods, generator and coroutine functions, iterables, and classes whose instances
+are iterable: for the whole process (``attach_handler``), for a block (``handlers``), or for one environment (the option
+``plugins``). A function without handlers costs nothing extra or, if ``expose_to_plugins`` exposed it, one test.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -25,13 +25,13 @@ Entry = tuple[Callable[..., Any], Any, str]
 
 
 def attached_handlers(env: Any = None) -> list[Entry]:
-    """The handlers that are attached, by target in the order in which they run.
+    """Return the attached handlers, by target, in the order in which they run.
 
     Args:
-        env: An environment, for the handlers of its option ``plugins``; None: for those of the whole process.
+        env: An environment, for the handlers of its option ``plugins``. None: the handlers of the whole process.
 
     Returns:
-        For each the handler, the dotted name of its target, and its position.
+        A list of tuples: the handler, the dotted name of its target, and its position.
     """
     if env is not None:
         entries: list[Entry] = env.unwrapped.plugins
@@ -43,16 +43,16 @@ def attached_handlers(env: Any = None) -> list[Entry]:
 def expose_to_plugins(function_or_iterable: Thing) -> Thing:
     """Let handlers be attached to a function or an iterable (paper, section 3.4).
 
-    As a decorator inside the model, over or under ``staticmethod``, ``classmethod`` and ``make_step``, or from
-    outside: ``Model.step = expose_to_plugins(Model.step)``. What is importable need not be exposed to have
-    handlers attached to it, by its dotted name.
+    Use it as a decorator in the model, above or below ``staticmethod``, ``classmethod`` and ``make_step``; or from
+    outside: ``Model.step = expose_to_plugins(Model.step)``. An importable function need not be exposed: handlers can be
+    attached to its dotted name.
 
     Args:
         function_or_iterable: A function of any kind, an iterable, or a class whose instances are iterable.
 
     Returns:
-        The exposed function, which keeps its looks, and is one also when it is exposed again; for an iterable
-        what behaves like it in all respects; the class itself.
+        The exposed function, which keeps its name, signature and docstring and may be exposed again; for an iterable, a
+        proxy that behaves like it; for a class, the class itself.
 
     Raises:
         PatchError: It is none of these, or a method that is bound to one object.
@@ -69,19 +69,20 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
     """Attach a handler to a function, for the whole process (paper, section 3.4).
 
     Args:
-        handler: Called with the arguments of the call as they were passed; ``*_next``: with those of the generator
-            function, or the iterable. ``before`` may return ``ChangedArgs``; ``after`` gets the result as
-            ``_result`` where it has a parameter of that name, and may return ``ChangedResult``; what ``instead``
-            returns is the result. Those of one position run in the order in which they were attached; of several
-            ``instead`` the latest alone runs, and then neither ``before`` nor ``after``.
-        target: The function, or the dotted name of any importable one, whether it is exposed or not.
-        position: "before", "after" or "instead"; for iterables and generator functions also "before_next",
-            "after_next" or "instead_next".
+        handler: A callable. It gets the arguments of the call as they were passed; at ``*_next`` positions, it gets
+            those of the generator function, or the iterable. A ``before`` handler may return ``ChangedArgs``. An
+            ``after`` handler gets the result if it has a parameter ``_result``, and may return ``ChangedResult``. The
+            result of an ``instead`` handler is the result of the call. Handlers of one position run in the order in
+            which they were attached. Of several ``instead`` handlers only the latest runs, and then no ``before`` and
+            ``after`` handlers.
+        target: The function, or the dotted name of any importable function, exposed or not.
+        position: "before", "after" or "instead"; for iterables and generator functions also "before_next", "after_next"
+            or "instead_next".
 
     Raises:
-        UnknownTargetError: The name leads to nothing.
-        HandlerError: There is no such position, or the handler cannot be called like the target.
-        PatchError: The target is not exposed, and cannot be patched.
+        UnknownTargetError: The name does not exist.
+        HandlerError: The position does not exist, or the handler cannot be called like the target.
+        PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
         attached = _attachable((handler, target, position))
@@ -89,15 +90,16 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
-    """Remove what ``attach_handler`` has attached.
+    """Remove a handler that ``attach_handler`` attached.
 
     Args:
         target: The function, or its dotted name.
         position: The position.
-        handler: The handler, of which the one that was attached last is removed; None: all at this position.
+        handler: The handler; if it was attached several times, the last one is removed. None: all handlers at this
+            position.
 
     Raises:
-        UnknownTargetError: The name leads to nothing.
+        UnknownTargetError: The name does not exist.
         HandlerError: There is no such handler.
     """
     with LOCK:
@@ -113,13 +115,13 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
 
 @contextmanager
 def handlers(*entries: Entry) -> Iterator[None]:
-    """Attach handlers for as long as a block runs.
+    """Attach handlers for the duration of a ``with`` block.
 
     Args:
-        *entries: For each, what ``attach_handler`` takes: handler, target, position.
+        *entries: Tuples of the arguments of ``attach_handler``: handler, target, position.
 
     Raises:
-        SimEnvError: As ``attach_handler``; none is attached then.
+        SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
         attached = [_attachable(entry) for entry in entries]
@@ -131,11 +133,11 @@ def handlers(*entries: Entry) -> Iterator[None]:
 
 
 def _attachable(entry: Any, named: Mapping[str, Target] = MappingProxyType({})) -> Attached:
-    """A handler that fits its target.
+    """Return a handler, checked to fit its target.
 
     Args:
         entry: As ``handlers`` takes it.
-        named: Targets that names lead to before they lead into modules.
+        named: Targets by names that take precedence over importable names.
 
     Raises:
         SimEnvError: As ``attach_handler``.
@@ -151,16 +153,16 @@ def _attachable(entry: Any, named: Mapping[str, Target] = MappingProxyType({})) 
 
 
 class _Added:
-    """What is added to targets for as long as it is held."""
+    """Handlers that are attached to targets while this is held."""
 
     _key: Any = None
-    """Under which targets know it; None: it is for the whole process."""
+    """The key under which targets know it; None for the whole process."""
 
     def __init__(self, added: list[tuple[Target, Any]]) -> None:
         self._added, self._holders, self._stands = added, set[object](), False
 
     def hold(self, holder: object) -> None:
-        """Have it added until ``let_go``, by all who hold it.
+        """Attach the handlers until every holder has called ``let_go``.
 
         Raises:
             PatchError: A target cannot be patched.
@@ -178,7 +180,7 @@ class _Added:
                 raise
 
     def let_go(self, holder: object) -> None:
-        """Undo ``hold``. After an interrupt it is to be called again."""
+        """Undo ``hold``. After an interrupt, call it again."""
         with LOCK:
             self._holders.discard(holder)
             if not self._holders:
@@ -188,20 +190,22 @@ class _Added:
 
 
 class Plugins(_Added):
-    """The handlers of the environments of one plan. Also the key under which targets know them, and an ``Evaluation``.
+    """The handlers of the environments of one plan.
+
+    It is also the key under which targets know them, and an ``Evaluation``.
 
     Attributes:
-        memory: None; what differences remember is known to agents.
+        memory: None, since agents keep the memory of differences.
     """
 
     memory: dict[Any, Any] | None = None
 
     def __init__(self, entries: Iterable[Any], named: Mapping[str, Target] = MappingProxyType({})) -> None:
-        """Find the targets, and make sure that the handlers fit.
+        """Find the targets, and check that the handlers fit.
 
         Args:
             entries: As ``handlers`` takes them.
-            named: The targets of names that are the simulation's own.
+            named: The targets of names that the simulation itself defines.
 
         Raises:
             SimEnvError: As ``attach_handler``.
@@ -220,17 +224,17 @@ class Plugins(_Added):
 
     @property
     def plugins(self) -> "Plugins":
-        """Themselves: they take part in what is evaluated for their environment."""
+        """This object: its handlers take part in evaluations for its environment."""
         return self
 
     @property
     def entries(self) -> list[Entry]:
-        """For each the handler, the dotted name of its target, and its position."""
+        """Tuples of the handler, the dotted name of its target, and its position."""
         return [(a.handler, a.target.name, a.position) for a in self._attached]
 
     @property
     def portable(self) -> list[Entry]:
-        """The same as ``entries``, but for targets that are not named the same in another process."""
+        """The same as ``entries``, but with the given target where its name would not lead to it in another process."""
         return [
             (handler, target if leads_there(target) else given, position)
             for (handler, target, position), given in zip(self.entries, self._given, strict=True)
@@ -238,12 +242,12 @@ class Plugins(_Added):
 
     @property
     def stale(self) -> bool:
-        """Whether a target has been replaced by something else, while nothing was set there."""
+        """Whether something else has replaced a target while nothing was set there."""
         return any(a.target.stale for a in self._attached)
 
     @property
     def hooks(self) -> Iterable[Hook]:
-        """The hooks of functions that have handlers."""
+        """Return the hooks of functions that have handlers."""
         return {id(a.target): a.target for a in self._attached if isinstance(a.target, Hook)}.values()
 
 
@@ -255,12 +259,12 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     """Record the calls of a model's functions, in the order in which they begin.
 
     Args:
-        *targets: The functions, as ``attach_handler`` takes them; none: all that are exposed or have handlers, and
-            all decorated decision points.
+        *targets: The functions, as ``attach_handler`` takes them. Without arguments: all functions that are exposed or
+            have handlers, and all decorated decision points.
 
     Returns:
-        A context manager whose value is the list of calls. An entry has the attributes ``target``, ``arguments``
-        and ``result``, which are strings; the result is None until the call ends.
+        A context manager whose value is the list of calls. An entry has the attributes ``target``, ``arguments`` and
+        ``result``, which are strings; the result is None until the call ends.
 
     Raises:
         SimEnvError: As ``attach_handler``.
@@ -282,7 +286,7 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
 
 
 def _everything() -> Iterator[Target]:
-    """All that is exposed or has handlers, and all decorated decision points."""
+    """Yield all targets that are exposed or have handlers, and all decorated decision points."""
     for target in list(Target.all):
         if isinstance(target, Hook) and (target.for_good or target.slot):
             with suppress(SimEnvError, ImportError):

@@ -1,11 +1,11 @@
-"""Which stacks belong to simulations, and for whom something is evaluated on a stack.
+"""The stacks of simulations, and the environment for which code on a stack is evaluated.
 
-A *stack* is a greenlet; a thread that knows nothing of greenlets has one all the same, its root. The stack of a
-simulation is entered in ``STACKS`` for as long as it lives. A greenlet belongs to the simulation whose stack is the
-nearest among itself, its parents, their parents, and so on. What an environment evaluates on its user's side
-(mappings, policies, the clock) is entered in ``EVALUATING`` under the greenlet on which that runs.
+A *stack* is a greenlet; a thread without greenlets has one, too, its root. ``STACKS`` has the stack of each simulation
+as long as it lives. A greenlet belongs to the simulation whose stack is the nearest among itself, its parent, the
+parent of that, and so on. While an environment evaluates something on the caller's side (mappings, policies, the
+clock), ``EVALUATING`` has an entry for the greenlet that runs it.
 
-Nothing here changes when a simulation is resumed or suspended: other stacks have other keys.
+Resuming or suspending a simulation changes nothing here, since other stacks have other keys.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from typing import Any, Final, Protocol
 from greenlet import getcurrent, greenlet
 
 Taker = Callable[[tuple[Any, ...], dict[str, Any]], Any]
-"""Takes part in a call: gets its arguments, positional and by keyword, and returns what the call returns."""
+"""A participant in a call: it gets the positional and keyword arguments, and returns the result of the call."""
 
 LOCK: Final = RLock()
-"""Held while functions are set in a model or put back, and while handlers come and go. Calls need none."""
+"""Held while patches or handlers change. Calls do not need it."""
 
 
 class Stack(Protocol):
@@ -35,10 +35,10 @@ class Stack(Protocol):
     plugins: Any
 
     def taker(self, hook: Any, here: greenlet) -> Taker | None:
-        """Who decides a call of a hook in a greenlet of the simulation's; None: the rule, with handlers around it."""
+        """Return what decides a call in a greenlet of the simulation; None for the rule with its handlers."""
 
     def refusal_of(self, hook: Any, where: str) -> Taker | None:
-        """What refuses a decision that was asked for where the simulation cannot wait; None where it is none."""
+        """Return a taker that refuses a decision where the simulation cannot wait; None if it is not a decision."""
 
     def hide(self) -> None:
         """Take no part in calls on the simulation's stack until ``show``."""
@@ -47,23 +47,23 @@ class Stack(Protocol):
         """Take part again."""
 
     def forked(self) -> None:
-        """The process was forked, and this is the child."""
+        """React to a fork, in the child process."""
 
     def forked_worker(self) -> None:
-        """The simulation has begun a worker of ``multiprocessing`` by a fork, and this is the worker."""
+        """React to a fork by which the simulation started a ``multiprocessing`` worker, in the worker."""
 
 
 class Evaluation(Protocol):
-    """For whom something is evaluated.
+    """The environment or agent for which code is evaluated.
 
     Attributes:
-        memory: What differences remember; None: nothing.
-        plugins: The plugins that take part; None: none but the handlers of the whole process.
+        memory: The memory of differences; None if there is none.
+        plugins: The plugins that take part. None: only the handlers of the whole process.
     """
 
     @property
     def memory(self) -> dict[Any, Any] | None:
-        """What differences remember."""
+        """The memory of differences."""
 
     @property
     def plugins(self) -> Any:
@@ -71,7 +71,7 @@ class Evaluation(Protocol):
 
 
 class Outside:
-    """Stands in ``STACKS`` for a simulation's stack on which another environment is at work."""
+    """The entry in ``STACKS`` for a simulation's stack on which another environment runs."""
 
     def __repr__(self) -> str:
         return "OUTSIDE"
@@ -83,15 +83,15 @@ STACKS: Final[dict[greenlet, Any]] = {}
 """The stacks of simulations, by greenlet: a ``Stack`` for each, or ``OUTSIDE``."""
 
 EVALUATING: Final[dict[greenlet, Evaluation]] = {}
-"""By greenlet: for whom something is evaluated there. Those who enter something put back what was there."""
+"""The running evaluation of each greenlet. Code that sets an entry restores the previous one."""
 
 DIFFERENCES: Final[list[str]] = []
-"""Not empty once a difference was made. While it is empty, and there are no plugins, mappings need no entry in
+"""Not empty once a difference was made. While it is empty and there are no plugins, mappings need no entry in
 ``EVALUATING``."""
 
 
 def stack_of(here: greenlet | None) -> Any:
-    """The simulation's stack to which a greenlet belongs; None if it belongs to none."""
+    """Return the simulation's stack to which a greenlet belongs; None if it belongs to none."""
     while here is not None:
         stack = STACKS.get(here)
         if stack is not None:
@@ -101,7 +101,7 @@ def stack_of(here: greenlet | None) -> Any:
 
 
 def spawner_of(here: greenlet) -> Any:
-    """The simulation's stack from which a greenlet was spawned on a hub of others, as gevent does it; or None."""
+    """Return the simulation's stack that spawned a greenlet on another hub, as gevent does; or None."""
     spawned: Any = here
     for _ in range(100):
         spawner = getattr(spawned, "spawning_greenlet", None)
@@ -112,7 +112,7 @@ def spawner_of(here: greenlet) -> Any:
         if stack is not None:
             return stack
         spawned = spawner
-    # A greenlet that has spawned another one may be gone, but all that one stack has led to share a dict.
+    # The greenlet that spawned this one may be gone, but all descendants of one stack share a dict.
     tree = getattr(spawned, "spawn_tree_locals", None)
     if tree is not None:
         for stack in list(STACKS):
@@ -122,7 +122,7 @@ def spawner_of(here: greenlet) -> Any:
 
 
 def plugins_at_work() -> Any:
-    """The plugins that take part in what runs here; None: none but the handlers of the whole process."""
+    """Return the plugins that take part here. None: only the handlers of the whole process."""
     here = getcurrent()
     stack = stack_of(here) if STACKS else None
     if stack is not None:
@@ -132,21 +132,21 @@ def plugins_at_work() -> Any:
 
 
 class outside_simulation:  # noqa: N801 - it is used like a function
-    """Keep apart what runs in this greenlet from a simulation or an evaluation that runs around it.
+    """Separate code in this greenlet from a simulation or an evaluation that runs around it.
 
-    Decision functions run their rule, and what takes part is what this says, and not what did before.
+    Inside, decision functions run their rule, and only the given evaluation's plugins take part.
 
-    It is a class, because a context manager made of a generator cannot pass on errors that refuse to be changed, as
-    frozen dataclasses do.
+    This is a class because the context manager of a generator cannot pass on immutable errors, such as frozen
+    dataclasses.
     """
 
     __slots__ = ("_before", "_evaluation", "_here", "_hidden", "_mask")
 
     def __init__(self, evaluation: Evaluation | None = None) -> None:
-        """Prepare it.
+        """Prepare the separation.
 
         Args:
-            evaluation: For whom something is evaluated here, and who takes part in it.
+            evaluation: The evaluation that runs inside.
         """
         self._evaluation = evaluation
 
@@ -162,7 +162,7 @@ class outside_simulation:  # noqa: N801 - it is used like a function
         self._put(EVALUATING, self._evaluation)
 
     def __del__(self) -> None:
-        # An interrupt at the entry of ``__exit__`` has kept it from running.
+        # An interrupt at the entry of ``__exit__`` kept it from running.
         if hasattr(self, "_mask") and EVALUATING.get(self._here) is self._evaluation:
             outside_simulation.__exit__(self)
 
@@ -199,7 +199,7 @@ def _in_a_forked_worker(_: object) -> None:
         stack.forked_worker()
 
 
-register_after_fork(OUTSIDE, _in_a_forked_worker)  # of multiprocessing alone: a plain fork goes on twice
+register_after_fork(OUTSIDE, _in_a_forked_worker)  # only for multiprocessing: after a plain fork, both processes go on
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_in_the_child_of_a_fork)

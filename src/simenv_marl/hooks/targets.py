@@ -1,4 +1,4 @@
-"""Finding what handlers are attached to: functions, iterables, and classes whose instances iterate."""
+"""Finds the targets of handlers: functions, iterables, and classes whose instances are iterable."""
 
 import inspect
 from collections.abc import Callable, Iterable
@@ -28,7 +28,7 @@ from .places import (
 
 
 def exposed_functions() -> list[str]:
-    """The names of all that is exposed to plugins, or has handlers attached to it."""
+    """Return the names of all targets that are exposed to plugins or have handlers."""
     return sorted({target.name for target in Target.all if target.exposed or target.slot})
 
 
@@ -40,14 +40,14 @@ _ONE = inspect.Signature([inspect.Parameter("iterable", inspect.Parameter.POSITI
 
 
 class IterableTarget(Target):
-    """An iterable, or a class whose instances are."""
+    """An iterable, or a class whose instances are iterable."""
 
     def __init__(self, name: str, nature: str = "is not called: it is iterated over") -> None:
         super().__init__(name, ITEMS, nature, _ONE)
 
 
 class NamedIterable(IterableTarget):
-    """An iterable under a name of a module or class, in whose stead a proxy is set while it has handlers."""
+    """An iterable that is an attribute of a module or class. A proxy replaces it while it has handlers."""
 
     def __init__(self, name: str, owner: Any, attribute: str, iterable: Any) -> None:
         from .iterables import proxy
@@ -57,20 +57,20 @@ class NamedIterable(IterableTarget):
         self._proxy, self._holders = proxy(iterable, self), set[object]()
 
     def hold(self, holder: object) -> None:
-        """Have the proxy set until ``let_go``, by all who hold it."""
+        """Set the proxy until every holder has called ``let_go``."""
         self._holders.add(holder)
         if len(self._holders) == 1:
             setattr(self._owner, self._attribute, self._proxy)
 
     def let_go(self, holder: object) -> None:
-        """Undo ``hold``. After an interrupt it is to be called again."""
+        """Undo ``hold``. After an interrupt, call it again."""
         self._holders.discard(holder)
         if not self._holders and vars(self._owner).get(self._attribute) is self._proxy:
             setattr(self._owner, self._attribute, self._iterable)
 
 
 class ClassTarget(IterableTarget):
-    """A class whose instances iterate: while it has handlers, its ``__iter__`` and ``__next__`` hand out the items."""
+    """A class whose instances are iterable. While it has handlers, its ``__iter__`` and ``__next__`` are patched."""
 
     def __init__(self, owner: type) -> None:
         name = f"{owner.__module__}.{owner.__qualname__}"
@@ -86,11 +86,11 @@ class ClassTarget(IterableTarget):
 
     @property
     def stale(self) -> bool:
-        """Whether something else has been set in its place, while nothing was set there for it."""
+        """Whether another object has replaced it while nothing was set in its place."""
         return any(hook.stale for hook, _ in self._hooks)
 
     def hold(self, holder: object) -> None:
-        """Be set where it has to be until ``let_go``, by all who hold it."""
+        """Patch the class until every holder has called ``let_go``."""
         try:
             for hook, _ in self._hooks:
                 hook.hold(holder)
@@ -99,7 +99,7 @@ class ClassTarget(IterableTarget):
             raise
 
     def let_go(self, holder: object) -> None:
-        """Undo ``hold``. After an interrupt it is to be called again."""
+        """Undo ``hold``. After an interrupt, call it again."""
         for hook, _ in self._hooks:
             hook.let_go(holder)
 
@@ -139,7 +139,7 @@ def _class_target(owner: type) -> ClassTarget:
 
 
 def exposed_iterable(thing: Any) -> Any:
-    """What has been made of an iterable to expose it, if that is what a thing is; else None."""
+    """Return the object if it is the proxy of an exposed iterable; else None."""
     iterables: Any = modules.get(f"{__package__}.iterables")
     return thing if iterables is not None and type(thing) in iterables.KINDS else None
 
@@ -152,7 +152,7 @@ def _iterates(thing: Any) -> bool:
 
 
 def expose(thing: Any) -> Any:
-    """Make an exposed thing, as ``expose_to_plugins`` does."""
+    """Expose a function or iterable, as ``expose_to_plugins`` does."""
     if isinstance(thing, type):
         target = _class_target(thing)
         if not target.exposed:
@@ -166,7 +166,7 @@ def expose(thing: Any) -> Any:
     if isinstance(thing, (staticmethod, classmethod, FunctionType, MethodType)):
         return _expose_function(thing)
     if _iterates(thing):
-        from .iterables import expose as expose_iterable  # what it stands on imports asyncio, which decisions pay for
+        from .iterables import expose as expose_iterable  # its dependency imports asyncio, which slows down decisions
 
         return expose_iterable(thing)
     if callable(thing):
@@ -183,12 +183,12 @@ def _expose_function(thing: Any) -> Any:
         there = _at_own_name(given)
         hook = hook_of(there)
         if hook is not None and hook.exposed and hook.function is given:
-            given = there  # it was exposed before
+            given = there  # already exposed
         else:
             name = f"{given.__module__}.{given.__qualname__}"
             hook = Hook(given, name, bound=binding is not staticmethod)
             given = hook.stand_in()
-    elif not hook.for_good:  # fetched while it was set for a while
+    elif not hook.for_good:  # fetched while its hook was set temporarily
         stays(hook)
         given = hook.stand_in()
     hook.exposed = True
@@ -209,14 +209,14 @@ def _at_own_name(function: FunctionType) -> Any:
 
 
 def find_target(target: Any) -> Target:
-    """Find what handlers are to be attached to.
+    """Find the target for handlers.
 
     Args:
         target: A function, an iterable or a class, or its dotted name.
 
     Raises:
-        UnknownTargetError: The name leads to nothing.
-        PatchError: It is not exposed, and cannot be patched.
+        UnknownTargetError: The name does not exist.
+        PatchError: It is not exposed and cannot be patched.
     """
     if isinstance(target, str):
         try:
@@ -243,7 +243,7 @@ def find_target(target: Any) -> Target:
 
 
 def at_hand(hook: Hook) -> Target:
-    """The hook of a function, wherever that was fetched; if it was set there for a while, what is there now."""
+    """Return the hook of a function; if that was a temporary one, the hook that is at its place now."""
     if hook.stale:
         if not hook.for_good:
             return find_target(hook.name)
@@ -254,7 +254,7 @@ def at_hand(hook: Hook) -> Target:
 
 
 def _of_function(function: FunctionType) -> Target:
-    """The target of a function that is not exposed, which is to be found by its name or in a class."""
+    """Return the target of a function that is not exposed, found by its name or in a class."""
     name = f"{function.__module__}.{function.__qualname__}"
     owner: Any = None
     attribute = function.__name__

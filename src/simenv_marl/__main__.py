@@ -1,7 +1,7 @@
 """The command line: ``python -m simenv_marl`` with ``new``, ``check``, ``inspect`` or ``wire-check``.
 
-Exit codes: 0 where all is well, 1 where a check has found errors (or the model fails in ``inspect``), 2 where nothing
-could be looked at or written.
+Exit codes: 0 for success; 1 if a check has found errors (or the model fails in ``inspect``); 2 if the arguments cannot
+be used, or nothing can be written.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from .templates import KINDS, write_template
 
 
 class _UsageError(Exception):
-    """What was asked for cannot be looked at."""
+    """The arguments cannot be used."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: What follows the program's name; None: what it was called with.
+        arguments: The arguments after the program's name. None: those of this process.
 
     Returns:
         The exit code.
@@ -185,10 +185,10 @@ def _inspected(options: argparse.Namespace) -> Any:
 
 
 def _found(text: str) -> Any:
-    """Import what ``module:name`` says.
+    """Import the object that ``module:name`` names.
 
     Raises:
-        _UsageError: It leads to nothing.
+        _UsageError: It does not exist.
     """
     module_name, colon, path = text.partition(":")
     if not (module_name and colon and path):

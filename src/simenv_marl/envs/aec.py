@@ -19,23 +19,21 @@ from .pettingzoo_base import AgentsView
 class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
     """A simulation as a PettingZoo AEC environment. Made by ``aec_env`` and ``generate_env``.
 
-    ``possible_agents`` exists only where all agents are known beforehand. Every step takes the same time,
-    however many agents there are: PettingZoo's helpers for rewards and dead steps, which pass over all
-    agents, are not used.
+    ``possible_agents`` exists only if all agents are known beforehand. The time for a step does not depend on the
+    number of agents: PettingZoo's helpers for rewards and dead steps, which loop over all agents, are not used.
 
-    With ``padded=True`` all of ``possible_agents`` are there until the episode ends, whether they are ``"present"``, as
-    their infos then tell, or not; those who are not are never selected before.
+    With ``padded=True``, ``agents`` has all of ``possible_agents`` until the episode ends. ``infos[agent]["present"]``
+    tells whether an agent lives. Agents that are not present are not selected before the end.
 
     Attributes:
-        agents: The agents that have not yet taken leave of the episode.
-        agent_selection: The agent whose decision is pending; where agents have ended, the one that is to take
-            its ``None`` step.
-        rewards: The rewards that the latest step has brought, python floats.
-        terminations, truncations: By agent, python bools.
-        infos: By agent, the info of its latest decision. ``infos[agent]["action_mask"]``, np.int8, is there
-            where the decision point restricts its actions; ``"time"`` and ``"elapsed"`` where the simulation
-            has a clock. The keys are there from the reset on, and stay; of an agent that has not been seen
-            yet, all actions are legal.
+        agents: The agents that have not yet taken the final ``None`` step of their episode.
+        agent_selection: The agent whose decision is pending; after agents have ended, the one that takes its ``None``
+            step next.
+        rewards: The rewards of the latest step, as Python floats.
+        terminations, truncations: The flags of each agent, as Python bools.
+        infos: The info of each agent's latest decision. ``infos[agent]["action_mask"]``, np.int8, exists if the
+            decision point restricts its actions; ``"time"`` and ``"elapsed"`` exist if the simulation has a clock. The
+            keys exist from the reset on. Until an agent was observed, its mask has all actions legal.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -49,7 +47,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     @staticmethod
     def metadata_of(plan: Plan) -> dict[str, Any]:
-        """What the environments of a plan say about themselves; the order of its agents is no order of rounds."""
+        """Return the metadata of a plan's environments; the order of agents is not an order of rounds."""
         return View.metadata_of(plan) | {"is_parallelizable": False}
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -58,13 +56,13 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         """Reset the simulation and run it to its first decision.
 
         Args:
-            seed: Seeds the environment's generator and the agents' spaces, and is what the simulation's
-                ``reset`` gets. None: the simulation gets a seed drawn from the generator.
-            options: Handed to the simulation's ``reset``, where that takes them.
+            seed: The seed for the environment's generator, the agents' spaces, and the simulation's ``reset``. None:
+                the simulation gets a seed from the environment's generator.
+            options: Options for the simulation's ``reset``, if it takes them.
 
         Raises:
             NoDecisionError: The simulation ended without a decision.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         with self._session.claimed():
             self._enter(self._start(seed, options, When.DECISION))
@@ -75,12 +73,12 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         """Answer the decision of ``agent_selection`` and run to the next one.
 
         Args:
-            action: In the agent's action space, or ``RULE``; None for an agent whose episode has ended.
+            action: An action in the agent's action space, or ``RULE``. None for an agent whose episode has ended.
 
         Raises:
-            InvalidActionError: The action is not legal. The environment stands where it stood.
-            ResetNeededError: There is no episode to go on with.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            InvalidActionError: The action is not legal. The environment does not change.
+            ResetNeededError: There is no running episode.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         claim = self._session.claim
         if claim is not None and not claim.held:  # what comes of it is read under the claim, too
@@ -113,16 +111,16 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             self.render()
 
     def last(self, observe: bool = True) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """What ``agent_selection`` needs to decide.
+        """Return what ``agent_selection`` needs to decide.
 
         Args:
-            observe: Whether to return the observation, or None in its place.
+            observe: Whether to return the observation, or None instead.
 
         Returns:
-            Its observation, its rewards since its last step, terminated, truncated, info.
+            Its observation, the sum of its rewards since its last step, terminated, truncated, info.
 
         Raises:
-            ResetNeededError: There is no episode, or all agents have taken leave of it.
+            ResetNeededError: There is no episode, or all agents have taken their final step.
         """
         agent, observation = self._deciding, None
         if agent is None:
@@ -145,10 +143,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         )
 
     def observe(self, agent: str) -> Any:
-        """The latest observation of an agent, as a copy of the caller's own.
+        """Return the latest observation of an agent, as a new copy.
 
         Args:
-            agent: An agent of this episode.
+            agent: The name of an agent of this episode.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -184,7 +182,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.infos[name] = {}
 
     def _select(self, agent: Agent) -> None:
-        """Enter a decision that has arisen."""
+        """Record a decision that has arisen."""
         self._deciding = agent
         name = self.agent_selection = agent.name
         if name not in self.rewards:
@@ -194,7 +192,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.infos[name] = presence(agent) if self._padded else agent.info
 
     def _enter_reward(self, agent: Agent) -> None:
-        """Enter the reward and the info of an agent that is not selected for its decision."""
+        """Record the reward and the info of an agent that is not selected for its decision."""
         name, reward = agent.name, agent.reward
         self.rewards[name] = reward
         self._cumulative_rewards[name] += reward
@@ -202,7 +200,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.infos[name] = presence(agent) if self._padded else agent.info
 
     def _enter(self, episode: Episode) -> None:
-        """Enter what a reset or a step has brought besides a decision: births and ends."""
+        """Record the births and ends of a reset or a step."""
         if not self.agents:
             for name, agent in episode.agents.items():
                 self._join(name)
@@ -232,7 +230,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         episode.just_ended = []
 
     def _select_leaving(self, episode: Episode) -> None:
-        """Select the next agent that is to take leave, if there is any, and else the one that decides."""
+        """Select the next agent that takes its final step, or else the one that decides."""
         if self._leaving:
             self.agent_selection, self._deciding = self._leaving[-1], None
         else:
@@ -241,18 +239,18 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                 self.agent_selection = self._deciding.name
 
     def _dismiss(self, name: str, *, terminated: bool, truncated: bool) -> None:
-        """Enter the end of an agent, whose ``None`` step is to come."""
+        """Record the end of an agent, whose ``None`` step comes next."""
         self.terminations[name], self.truncations[name] = terminated, truncated
         self._leaving.append(name)
 
     def _take_back_rewards(self) -> None:
-        """Take back what is only to be seen of the step before: the rewards of others than the selected agent."""
+        """Reset the rewards of the previous step, except for the selected agent."""
         for name in self._rewarded:
             self.rewards[name] = 0.0
         self._rewarded = []
 
     def _dead_step(self, action: Any) -> None:
-        """The step of an agent that has ended."""
+        """Take the final step of an agent that has ended."""
         if action is not None and action is not RULE:
             raise InvalidActionError(
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {shown(action)}"

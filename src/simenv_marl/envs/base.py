@@ -1,4 +1,4 @@
-"""What all views have in common: a session, spaces of their own, a picture and a state."""
+"""The base class of all views: the session, the spaces, rendering and the state."""
 
 import copy
 import weakref
@@ -19,7 +19,7 @@ from ..hooks.plugins import Entry
 
 
 class View:
-    """A reading of a simulation's episodes.
+    """A view of a simulation's episodes.
 
     Attributes:
         metadata: Its name, and the render modes of its simulation.
@@ -39,7 +39,7 @@ class View:
 
         Args:
             plan: The plan.
-            session: The simulation that it reads, which is closed elsewhere; None: one of its own.
+            session: The simulation to use, which its owner closes. None: a new one.
 
         Raises:
             SimEnvError: Something in the plan cannot work.
@@ -52,15 +52,15 @@ class View:
             self._finalizer = weakref.finalize(self, self._session.abandon)
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
-        self._shows = self.render_mode == "human"  # after every reset and step, without being asked to
+        self._shows = self.render_mode == "human"  # render after every reset and step
 
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Make sure that a plan allows this view.
+        """Check that a plan allows this view.
 
         Raises:
             UnknownOptionError: An option is given that only another view takes.
-            ViewError: It does not allow the view.
+            ViewError: The plan does not allow the view.
         """
         for option, view in (("flatten", "joint"), ("agent", "single")):
             if getattr(plan.options, option) and option not in cls.takes:
@@ -68,12 +68,12 @@ class View:
 
     @staticmethod
     def metadata_of(plan: Plan) -> dict[str, Any]:
-        """What the environments of a plan say about themselves."""
+        """Return the metadata of a plan's environments."""
         return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": plan.render_fps}
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The generator that the last given seed has seeded, and from which other seeds are drawn."""
+        """The generator that was seeded with the last given seed, and from which other seeds are drawn."""
         return self._session.np_random
 
     @np_random.setter
@@ -82,10 +82,10 @@ class View:
 
     @property
     def np_random_seed(self) -> int:
-        """What the generator was seeded with; -1 where it was set."""
+        """The seed of the generator; -1 if the generator was set."""
         seed = self._session.np_random_seed
         if seed is None:
-            _ = self._session.np_random  # which a seed is drawn for
+            _ = self._session.np_random  # draws a seed
             seed = self._session.np_random_seed
         assert seed is not None
         return seed
@@ -97,33 +97,33 @@ class View:
 
     @property
     def plugins(self) -> list[Entry]:
-        """Of each handler of the option ``plugins``: the handler, the dotted name of its target, its position."""
+        """The handlers of the option ``plugins``: tuples of handler, dotted name of the target, and position."""
         plugins = self._plan.plugins
         return [] if plugins is None else plugins.entries
 
     def provenance(self) -> dict[str, Any]:
-        """What this environment is made of, and the seed of its latest episode, ready for ``json.dump``.
+        """Return the provenance of this environment, with the seed of its latest episode, ready for ``json.dump``.
 
         Returns:
-            What ``simenv_marl.provenance`` lists.
+            The dict that ``simenv_marl.provenance`` describes.
         """
         return describe(self._plan, self._session.seed)
 
     @property
     def state_space(self) -> spaces.Space[Any] | None:
-        """The space of ``state()``, where the environment was made with one."""
+        """The space of ``state()``, if the environment was made with one."""
         space = self._plan.options.state_space
         return self._seen_together()[1] if isinstance(space, str) else space
 
     def state(self) -> Any:
-        """The state of the simulation, for centralised critics: what its own ``state()`` returns.
+        """Return the state of the simulation, for centralised critics, from the simulation's own ``state()``.
 
         Returns:
-            A new array; in the dtype of ``state_space``, where the environment was made with one. With
-            ``state_space="observations"`` what all possible agents observe, flattened, one behind the other.
+            A new array, in the dtype of ``state_space`` if the environment was made with one. With
+            ``state_space="observations"``: the flattened observations of all possible agents, concatenated.
 
         Raises:
-            NotImplementedError: The simulation has no ``state``, as PettingZoo has it.
+            NotImplementedError: The simulation has no ``state`` (PettingZoo's convention).
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
         if isinstance(self._plan.options.state_space, str):
@@ -137,10 +137,10 @@ class View:
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 
     def _seen_together(self) -> tuple[spaces.Tuple[Any], spaces.Space[Any]]:
-        """The spaces of all that is observed, and the one of them all.
+        """Return the spaces of all observations, and the space of their concatenation.
 
         Raises:
-            ViewError: There is no vector of them.
+            ViewError: They cannot be flattened.
         """
         if self._together is None:
             parts = spaces.Tuple(self._seen_spaces())
@@ -151,41 +151,41 @@ class View:
         return self._together
 
     def _seen_spaces(self) -> list[spaces.Space[Any]]:
-        """The spaces of all that is observed."""
+        """Return the spaces of all observations."""
         raise NotImplementedError
 
     def _seen(self, episode: Episode) -> tuple[Any, ...]:
-        """All that is observed."""
+        """Return all observations."""
         raise NotImplementedError
 
     def render(self) -> Any:
-        """Render the simulation in ``render_mode``; without one, None and a warning.
+        """Render the simulation in ``render_mode``. Without a render mode, warn and return None.
 
-        In the mode "human" every ``reset`` and ``step`` does so by itself.
+        In the mode "human", every ``reset`` and ``step`` renders by itself.
         """
         return self._session.render()
 
     def close(self) -> None:
-        """End the episode and unwind the simulation; a later ``reset`` begins anew.
+        """End the episode and unwind the simulation; a later ``reset`` begins a new one.
 
         Raises:
-            BaseException: What the simulation raises while it unwinds.
+            BaseException: Any exception of the simulation while it unwinds.
         """
         try:
             self._end(self._session.close)
         finally:
-            if self._finalizer is not None and self._session.idle:  # else it was refused, or interrupted
+            if self._finalizer is not None and self._session.idle:  # else closing was refused, or interrupted
                 # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
                 self._finalizer.detach()
 
     def _make_way(self) -> None:
-        """End the episode that runs, and see to it that the next one ends should the environment be abandoned."""
+        """End the running episode, and make sure that the next one ends if the environment is abandoned."""
         if self._finalizer is not None and not self._finalizer.alive:
             self._finalizer = weakref.finalize(self, self._session.abandon)
         self._end(self._session.end)
 
     def _end(self, end: Callable[[], None]) -> None:
-        """End the episode; forget it, unless that was refused."""
+        """End the episode, and forget it unless that was refused."""
         try:
             end()
         finally:
@@ -194,7 +194,7 @@ class View:
                 self._clear()
 
     def __deepcopy__(self, memory: dict[int, Any]) -> Any:
-        """Make an environment like this one, with a simulation of its own, that is to be reset."""
+        """Make an environment like this one, with a simulation of its own. It needs a reset."""
         made = memory[id(self)] = _made_again(type(self), self._made_of)
         _take_over(made, copy.deepcopy(self._state(), memory))
         return made
@@ -203,12 +203,12 @@ class View:
         return copy.deepcopy(self)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Be pickled: to an environment like this one, with a simulation of its own, that is to be reset."""
+        """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset."""
         made: Any = type(self)
         found: Any = modules.get(made.__module__)
         for name in made.__qualname__.split("."):
             found = getattr(found, name, None)
-        if found is not made:  # a class that generate_env has made, and which is not found by its name
+        if found is not made:  # a class that generate_env made and that its name does not lead to
             made = next(base for base in made.__mro__ if base.__module__.startswith(__package__))
         return _made_again, (made, self._made_of), self._state(), None, None, _take_over
 
@@ -217,39 +217,39 @@ class View:
         vars(self).update(kept)
 
     def _state(self) -> dict[str, Any]:
-        """What a copy takes over."""
+        """Return what a copy takes over."""
         kept = {name: value for name, value in vars(self).items() if name not in _OWN}
         return kept | {"session": self._session.kept()}
 
     @property
     def driver(self) -> str:
-        """What switches between the simulation and its user."""
+        """The name of the driver, which switches between the simulation and its user."""
         return self._plan.options.driver
 
     def check_pending(self) -> None:
-        """Make sure that a decision is pending.
+        """Check that a decision is pending.
 
         Raises:
-            ResetNeededError: None is.
-            ReentrancyError: The simulation is moving.
+            ResetNeededError: No decision is pending.
+            ReentrancyError: The simulation is running.
         """
         if self._running().pending is None:
             raise self._session.refusal()
 
     def opened(self) -> tuple[list[str], list[Any]]:
-        """What the simulation has opened that a forked process would share: see ``Session.opened``."""
+        """Return what the simulation has opened that a forked process would share: see ``Session.opened``."""
         return self._session.opened()
 
     def check_reseed(self) -> None:
-        """Make sure that the chance that lies ahead can be drawn anew: see ``Session.check_reseed``."""
+        """Check that the random numbers ahead can be drawn anew: see ``Session.check_reseed``."""
         self._session.check_reseed()
 
     def reseed(self, seed: int) -> None:
-        """Draw the chance that lies ahead anew: for ``branch``, see ``Session.reseed``."""
+        """Reseed the simulation, for ``branch``: see ``Session.reseed``."""
         self._session.reseed(seed)
 
     def _running(self) -> Episode:
-        """The episode that goes on, or has just ended.
+        """Return the running episode, or the one that has just ended.
 
         Raises:
             ResetNeededError: There is none.
@@ -260,11 +260,11 @@ class View:
         return episode
 
     def replayed(self) -> Any:
-        """Make an environment that stands just where this one stands in mid-episode: a copy for ``branch``.
+        """Make an environment in exactly the same state in mid-episode, for ``branch``.
 
         Raises:
-            BranchError: It cannot be brought there.
-            ResetNeededError: There is no episode that could be brought anywhere.
+            BranchError: The state cannot be reached.
+            ResetNeededError: There is no running episode.
         """
         made = _made_again(type(self), self._made_of)
         made.__setstate__(copy.deepcopy(self._state()))
@@ -274,7 +274,7 @@ class View:
 
     @property
     def episode(self) -> Episode:
-        """The episode that goes on, or has just ended: for planners.
+        """Return the running episode, or the one that has just ended, for planners.
 
         Raises:
             ResetNeededError: There is none.
@@ -282,21 +282,21 @@ class View:
         return self._running()
 
     def stop_showing(self) -> None:
-        """In a branch: show nothing of what is not to happen."""
+        """Stop rendering, in a branch."""
         self._shows = False
 
     def begin_branch(self) -> None:
-        """Make ready for what is done in a branch, of which this is the environment."""
+        """Prepare the environment of a branch."""
 
     def _resume_from_replay(self) -> None:
-        """Take over the session's episode in the midst of it."""
+        """Take over the session's episode in mid-episode."""
 
     def _clear(self) -> None:
-        """Forget what was noted of the episode."""
+        """Forget the records of the episode."""
 
 
 def _made_again(view: type[View], plan: Plan) -> View:
-    """An environment of a class, of which a plan is all that is known."""
+    """Make an environment of a class from its plan alone."""
     made = view.__new__(view)
     base: Any = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
     base.__init__(made, plan)
@@ -304,10 +304,10 @@ def _made_again(view: type[View], plan: Plan) -> View:
 
 
 def _take_over(view: View, state: dict[str, Any]) -> None:
-    """Have a copy take over the state of another view, but for what that has noted of its episode."""
+    """Have a copy take over the state of another view, except for the records of its episode."""
     view.__setstate__(state)
     view._clear()
 
 
 _OWN = frozenset(("_deciding", "_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))
-"""What each environment has of its own, and no copy takes over."""
+"""The attributes that no copy takes over."""

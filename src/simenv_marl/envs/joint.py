@@ -1,4 +1,4 @@
-"""The joint view: one agent that takes all decisions, and so a Gymnasium environment."""
+"""The joint view: a Gymnasium environment with one agent that takes all decisions."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -18,15 +18,15 @@ from .gymnasium_base import OneAgentView
 
 
 class Joint:
-    """How the agents of a roster are read as one.
+    """The agents of a roster, combined into one.
 
     Attributes:
-        roster: By name, the points of the agents.
-        observation_space, action_space: The spaces of all of them: see ``SimulationJointEnv``.
+        roster: The points of the agents, by name.
+        observation_space, action_space: The combined spaces: see ``SimulationJointEnv``.
     """
 
     def __init__(self, roster: Mapping[str, BoundPoint], *, flatten: bool) -> None:
-        """Find out the spaces.
+        """Combine the spaces.
 
         Raises:
             ViewError: The spaces cannot be flattened.
@@ -43,13 +43,13 @@ class Joint:
             self.observation_space, self.action_space = spaces.Dict(observations), spaces.Dict(actions)
 
     def actions(self, episode: Episode, action: Any) -> dict[str, Any]:
-        """Take a joint action apart.
+        """Split a joint action.
 
         Returns:
-            The actions of the agents that live.
+            The actions of the live agents.
 
         Raises:
-            InvalidActionError: It is no joint action, or lacks an agent.
+            InvalidActionError: It is not a joint action, or lacks an agent.
         """
         actions: Mapping[str, Any]
         if action is RULE:
@@ -68,10 +68,10 @@ class Joint:
         return {name: actions[name] for name in self.roster if name in episode.agents}
 
     def check(self, episode: Episode, action: Any) -> None:
-        """Check the joint action of a vector environment, as far as it can be checked before anything moves.
+        """Check the joint action of a vector environment, as far as possible before the simulation moves.
 
         Raises:
-            InvalidActionError: It is not legal, or has ``RULE`` in it.
+            InvalidActionError: It is not legal, or contains ``RULE``.
         """
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
@@ -79,7 +79,7 @@ class Joint:
         episode.check(actions)
 
     def observe(self, episode: Episode) -> Any:
-        """What all agents observe; one that has ended keeps its last observation."""
+        """Return the observations of all agents; an agent that has ended keeps its last observation."""
         observations = {}
         for name, point in self.roster.items():
             agent = episode.agent(name)
@@ -92,14 +92,14 @@ class Joint:
         return observations
 
     def reward(self, episode: Episode) -> float:
-        """The sum of the rewards that a step has brought."""
+        """Return the sum of the rewards of a step."""
         reward = 0.0
         for agent in (*episode.just_ended, *episode.agents.values()):
             reward += agent.reward
         return reward
 
     def inform(self, episode: Episode) -> dict[str, Any]:
-        """The info of a step or a reset, which tells how much time has gone by since the one before."""
+        """Return the info of a step or a reset, with the time since the previous one."""
         agents = {name: episode.agent(name) for name in self.roster}
         info: dict[str, Any] = {
             "deciding": episode.pending.name if episode.pending is not None else "",
@@ -117,22 +117,22 @@ class Joint:
         return info
 
     def masks(self, episode: Episode) -> list[Any]:
-        """The masks of all agents."""
+        """Return the action masks of all agents."""
         agents = [(point, episode.agent(name)) for name, point in self.roster.items()]
         return [point.open_mask() if agent is None or agent.mask is None else agent.mask for point, agent in agents]
 
 
 class SimulationJointEnv(OneAgentView):
-    """A simulation as a Gymnasium environment whose one agent takes all decisions. Made by ``joint_env``.
+    """A simulation as a Gymnasium environment with one agent that takes all decisions. Made by ``joint_env``.
 
-    A step is a round of the parallel view with an action for each agent; the reward is the sum. The agents are
-    those that are known when it is made: those with names of their own, those in ``possible_agents``, and
-    those that the simulation's ``expected_calls`` names after a reset.
+    A step is a round of the parallel view with an action for each agent. The reward is the sum of their rewards. The
+    agents are those that are known when the environment is made: those whose names are strings, those in
+    ``possible_agents``, and those that the simulation's ``expected_calls`` announces after a reset.
 
     Attributes:
-        observation_space, action_space: ``Dict`` spaces keyed by agent, or, flattened, the one-dimensional
-            ``Box`` of all of them, one behind the other (the paper's two-dimensional action space); actions of
-            ``Discrete`` and one-dimensional ``MultiDiscrete`` spaces come to a ``MultiDiscrete``.
+        observation_space, action_space: ``Dict`` spaces by agent. With ``flatten=True``: one-dimensional ``Box``
+            spaces, the concatenation of those of the agents (the paper's two-dimensional action space). ``Discrete``
+            and one-dimensional ``MultiDiscrete`` action spaces become one ``MultiDiscrete``.
     """
 
     takes = ("flatten",)
@@ -143,7 +143,7 @@ class SimulationJointEnv(OneAgentView):
 
         Args:
             plan: The plan.
-            session: The simulation that it reads; None: one of its own.
+            session: The simulation to use. None: a new one.
 
         Raises:
             ViewError: Not all agents are known beforehand, or their spaces cannot be flattened.
@@ -173,16 +173,16 @@ class SimulationJointEnv(OneAgentView):
         """Reset the simulation and run it to its first decision.
 
         Args:
-            seed: Seeds the environment's generator and its spaces, and is what the simulation's ``reset``
-                gets. None: the simulation gets a seed drawn from the generator.
-            options: Handed to the simulation's ``reset``, where that takes them.
+            seed: The seed for the environment's generator, its spaces, and the simulation's ``reset``. None: the
+                simulation gets a seed from the environment's generator.
+            options: Options for the simulation's ``reset``, if it takes them.
 
         Returns:
             The observation and the info.
 
         Raises:
             NoDecisionError: The simulation ended without a decision.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         with self._session.claimed():
             episode = self._begin(seed, options, When.RETURN)
@@ -194,22 +194,22 @@ class SimulationJointEnv(OneAgentView):
         """Play a round with an action for each agent.
 
         Args:
-            action: In the action space: an action for each agent (those of agents that have ended are not
-                used). ``RULE``, or ``RULE`` in place of an agent's action, lets the rule decide.
+            action: An action in the action space, with an action for each agent (those of ended agents are not used).
+                ``RULE``, or ``RULE`` instead of an agent's action, lets the rule decide.
 
         Returns:
-            Observation, sum of the rewards (a python float), terminated, truncated, info. An agent that has
-            ended keeps its last observation. ``info["deciding"]`` names the agent whose decision is pending,
-            ``info["acted"]`` tells by agent whether its action was used, and ``info["time"]`` and ``["elapsed"]``,
-            where the simulation has a clock, the time and how much has gone by since the step before.
+            Observation, sum of the rewards (a Python float), terminated, truncated, info. An agent that has ended keeps
+            its last observation. ``info["deciding"]`` is the name of the agent whose decision is pending.
+            ``info["acted"]`` tells for each agent whether its action was used. If the simulation has a clock,
+            ``info["time"]`` is its time, and ``info["elapsed"]`` the time since the previous step.
 
         Raises:
-            InvalidActionError: The action is not legal, or lacks an agent. The environment stands where it stood.
-            ResetNeededError: There is no episode to go on with.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            InvalidActionError: The action is not legal, or lacks an agent. The environment does not change.
+            ResetNeededError: There is no running episode.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         claim = self._session.claim
-        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
+        if claim is not None and not claim.held:  # results are read under the claim, too
             with claim:
                 return SimulationJointEnv.step(self, action)
         episode, joint = self._running(), self.joint
@@ -233,7 +233,7 @@ def _length(space: spaces.Space[Any]) -> int:
 
 
 def _concatenate_actions(parts: Mapping[str, spaces.Space[Any]]) -> spaces.Space[Any]:
-    """Actions are one vector where they are all numbers of one kind: all continuous, or all discrete."""
+    """Return the space of concatenated actions, which must be all continuous or all discrete."""
     listed: list[Any] = list(parts.values())
     if not all(_counts(space) for space in listed):
         if any(_counts(space) for space in listed):
@@ -250,7 +250,7 @@ def _counts(space: spaces.Space[Any]) -> bool:
 
 
 def _places(parts: Mapping[str, spaces.Space[Any]]) -> dict[str, int | slice]:
-    """By agent, where its action stands in the flattened one."""
+    """Return the place of each agent's action in the flattened one."""
     places: dict[str, int | slice] = {}
     begin = 0
     for agent, space in parts.items():

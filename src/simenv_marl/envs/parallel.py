@@ -17,12 +17,13 @@ from .pettingzoo_base import AgentsView
 class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     """A simulation as a PettingZoo parallel environment. Made by ``parallel_env`` and ``generate_env``.
 
-    With ``padded=True`` all of ``possible_agents`` are there until the episode ends, whether they are ``"present"``, as
-    their infos then tell, or not.
+    A step answers each decision as it arises with the action of its agent. Each action is used once. The step returns
+    at the first decision whose action is missing or already used. So, giving all actions at once makes simultaneous
+    moves, and giving one action at a time makes turns. When the step returns, all live agents are observed and
+    rewarded.
 
-    A step answers each decision as it arises with the action given for its agent, once, and returns at the
-    first decision whose action is missing or used already. All actions at once so give simultaneous moves,
-    and one action at a time gives turns. All live agents are observed and rewarded at the return.
+    With ``padded=True``, ``agents`` has all of ``possible_agents`` until the episode ends. ``infos[agent]["present"]``
+    tells whether an agent lives.
 
     Attributes:
         agents: The live agents.
@@ -39,7 +40,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
 
     @staticmethod
     def metadata_of(plan: Plan) -> dict[str, Any]:
-        """What the environments of a plan say about themselves."""
+        """Return the metadata of a plan's environments."""
         return View.metadata_of(plan) | {"is_parallelizable": True}
 
     def reset(
@@ -48,16 +49,16 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         """Reset the simulation and run it to its first decision.
 
         Args:
-            seed: Seeds the environment's generator and the agents' spaces, and is what the simulation's
-                ``reset`` gets. None: the simulation gets a seed drawn from the generator.
-            options: Handed to the simulation's ``reset``, where that takes them.
+            seed: The seed for the environment's generator, the agents' spaces, and the simulation's ``reset``. None:
+                the simulation gets a seed from the environment's generator.
+            options: Options for the simulation's ``reset``, if it takes them.
 
         Returns:
-            By agent, the observations and the infos.
+            The observations and the infos, by agent.
 
         Raises:
             NoDecisionError: The simulation ended without a decision.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         with self._session.claimed():
             episode = self._start(seed, options, When.RETURN)
@@ -71,22 +72,23 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         """Play a round.
 
         Args:
-            actions: By live agent: an action in its action space, or ``RULE``. ``RULE`` in place of the dict:
-                for all of them. An empty dict is accepted after the end, too, and nothing comes of it.
+            actions: A dict from live agent to an action in its action space, or ``RULE``. ``RULE`` instead of the dict
+                stands for ``RULE`` of all agents. After the end of the episode, an empty dict is accepted and has no
+                effect.
 
         Returns:
-            By agent: observations, rewards (python floats), terminations, truncations (python bools) and
-            infos. ``infos[agent]["deciding"]`` tells whose decision is pending, ``["acted"]`` whether the
-            agent's action was used. Agents that have ended are among them for the last time.
+            Observations, rewards (Python floats), terminations, truncations (Python bools) and infos, by agent.
+            ``infos[agent]["deciding"]`` tells whether the agent's decision is pending, ``["acted"]`` whether its action
+            was used. Agents that have ended are in the dicts one last time.
 
         Raises:
-            UnknownAgentError: An action is for no live agent. The environment stands where it stood.
-            InvalidActionError: An action is not legal. The environment stands where it stood.
-            ResetNeededError: There is no episode to go on with.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            UnknownAgentError: An action is for an agent that does not live. The environment does not change.
+            InvalidActionError: An action is not legal. The environment does not change.
+            ResetNeededError: There is no running episode.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         claim = self._session.claim
-        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
+        if claim is not None and not claim.held:  # results are read under the claim, too
             with claim:
                 return SimulationParallelEnv.step(self, actions)
         episode = self._session.episode
@@ -111,7 +113,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         return results
 
     def _results(self, episode: Episode) -> Results:
-        """What the agents have come to, by agent."""
+        """Return the results of a step, by agent."""
         agents, ended = episode.agents, episode.just_ended
         if ended:
             agents = {agent.name: agent for agent in ended} | agents
@@ -120,10 +122,10 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         observations, rewards, _, _, infos = results
         for name, agent in agents.items():
             observation = agent.observation
-            if observation is agent.handed_out:  # it could not be observed anew, or never was
+            if observation is agent.handed_out:  # it could not be observed anew, or was never observed
                 observation = agent.point.blank() if observation is None else duplicate(observation)
             else:
-                agent.handed_out = observation  # it is the caller's alone
+                agent.handed_out = observation  # the caller may change it
             observations[name], rewards[name] = observation, agent.reward
             infos[name] = info = agent.info
             info["deciding"], info["acted"] = False, agent.acted

@@ -1,4 +1,4 @@
-"""The single view: one agent, and so a Gymnasium environment."""
+"""The single view: a Gymnasium environment of one agent."""
 
 import copy
 from dataclasses import replace
@@ -23,21 +23,21 @@ class SimulationEnv(OneAgentView):
     """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``.
 
     Attributes:
-        observation_space, action_space: The agent's spaces, of this environment alone.
+        observation_space, action_space: The agent's spaces, which this environment does not share.
     """
 
     takes = ("agent",)
-    _own: Any = None  # its agent, while there is an episode
+    _own: Any = None  # its agent during an episode
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the environment of a plan.
 
         Args:
             plan: The plan.
-            session: The simulation that it reads; None: one of its own.
+            session: The simulation to use. None: a new one.
 
         Raises:
-            ViewError: Not just one agent is active, or its name is only known when it decides.
+            ViewError: There is not exactly one active agent, or its name is unknown until it decides.
             SimEnvError: Something else in the plan cannot work.
         """
         super().__init__(plan, session)
@@ -51,11 +51,11 @@ class SimulationEnv(OneAgentView):
 
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Make sure that a plan allows this view.
+        """Check that a plan allows this view.
 
         Raises:
             UnknownOptionError: An option is given that only another view takes.
-            ViewError: It does not allow the view.
+            ViewError: The plan does not allow the view.
         """
         super().check(plan)
         if plan.one_agent is None:
@@ -70,16 +70,16 @@ class SimulationEnv(OneAgentView):
         """Reset the simulation and run it to its first decision.
 
         Args:
-            seed: Seeds the environment's generator and its spaces, and is what the simulation's ``reset``
-                gets. None: the simulation gets a seed drawn from the generator.
-            options: Handed to the simulation's ``reset``, where that takes them.
+            seed: The seed for the environment's generator, its spaces, and the simulation's ``reset``. None: the
+                simulation gets a seed from the environment's generator.
+            options: Options for the simulation's ``reset``, if it takes them.
 
         Returns:
             The observation and the info.
 
         Raises:
             NoDecisionError: The simulation ended without a decision.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         with self._session.claimed():
             episode = self._begin(seed, options, When.DECISION)
@@ -93,18 +93,18 @@ class SimulationEnv(OneAgentView):
         """Answer the pending decision and run to the next one.
 
         Args:
-            action: In the action space, or ``RULE``.
+            action: An action in the action space, or ``RULE``.
 
         Returns:
-            Observation, reward (a python float), terminated, truncated, info.
+            Observation, reward (a Python float), terminated, truncated, info.
 
         Raises:
-            InvalidActionError: The action is not legal. The environment stands where it stood.
-            ResetNeededError: There is no episode to go on with.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            InvalidActionError: The action is not legal. The environment does not change.
+            ResetNeededError: There is no running episode.
+            BaseException: Any exception of the model, a mapping or a policy.
         """
         claim = self._session.claim
-        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
+        if claim is not None and not claim.held:  # results are read under the claim, too
             with claim:
                 return SimulationEnv.step(self, action)
         episode = self._session.episode
@@ -134,9 +134,9 @@ class SimulationEnv(OneAgentView):
 
 
 class SimulationGoalEnv(SimulationEnv):
-    """A single view whose observations tell the goal that was achieved and the one that is desired.
+    """A goal-based single view.
 
-    Made where the decision point has a ``goal_space``. Its observation space is a ``Dict`` of ``observation``,
+    Made if the decision point has a ``goal_space``. Its observation space is a ``Dict`` of ``observation``,
     ``achieved_goal`` and ``desired_goal``.
     """
 
@@ -152,15 +152,15 @@ class SimulationGoalEnv(SimulationEnv):
         self._made_of = plan
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:
-        """What the rewards had been, had these been the goals.
+        """Return the rewards for other goals.
 
         Args:
-            achieved_goal: Of shape ``goal_space.shape``, or ``(n, *goal_space.shape)`` of n steps.
-            desired_goal: The same.
-            info: The info of the step, or a sequence of n.
+            achieved_goal: The achieved goals, of shape ``goal_space.shape``, or ``(n, *goal_space.shape)`` for n steps.
+            desired_goal: The desired goals, of the same shape.
+            info: The info of the step, or a sequence of n infos.
 
         Returns:
-            The reward, or an array of n.
+            The reward, or an array of n rewards.
         """
         compute = self._definition.compute_reward
         assert compute is not None
@@ -169,7 +169,7 @@ class SimulationGoalEnv(SimulationEnv):
 
 
 def with_goals(plan: Plan) -> Plan:
-    """The same plan, with observations that tell the goals of its one decision point."""
+    """Return the same plan with goals in the observations of its one decision point."""
     return plan.redefined(plan.active[0].point, _with_goals(plan.active[0].definition))
 
 
@@ -199,6 +199,6 @@ def _with_goals(definition: Definition) -> Definition:
 
 
 def single_view(plan: Plan) -> type[SimulationEnv]:
-    """Which of the single views a plan asks for."""
+    """Return the class of the single view for a plan."""
     SimulationEnv.check(plan)
     return SimulationEnv if plan.active[0].definition.goal_space is None else SimulationGoalEnv

@@ -1,4 +1,4 @@
-"""The vector view: many simulations of a kind, stepped together."""
+"""The vector view: many copies of a simulation, stepped together."""
 
 import weakref
 from collections.abc import Iterable, Sequence
@@ -31,14 +31,14 @@ from .workers import Workers
 class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     """Many simulations as one ``gymnasium.vector.VectorEnv``. Made by ``vector_env``.
 
-    It is ``gymnasium.vector.SyncVectorEnv`` over as many single (or joint) views, and tells the same step by step.
+    It behaves like ``gymnasium.vector.SyncVectorEnv`` with as many single (or joint) views, step by step.
 
     Attributes:
-        num_envs: How many simulations there are.
-        single_observation_space, single_action_space: The spaces of one of them.
-        observation_space, action_space: Those of all of them, batched.
-        metadata: As that of the view, with ``autoreset_mode``.
-        render_mode: What ``render`` returns of each.
+        num_envs: The number of simulations.
+        single_observation_space, single_action_space: The spaces of one simulation.
+        observation_space, action_space: The batched spaces of all simulations.
+        metadata: The metadata of the view, with ``autoreset_mode``.
+        render_mode: The render mode of each simulation.
         closed: Whether it was closed.
     """
 
@@ -55,10 +55,10 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         """Make the environment of a recipe; the other arguments are those of ``vector_env``.
 
         Raises:
-            SimEnvError: Something in it cannot work; the leaf says what.
+            SimEnvError: Something cannot work. The subclass tells what.
         """
         super().__init__()
-        self.closed = True  # as long as it is not made; older versions of Gymnasium close what is dropped half made
+        self.closed = True  # until it is made: older versions of Gymnasium close half-made environments
         self.num_envs = _count(num_envs, "num_envs", 1)
         workers = _count(workers, "workers", 0)
         self._mode = _mode(autoreset_mode)
@@ -90,22 +90,22 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset all simulations, or some, and run them to their first decisions.
+        """Reset all simulations, or some of them, and run them to their first decisions.
 
         Args:
-            seed: An integer: the simulations get ``seed``, ``seed + 1``, ...; a sequence: each gets its own (or None);
-                None: each draws one from its own generator.
-            options: Handed to the simulations' ``reset``, where that takes them, but for ``"reset_mask"``: a bool
-                array of shape ``(num_envs,)`` that says which of them to reset.
+            seed: An integer: the simulations get ``seed``, ``seed + 1``, ... A sequence: each simulation gets its own
+                seed (or None). None: each simulation draws a seed from its own generator.
+            options: Options for the simulations' ``reset``, if it takes them. ``"reset_mask"``, a bool array of shape
+                ``(num_envs,)``, selects the simulations to reset.
 
         Returns:
-            The observations of all and the infos of those that were reset.
+            The observations of all simulations, and the infos of those that were reset.
 
         Raises:
-            OptionValueError: The seeds or the mask are not as they should be.
+            OptionValueError: The seeds or the mask are invalid.
             ClosedError: The environment is closed.
-            BaseException: Whatever a simulation or a mapping raises, with a note that says which. All are then to be
-                reset; where one raises, those after it have not been.
+            BaseException: Any exception of a simulation or a mapping, with a note that names the simulation. Then all
+                of them need a reset; the ones after it have not been reset.
         """
         self._enter()
         try:
@@ -124,17 +124,17 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         """Answer the pending decision of each simulation and run it to its next one.
 
         Args:
-            actions: A batch of the action space. What stands in it for simulations that are now reset is not used.
+            actions: A batch of the action space. The actions of simulations that are reset by this step are not used.
 
         Returns:
-            Observations, rewards (float64), terminations and truncations (bool), each of shape ``(num_envs, ...)``,
-            and infos.
+            Observations, rewards (float64), terminations and truncations (bool), each of shape ``(num_envs, ...)``, and
+            infos.
 
         Raises:
-            InvalidActionError: An action is not legal; it says of which simulation. None of them has moved.
-            ResetNeededError: There is no episode to go on with.
-            BaseException: Whatever a simulation or a mapping raises, with a note that says which. All are then to be
-                reset.
+            InvalidActionError: An action is not legal; the message names the simulation. None of them has moved.
+            ResetNeededError: There is no running episode.
+            BaseException: Any exception of a simulation or a mapping, with a note that names the simulation. Then all
+                of them need a reset.
         """
         self._enter()
         try:
@@ -184,7 +184,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         return seeds
 
     def _chosen(self, options: dict[str, Any] | None) -> tuple[list[int], dict[str, Any] | None]:
-        """Which simulations are to be reset, and with which options."""
+        """Return the simulations to reset, and the options for them."""
         numbers = list(range(self.num_envs))
         if options is None or "reset_mask" not in options:
             return numbers, options
@@ -204,23 +204,23 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def envs(self) -> list[OneAgentView]:
-        """The Gymnasium environments of the simulations, in their order."""
+        """The Gymnasium environments of the simulations, in order."""
         return list(self._crew.views)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each sub-environment, or get its attribute.
 
         Args:
-            name: Its name: an attribute of a single (or joint) view, such as ``simulation``.
-            *args: What it is called with.
-            **kwargs: What it is called with by keyword.
+            name: The name of a method or attribute of a single (or joint) view, such as ``simulation``.
+            *args: The positional arguments of the method.
+            **kwargs: The keyword arguments of the method.
 
         Returns:
-            What each returns.
+            A tuple of the results.
 
         Raises:
             ClosedError: The environment is closed.
-            BaseException: What a sub-environment raises.
+            BaseException: Any exception of a sub-environment.
         """
         self._enter()
         try:
@@ -229,15 +229,15 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             self._moving.release()
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """The attribute of that name of each sub-environment."""
+        """Return an attribute of each sub-environment, as a tuple."""
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute of each sub-environment.
 
         Args:
-            name: Its name.
-            values: A list or tuple of a value for each; or one value for all.
+            name: The name of the attribute.
+            values: A list or tuple with one value for each sub-environment, or a single value for all of them.
 
         Raises:
             OptionValueError: There are more or fewer values than sub-environments.
@@ -259,19 +259,19 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     @property
     def np_random_seed(self) -> Any:
-        """What the generators of the sub-environments were seeded with, as a tuple."""
+        """The seeds of the sub-environments' generators, as a tuple."""
         return self.get_attr("np_random_seed")
 
     def render(self) -> tuple[Any, ...]:
-        """Render each simulation in ``render_mode``; without one, a tuple of None and a warning."""
+        """Render each simulation in ``render_mode``. Without a render mode, warn and return a tuple of None."""
         return self.call("render")
 
     def close(self, **kwargs: Any) -> None:
         """Unwind all simulations. The environment cannot be used any more.
 
         Raises:
-            ReentrancyError, WrongThreadError: It cannot be closed from here, and goes on.
-            BaseException: What the first simulation raises while it unwinds; all are unwound nevertheless.
+            ReentrancyError, WrongThreadError: It cannot be closed from here, and stays open.
+            BaseException: The exception of the first simulation that fails to unwind; all others are unwound, too.
         """
         if self.closed:
             return
@@ -285,12 +285,12 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 self._finalizer.detach()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Refuse to be copied or pickled: the stacks of simulations cannot be."""
+        """Refuse to be copied or pickled, since the stacks of simulations cannot be."""
         raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
 
 
 def _merged(told: Iterable[tuple[int, Any]], number: int) -> dict[str, Any]:
-    """The infos of many as one: what ``VectorEnv._add_info`` makes of them one by one, but a key at a time."""
+    """Merge the infos of many simulations, as ``VectorEnv._add_info`` does one by one, but key by key."""
     columns: dict[str, tuple[list[int], list[Any]]] = {}
     for index, info in told:
         for key, value in info.items():

@@ -1,4 +1,4 @@
-"""The calls of a simulator's decision points, as mappings see them, and the functions that stand for the points."""
+"""The calls of a simulator's decision points, as mappings see them, and the functions that represent the points."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from ..simulation import RULE
 
 
 class RemoteCall:
-    """An entity's latest call of a decision point: what mappings, ``agent`` and ``apply`` get.
+    """An entity's latest call of a decision point: the argument of mappings, ``agent`` and ``apply``.
 
-    The call's arguments are its attributes and items: ``call.level``, ``call["queue-length"]``. Of one entity at one
-    point it is one object, which changes from call to call; a copy of it does not.
+    The call's arguments are its attributes and items: ``call.level``, ``call["queue-length"]``. Each entity at a point
+    has one object, which changes from call to call. A copy of it does not change.
 
     Attributes:
         point: The name of the decision point.
-        entity: Who decides, as the process names it; None where it names no entity.
-        time: The process's time; None where it tells none.
+        entity: The deciding entity, as the process names it; None if it names none.
+        time: The process's time; None if it tells none.
     """
 
     __slots__ = ("__dict__", "__weakref__", "entity", "point", "time")
@@ -47,7 +47,7 @@ class RemoteCall:
         return len(self.__dict__)
 
     def __getattr__(self, name: str) -> Any:
-        if name in RemoteCall.__slots__:  # of a copy that is being made
+        if name in RemoteCall.__slots__:  # a copy is being made
             raise AttributeError(name)
         raise AttributeError(
             f"the call of {self.point} has no argument {name!r}; it has {', '.join(self.__dict__) or 'none'}"
@@ -59,7 +59,7 @@ class RemoteCall:
 
 
 class Point(NamedTuple):
-    """What stands for a decision point of a simulator.
+    """The functions that represent a decision point of a simulator.
 
     Attributes:
         decide: Its decision function. Called with a ``RemoteCall``, it returns the decision, or ``RULE``.
@@ -72,7 +72,7 @@ class Point(NamedTuple):
 
 @cache
 def point_named(name: str) -> Point:
-    """The functions that stand for a decision point of that name, in all simulators."""
+    """Return the functions that represent decision points of that name, in all simulators."""
 
     def decide(call: RemoteCall) -> Any:
         return RULE
@@ -87,7 +87,7 @@ def point_named(name: str) -> Point:
 
 
 def _hook(function: Any, name: str) -> Hook:
-    """The hook of a function that is found by a name of its own."""
+    """Return the hook of a function that is found by a name of its own."""
     setattr(function, BY_NAME, name)
     function.__name__, function.__qualname__ = name.rpartition(".")[2], name
     hook = Hook(function, name)

@@ -1,7 +1,7 @@
-"""A simulator's process, and the lines that go to and fro.
+"""The process of a simulator, and the lines that are exchanged with it.
 
-Every wait has an end. What the process writes on its standard error is read whenever the process is waited for, so that
-it is not held up by it; the last of it stands in errors. The process leads a group of its own, which ends with it.
+Every wait has an end. The standard error of the process is read while the process is waited for, so that it never
+blocks; errors show the last part of it. The process leads a process group of its own, which ends with it.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from .wire import DESCRIPTORS, LONGEST, VERSION, decode
 CHUNK: Final = 1 << 16
 
 REMEMBERED: Final = 4096
-"""How many bytes of what it has last written on its standard error stand in errors."""
+"""The number of bytes of its standard error that errors show."""
 
 LONGEST_WAIT: Final = 3600.0
-"""For how many seconds is waited at once; ``poll`` takes no more than some weeks."""
+"""The longest wait at once, in seconds; ``poll`` takes no more than some weeks."""
 
 GRACE: Final = 2.0
-"""For how many seconds is waited for a process to end by itself."""
+"""The time in seconds that a process has to end by itself."""
 
 
 _ENTITIES: Final = (str, int, NoneType)
@@ -51,9 +51,9 @@ class _Process:
 
     Attributes:
         reading, writing: This side's ends of the two pipes.
-        stderr: Where its standard error is read.
-        last: What was last read there.
-        owner: The process that has started it.
+        stderr: The descriptor of its standard error.
+        last: The last part of its standard error.
+        owner: The id of the process that started it.
     """
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], cwd: Any) -> None:
@@ -71,7 +71,7 @@ class _Process:
                 pass_fds=(theirs_in, theirs_out),
                 env={**env, DESCRIPTORS: f"{theirs_in},{theirs_out}"},
                 cwd=cwd,
-                start_new_session=True,  # it and all that it starts can be ended; interrupts at a terminal are not its
+                start_new_session=True,  # so that its group can be ended, and a terminal's interrupts miss it
             )
         except BaseException:
             for end in ends:
@@ -85,7 +85,7 @@ class _Process:
             os.set_blocking(descriptor, False)
 
     def listen(self) -> bool:
-        """Read what is there of its standard error; return whether more may come."""
+        """Read its standard error; return whether more may come."""
         try:
             chunk = os.read(self.stderr, CHUNK)
         except BlockingIOError:
@@ -95,22 +95,22 @@ class _Process:
         return bool(chunk)
 
     def exit_code(self) -> int | None:
-        """With what it has exited, or minus the signal that has ended it; None as long as it runs.
+        """Return its exit code, or minus the signal that ended it; None while it runs.
 
-        It is not reaped: until then no other group can have its number.
+        The process is not reaped, so that no other group can get its number.
         """
         if self._popen.returncode is not None or not hasattr(os, "waitid"):
             return self._popen.poll()
         try:
             found = os.waitid(os.P_PID, self.number, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-        except ChildProcessError:  # something else in this process has reaped it
+        except ChildProcessError:  # other code in this process reaped it
             return self._popen.poll()
         if found is None:
             return None
         return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
 
     def wait(self, patience: float) -> int | None:
-        """Wait for its exit for so many seconds; return its exit code."""
+        """Wait for its exit, at most ``patience`` seconds; return its exit code."""
         deadline, pause = monotonic() + patience, 0.0005
         while (code := self.exit_code()) is None and monotonic() < deadline:
             self.listen()
@@ -125,10 +125,10 @@ class _Process:
             self.writing = -1
 
     def end(self, patience: float) -> None:
-        """Close its pipes, and end it and its group; in a fork of this process, let go of it.
+        """Close its pipes, and end it and its group; in a fork of this process, only let go of it.
 
         Args:
-            patience: For how many seconds it may take to end by itself.
+            patience: The time in seconds that it has to end by itself.
         """
         if self._ended:
             return
@@ -147,45 +147,45 @@ class _Process:
             self._popen.stderr.close()
 
     def _kill(self) -> None:
-        """End it and its group at once, and read the last that it wrote."""
-        with suppress(ProcessLookupError, PermissionError):  # there is none of the group left
+        """Kill it and its group at once, and read the rest of its standard error."""
+        with suppress(ProcessLookupError, PermissionError):  # the group is empty
             os.killpg(self.number, signal.SIGKILL)
         try:
             self._popen.wait(GRACE)
         except TimeoutExpired:
             warn_user(f"the process {self.number} was killed and has not ended yet", ResourceWarning)
-        for _ in range(REMEMBERED):  # others may still write, as those who have left the group
+        for _ in range(REMEMBERED):  # processes that left the group may still write
             before = bytes(self.last)
             if not self.listen() or self.last == before:
                 break
 
 
 class Child:
-    """A simulator in a process of its own, which speaks the wire.
+    """A simulator in a process of its own that speaks the wire protocol.
 
     Attributes:
         points: The names of its decision points.
-        can: What else it can, such as "reseed".
-        may_exit: Whether its episode is over, after which it may exit.
+        can: Its further abilities, such as "reseed".
+        may_exit: Whether its episode is over, so that it may exit.
     """
 
     def __init__(
         self, command: Sequence[str], timeout: float, env: Mapping[str, str] | None = None, cwd: Any = None
     ) -> None:
-        """Start it, and read what it says of itself.
+        """Start the process, and read its first frame.
 
         Args:
             command: The program and its arguments.
-            timeout: For how many seconds to wait for each line.
-            env: The environment variables that it sees; None: those of this process.
-            cwd: The folder in which it runs; None: that of this process.
+            timeout: The time to wait for each line, in seconds.
+            env: The environment variables of the process. None: those of this process.
+            cwd: The folder in which it runs. None: that of this process.
 
         Raises:
-            ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or does not speak as it should.
-            RemoteError: It says what has failed.
+            ProcessDiedError, ProcessTimeoutError, WireError: It does not start, or breaks the rules of the wire.
+            RemoteError: It reported an error.
         """
         self.timeout, self.may_exit = timeout, False
-        self._rest = b""  # of what was received: the lines that come next
+        self._rest = b""  # received bytes of the next lines
         try:
             self._process = _Process(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
@@ -197,7 +197,7 @@ class Child:
         self._poll.register(self._process.stderr, select.POLLIN)
         try:
             hello = self.receive()
-        except BaseException:  # also an interrupt
+        except BaseException:  # an interrupt, too
             self.end(patience=0.0)
             raise
         version, points, can = hello.get("hello"), hello.get("points"), hello.get("can", [])
@@ -221,7 +221,7 @@ class Child:
         Raises:
             ProcessDiedError: The process has ended, or has closed its pipe.
             ProcessTimeoutError: Nothing came.
-            WireError: It has sent something else than a frame.
+            WireError: It sent something that is not a frame.
         """
         line = complete = self._rest
         if line:
@@ -234,7 +234,7 @@ class Child:
             self.fail(WireError(f"{self} has sent {error}"))
 
     def _completed(self, line: bytes) -> bytes:
-        """Wait for the rest of a line, of which this is the beginning."""
+        """Wait for the rest of a line, given its beginning."""
         parts, length, reading, begun = [line], len(line), self._process.reading, monotonic()
         while True:
             self._wait(reading, begun, "half a line" if length else "nothing")
@@ -245,14 +245,14 @@ class Child:
             length += len(part)
             if length >= LONGEST:
                 self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
-            if length == len(part) and complete:  # as most lines, in one piece
+            if length == len(part) and complete:  # most lines come in one piece
                 return part
             parts.append(part)
             if complete:
                 return b"".join(parts)
 
     def check_silent(self) -> None:
-        """Make sure that it has sent nothing, where nothing is due.
+        """Check that it has sent nothing when nothing is due.
 
         Raises:
             WireError, RemoteError: It has sent a frame.
@@ -263,10 +263,10 @@ class Child:
             self.refuse(frame, f"has sent {shown(frame)} before the start of an episode")
 
     def check_named(self, frame: Mapping[str, Any], entity: Any) -> tuple[str, float | None]:
-        """The point and the time of a frame that names an entity.
+        """Return the point and the time of a frame that names an entity.
 
         Raises:
-            WireError: They, the entity or the frame's arguments are none.
+            WireError: The point, the time, the entity or the arguments are invalid.
         """
         name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
         if not isinstance(name, str) or name not in self.points:
@@ -275,17 +275,17 @@ class Child:
             self.fail(WireError(f"{self} has named {shown(entity)} at {name}; an entity is a string or an integer"))
         if arguments is not None and not isinstance(arguments, dict):
             self.fail(WireError(f"{self} has sent args for {name} that are no object: {shown(arguments)}"))
-        if type(time) is int and abs(time) < 1 << 1000:  # a float has no larger ones
+        if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
             time = float(time)
         if type(time) not in _TIMES:
             self.fail(WireError(f"{self} has sent the time {shown(time)} for {name}, which is no number"))
         return name, time
 
     def check_end(self, end: Any) -> None:
-        """Make sure that an end is one.
+        """Check an "end" frame.
 
         Raises:
-            WireError: It is none.
+            WireError: It is invalid.
         """
         if not isinstance(end, dict):
             self.fail(WireError(f'{self} has sent the end {shown(end)}; it is an object with "truncated" and "result"'))
@@ -293,7 +293,7 @@ class Child:
     def send(self, lines: bytes) -> None:
         """Send lines.
 
-        Where the process has gone, nothing comes of it: ``receive`` tells, for it may have said why.
+        If the process is gone, nothing happens here: ``receive`` raises the error, which may have the reason.
 
         Raises:
             ProcessTimeoutError: It does not read.
@@ -315,11 +315,11 @@ class Child:
                 self._wait(process.writing, begun, "nothing, and does not read")
                 self._poll.unregister(process.writing)
                 self._poll.register(process.reading, select.POLLIN)
-            except OSError as error:  # its input is closed, and has no number any more
+            except OSError as error:  # its input is closed
                 raise ProcessDiedError(f"{self} was ended") from error
 
     def _wait(self, descriptor: int, begun: float, sent: str) -> None:
-        """Wait until a descriptor is ready; read what comes on standard error meanwhile."""
+        """Wait until a descriptor is ready; read standard error meanwhile."""
         found = False
         while not found:
             left = begun + self.timeout - monotonic()
@@ -328,32 +328,32 @@ class Child:
                     found = True
                 elif not self._process.listen():
                     self._poll.unregister(which)
-            if left <= 0:  # also for what comes drop by drop
+            if left <= 0:  # even if data keeps trickling in
                 self.fail(ProcessTimeoutError(f"{self} {self._state()}; it has sent {sent} for {self.timeout:g} s"))
 
     # -- ends -------------------------------------------------------------------------------------
 
     @property
     def usable(self) -> bool:
-        """Whether it was not ended, and is no other process's."""
+        """Whether it was not ended and belongs to this process."""
         return self._finalizer.alive and self._process.owner == os.getpid()
 
     def exit_code(self) -> int | None:
-        """With what it has exited, or minus the signal that has ended it; None as long as it runs."""
+        """Return its exit code, or minus the signal that ended it; None while it runs."""
         return self._process.exit_code()
 
     def close_input(self) -> None:
-        """Close its input; what it sends can still be received."""
+        """Close its input; its output can still be received."""
         self._process.close_input()
 
     def fail(self, error: SimEnvError) -> NoReturn:
-        """End the process at once, and raise an error, with the last that it wrote on its standard error."""
+        """End the process at once, and raise an error with the last part of its standard error."""
         self.end(patience=0.0)
         text = self._process.last.decode(errors="replace").strip()
         raise type(error)(f"{error}. The last that it wrote on its standard error:\n{text}" if text else str(error))
 
     def refuse(self, frame: Mapping[str, Any], what: str) -> NoReturn:
-        """Raise the error that it tells, or say that a frame is none, or not due."""
+        """Raise the error that a frame reports, or say that the frame is invalid or not due."""
         error = frame.get("error")
         if not isinstance(error, dict):
             self.fail(WireError(f"{self} {what}"))
@@ -362,16 +362,16 @@ class Child:
         self.fail(RemoteError(f"the model in {self} has raised {kind or 'an error'}: {text}{where}"))
 
     def end(self, patience: float = GRACE) -> None:
-        """Close its pipes, and end it and all that it has started.
+        """Close its pipes, and end it and all processes that it started.
 
         Args:
-            patience: For how many seconds it may take to end by itself.
+            patience: The time in seconds that it has to end by itself.
         """
         self._finalizer.detach()
         self._process.end(patience)
 
     def _died(self, *, half: bool) -> NoReturn:
-        """Raise the error of a process that has closed its pipe, maybe in the middle of a line."""
+        """Raise the error for a process that closed its pipe, maybe within a line."""
         self._process.wait(GRACE)
         where = " in the middle of a line" if half else ""
         self.fail(ProcessDiedError(f"{self} has closed its pipe{where}, and {self._state()}"))

@@ -1,4 +1,4 @@
-"""Processes that are kept while many simulations run one after the other, each for the next one that is made alike."""
+"""Keeps processes while many simulations run one after the other, to reuse them for equal simulations."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from weakref import ref
 from .child import Child
 
 Kept = dict[Hashable, list[Child]]
-"""By how they were started."""
+"""Kept processes, by the arguments that started them."""
 
 
 class processes_kept:  # noqa: N801 - it is used as a function
-    """Keep the processes of simulations that are closed for those that begin, up to the end of the block.
+    """Keep the processes of closed simulations for new ones, until the end of the block.
 
-    To start a process takes longer than many an episode. Within another such block it does nothing.
+    Starting a process often takes longer than an episode. Within another such block this does nothing.
     """
 
     __slots__ = ("__weakref__", "_token", "kept")
@@ -34,14 +34,14 @@ class processes_kept:  # noqa: N801 - it is used as a function
             return
         _BLOCK.reset(self._token)
         children = [child for alike in self.kept.values() for child in alike]
-        for child in children:  # first, so that they end side by side
+        for child in children:  # first for all of them, so that they end at the same time
             child.close_input()
         for child in children:
             child.end()
 
 
 _BLOCK: Final[ContextVar[ref[processes_kept] | None]] = ContextVar("simenv_marl.processes_kept", default=None)
-"""The block. Weak: an interrupt may come before a block is entered, and it is never left then."""
+"""The current block. Weak: after an interrupt before it was entered, a block is never left."""
 
 
 def _block() -> processes_kept | None:
@@ -50,7 +50,7 @@ def _block() -> processes_kept | None:
 
 
 def keep(key: Hashable, child: Child) -> bool:
-    """Keep a process, if such are kept here; return whether it is."""
+    """Keep a process if a block is active; return whether it is kept."""
     block = _block()
     if block is None or not child.usable:
         return False
@@ -59,7 +59,7 @@ def keep(key: Hashable, child: Child) -> bool:
 
 
 def take(key: Hashable) -> Child | None:
-    """A process that was started like that and has been kept; None where there is none."""
+    """Return a kept process that was started in the same way; None if there is none."""
     block = _block()
     alike = [] if block is None else block.kept.get(key, [])
     while alike:

@@ -28,16 +28,16 @@ from .wire import STOP, answer, encode
 
 
 class _Link:
-    """The process of a simulation, and how far it is in its episode. Never copied.
+    """The process of a simulation, and the state of its episode. Never copied.
 
     Attributes:
-        child: The process; None as long as none was started.
+        child: The process; None until one was started.
         state: "idle" between episodes, "waits" for the answer to a call, "busy" with its model, or "stopped".
-        first: The first frame of an episode that was begun and does not run yet.
-        number: Of the latest call.
-        calls: By point and entity, the latest call.
-        time: The latest time that was told; None where none was.
-        seed: With which it is to draw anew before it goes on; None: it is not to.
+        first: The first frame of an episode that has begun and does not run yet.
+        number: The number of the latest call.
+        calls: The latest call of each entity at each point.
+        time: The latest time of the process; None if it told none.
+        seed: The seed with which it has to reseed before it goes on; None if it need not.
     """
 
     __slots__ = ("calls", "child", "first", "number", "seed", "state", "time")
@@ -56,35 +56,36 @@ class _Link:
         if first is not None:
             self.state = "waits" if "decide" in first else "idle" if "end" in first else "busy"
             if type(first.get("time")) in (float, int):
-                with suppress(OverflowError):  # which is told of where the frame is read
+                with suppress(OverflowError):  # reported when the frame is read
                     self.time = float(first["time"])
 
     def break_off(self) -> None:
-        """End the episode, if one goes on: the process unwinds where it waits, and is ended where it is busy."""
+        """End a running episode: a waiting process unwinds, a busy one is ended."""
         child, state = self.child, self.state
         if child is None or not child.usable:
             return
         if state == "waits":
             self.state, child.may_exit = "stopped", True
-            with suppress(SimEnvError):  # it is ended then, and the next episode begins in a new one
+            with suppress(SimEnvError):  # it is ended then, and the next episode starts a new one
                 child.send(STOP)
         elif state == "busy":
             child.end(patience=0.0)
 
 
 class ProcessSimulation(SimulationInterface):
-    """A simulation whose model runs in a process of its own (POSIX), in whatever language.
+    """A simulation whose model runs in a process of its own (POSIX), in any language.
 
-    The process is started by the first ``reset``, plays one episode after the other, and is ended when the environment
-    is closed, or gone. It calls for decisions in its own order. What is left to ``RULE`` it decides itself.
+    The first ``reset`` starts the process. It plays one episode after the other, and is ended when the environment is
+    closed or garbage-collected. It calls for decisions in its own order. Decisions that are left to ``RULE`` it takes
+    itself.
 
-    Mappings, ``agent`` and ``apply`` get one object for each entity at a point: the call's arguments are its attributes
-    and items (``call.level``, ``call["queue-length"]``), ``entity`` and ``time`` besides. What ``apply`` returns is
-    sent as the decision; ``RULE`` leaves it to the process.
+    Mappings, ``agent`` and ``apply`` get one object for each entity at a point. The call's arguments are its attributes
+    and items (``call.level``, ``call["queue-length"]``); it also has ``entity`` and ``time``. The result of ``apply``
+    is sent as the decision; ``RULE`` leaves it to the process.
 
     Attributes:
         points: The decision points with their definitions.
-        result: What the process has told at the end of the latest episode; None before.
+        result: The result that the process sent at the end of the latest episode; None before.
     """
 
     def __init__(
@@ -96,20 +97,20 @@ class ProcessSimulation(SimulationInterface):
         env: Mapping[str, str] | None = None,
         cwd: str | os.PathLike[str] | None = None,
     ) -> None:
-        """Say how the process is started, and what is decided in it.
+        """Define how the process is started, and its decision points.
 
         Args:
-            command: The program and its arguments; a program without arguments may stand alone.
-            points: From the process's name of a decision point, which serves wherever a dotted name does, to its
-                definition. At points that are not named here the process decides by its own rule.
-            timeout: For how many seconds to wait for each line of the process, and for it to read what it is sent.
-            env: The environment variables that the process sees; None: those of this process.
-            cwd: The folder in which it runs; None: that of this process.
+            command: The program and its arguments; a program without arguments may be given as a string.
+            points: A dict from the process's name of a decision point to its definition. The name can be used wherever
+                a dotted name can. At points that are not in the dict, the process follows its own rule.
+            timeout: The time to wait for each line of the process, and for it to read a message, in seconds.
+            env: The environment variables of the process. None: those of this process.
+            cwd: The folder in which it runs. None: that of this process.
 
         Raises:
-            OptionValueError: The command or the timeout cannot be such.
-            DefinitionError: The points are no dict from names to definitions.
-            ProcessError: The platform is none of POSIX.
+            OptionValueError: The command or the timeout is invalid.
+            DefinitionError: ``points`` is not a dict from names to definitions.
+            ProcessError: The platform is not POSIX.
         """
         if os.name != "posix":
             raise ProcessError("ProcessSimulation needs POSIX: a process elsewhere gets no descriptors")
@@ -132,16 +133,16 @@ class ProcessSimulation(SimulationInterface):
     # -- episodes ---------------------------------------------------------------------------------
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        """Begin an episode: in the process that there is, or in a new one.
+        """Begin an episode, in the existing process or in a new one.
 
         Args:
-            seed: What the process is to seed its generators with.
-            options: What it is to know of the episode besides; JSON.
+            seed: The seed for the process's generators.
+            options: Further data for the episode, as JSON data.
 
         Raises:
-            WireError: The options are no JSON, and nothing was sent; or the process does not speak as it should.
+            WireError: The options are not JSON data, and nothing was sent; or the process breaks the rules of the wire.
             ProcessDiedError, ProcessTimeoutError: It does not start, or does not answer.
-            UnknownPointError: It does not have the points that were named.
+            UnknownPointError: It does not have the named points.
         """
         start = encode({"start": {"seed": seed, "options": options or {}}})
         self.result, link = None, self._link
@@ -160,12 +161,12 @@ class ProcessSimulation(SimulationInterface):
         self._begin(link.child, start)
 
     def _alike(self) -> tuple[Any, ...]:
-        """What processes have in common that may stand for one another."""
+        """Return the values that are equal for processes that can replace each other."""
         env = None if self.env is None else tuple(sorted(self.env.items()))
         return tuple(self.command), self.timeout, env, self.cwd
 
     def _begin(self, child: Child, start: bytes) -> None:
-        """Send the line of a start, and wait for what comes first."""
+        """Send the line that starts an episode, and wait for the first frame."""
         link = self._link
         stopped, link.state = link.state == "stopped", "busy"
         try:
@@ -185,14 +186,14 @@ class ProcessSimulation(SimulationInterface):
             raise
 
     def run(self) -> Any:
-        """Have the process run through the episode; its calls are those of the points' decision functions.
+        """Run the episode in the process; its calls become calls of the points' decision functions.
 
         Returns:
-            ``TRUNCATED`` where the process says that the end is a limit of time; else None.
+            ``TRUNCATED`` if the process reports a time limit; else None.
 
         Raises:
-            RemoteError: The model has raised an error.
-            WireError: The process does not speak as it should, or a decision is no JSON.
+            RemoteError: The model raised an error.
+            WireError: The process breaks the rules of the wire, or a decision is not JSON data.
             ProcessDiedError, ProcessTimeoutError: It has ended, or does not answer.
             SimulationError: No episode was begun.
         """
@@ -223,7 +224,7 @@ class ProcessSimulation(SimulationInterface):
         """End the process, if no other episode follows.
 
         Args:
-            last: Whether none does.
+            last: Whether no other episode follows.
         """
         link = self._link
         if last and link.child is not None:
@@ -234,17 +235,17 @@ class ProcessSimulation(SimulationInterface):
 
     @property
     def time(self) -> Callable[[], float]:
-        """A method that returns the process's time; not there where the process tells none."""
+        """A method that returns the process's time. The attribute is missing if the process tells no time."""
         link = self._link
         if link.time is None:
             raise AttributeError("the process tells no time")
         return lambda: link.time  # type: ignore[return-value]
 
     def reseed(self, seed: int) -> None:
-        """Have the process draw anew what it leaves to chance from here on.
+        """Ask the process to reseed its generators, so that it draws new random numbers from here on.
 
         Raises:
-            BranchError: It has not said that it can.
+            BranchError: The process did not announce "reseed".
         """
         child = self._link.child
         if child is None or "reseed" not in child.can:
@@ -254,7 +255,7 @@ class ProcessSimulation(SimulationInterface):
     # -- frames -----------------------------------------------------------------------------------
 
     def _answered(self, child: Child, frame: dict[str, Any], functions: dict[str, Any]) -> bytes:
-        """Have a call decided; return the lines that answer it."""
+        """Get the decision of a call; return the lines that answer it."""
         link, number = self._link, frame["decide"]
         if type(number) is not int or number != link.number + 1:
             child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
@@ -282,7 +283,7 @@ class ProcessSimulation(SimulationInterface):
         return encode({"reseed": seed}) + line
 
     def _update(self, child: Child, frame: dict[str, Any]) -> None:
-        """Note what the arguments of an entity's latest call would be by now."""
+        """Update the arguments of an entity's latest call."""
         call = self._link.calls.get(self._named(child, frame, frame["update"]))
         if call is not None:
             call.__dict__, call.time = frame.get("args") or {}, self._link.time
@@ -294,14 +295,14 @@ class ProcessSimulation(SimulationInterface):
             point_named(call.point).remove(call)
 
     def _named(self, child: Child, frame: dict[str, Any], entity: Any) -> tuple[str, Any]:
-        """The point and the entity of a frame, whose time is noted."""
+        """Return the point and the entity of a frame, and record its time."""
         name, time = child.check_named(frame, entity)
         if time is not None:
             self._link.time = time
         return name, entity
 
     def _end(self, child: Child, end: Any) -> Any:
-        """Note the end of the episode."""
+        """Record the end of the episode."""
         child.check_end(end)
         self._link.state, child.may_exit = "idle", True
         self.result = end.get("result")
@@ -312,10 +313,10 @@ class ProcessSimulation(SimulationInterface):
 
 
 def _words(command: Any) -> list[str]:
-    """The program and its arguments.
+    """Return the program and its arguments.
 
     Raises:
-        OptionValueError: They are no such.
+        OptionValueError: They are invalid.
     """
     words = [command] if isinstance(command, (str, os.PathLike)) else command
     if not isinstance(words, Sequence) or not words or not all(isinstance(word, (str, os.PathLike)) for word in words):
@@ -324,10 +325,10 @@ def _words(command: Any) -> list[str]:
 
 
 def _by_function(points: Any) -> dict[Any, Definition]:
-    """The definitions of the decision functions of a dict's names.
+    """Return the definitions by the decision functions of their names.
 
     Raises:
-        DefinitionError: It is no dict from names to definitions.
+        DefinitionError: ``points`` is not a dict from names to definitions.
     """
     if not isinstance(points, Mapping) or not points:
         raise DefinitionError(f"points must be a dict from the process's names to definitions, not {shown(points)}")

@@ -1,7 +1,7 @@
-"""The wire between an environment and a simulator in another process: one JSON object a line, version 1.
+"""The wire between an environment and a simulator in another process: one JSON object per line, version 1.
 
-What Python's ``json`` reads and writes is narrowed down to what every language can: keys are strings, and numbers that
-are not finite travel as ``{"float": "nan"}``, ``{"float": "inf"}`` and ``{"float": "-inf"}``.
+It only uses what every language can represent: keys are strings, and numbers that are not finite are sent as
+``{"float": "nan"}``, ``{"float": "inf"}`` and ``{"float": "-inf"}``.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from ..simulation import RULE
 VERSION: Final = 1
 
 DESCRIPTORS: Final = "SIMENV_MARL_FDS"
-"""The environment variable in which a simulator finds the numbers of its two descriptors, ``"R,W"``."""
+"""The environment variable that has the numbers of a simulator's two descriptors, ``"R,W"``."""
 
 LONGEST: Final = 16 << 20
-"""How many bytes a line may have."""
+"""The largest number of bytes in a line."""
 
 NOT_FINITE: Final = {"nan": nan, "inf": inf, "-inf": -inf}
 
@@ -30,10 +30,10 @@ STOP: Final = b'{"stop":true}\n'
 
 
 def encode(frame: Mapping[str, Any]) -> bytes:
-    """The line of a frame.
+    """Return the line of a frame.
 
     Raises:
-        WireError: Something in it cannot travel, or it is too long.
+        WireError: Something in it cannot be sent, or it is too long.
     """
     try:
         line = _ENCODER.encode(sendable(frame)).encode() + b"\n"
@@ -47,10 +47,10 @@ def encode(frame: Mapping[str, Any]) -> bytes:
 
 
 def answer(number: int, value: Any) -> bytes:
-    """The line that answers a call.
+    """Return the line that answers a call.
 
     Args:
-        number: Of the call.
+        number: The number of the call.
         value: The decision; ``RULE`` leaves it to the process.
 
     Raises:
@@ -58,7 +58,7 @@ def answer(number: int, value: Any) -> bytes:
     """
     if value is RULE:
         return b'{"act":%d,"rule":true}\n' % number
-    if type(value) is int:  # what most decisions are takes no walk through the value
+    if type(value) is int:  # most decisions are integers, which need no conversion
         return b'{"act":%d,"value":%d}\n' % (number, value)
     if type(value) is float and value - value == 0.0:
         return b'{"act":%d,"value":%a}\n' % (number, value)
@@ -66,14 +66,14 @@ def answer(number: int, value: Any) -> bytes:
 
 
 def sendable(value: Any, where: str = "") -> Any:
-    """A value made of what JSON has: arrays become lists, and numbers that are not finite become objects.
+    """Convert a value to JSON data: arrays become lists, and numbers that are not finite become objects.
 
     Args:
         value: Numbers, strings, booleans, None, arrays, lists, tuples, and dicts with strings as keys.
-        where: Where it stands in the frame, for the error.
+        where: The path in the frame, for the error.
 
     Raises:
-        WireError: Something else is in it.
+        WireError: It contains something else.
     """
     if value is None or isinstance(value, (str, bool, int)):
         return value
@@ -98,10 +98,10 @@ def _at(where: str) -> str:
 
 
 def decode(line: bytes) -> dict[str, Any]:
-    """The frame of a line.
+    """Return the frame of a line.
 
     Raises:
-        WireError: It is no JSON object in UTF-8.
+        WireError: The line is not a JSON object in UTF-8.
     """
     try:
         text = line.decode()
@@ -117,7 +117,7 @@ def decode(line: bytes) -> dict[str, Any]:
 
 
 def _number(found: dict[str, Any]) -> Any:
-    """What an object stands for: itself, or a number that is not finite."""
+    """Return the non-finite number that an object represents, or the object itself."""
     name = found.get("float")
     return NOT_FINITE.get(name, found) if len(found) == 1 and isinstance(name, str) else found
 

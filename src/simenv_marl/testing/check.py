@@ -28,7 +28,7 @@ CHECKS: Final[tuple[Callable[[Subject, Report], None], ...]] = (
     check_conformance,
     check_timing,
 )
-"""All checks, the more basic first: where the plain run already fails, the others are left out."""
+"""All checks, the more basic first: if the plain run fails, the others are left out."""
 
 
 TOLD: Final = {
@@ -36,7 +36,7 @@ TOLD: Final = {
     "several objects decide at": "shared_agent",
     "did not appear in the episode": "absent_agents",
 }
-"""What stands in the warnings of environments, and the finding that says the same."""
+"""Texts in the warnings of environments, and the findings that say the same."""
 
 
 def check_simulation(
@@ -50,29 +50,30 @@ def check_simulation(
     fingerprint: Callable[[Any], Any] | None = None,
     **options: Unpack[CheckOptions],
 ) -> CheckReport:
-    """Check all that is to be known of a simulation before its environments are trusted.
+    """Check a simulation before its environments are used.
 
-    Compared are plain runs with ``RULE`` throughout in every view that fits, episodes of the same seed in new and used
-    environments and side by side, and observations with their spaces; PettingZoo's and Gymnasium's own tests are run.
-    Whatever the model raises is a finding. Python's and NumPy's global generators are left as they were.
+    The checks compare plain runs with runs of ``RULE`` throughout in every view that fits; episodes of the same seed in
+    new and used environments and side by side; and observations with their spaces. They run PettingZoo's and
+    Gymnasium's own tests. Every exception of the model is a finding. Python's and NumPy's global generators are left as
+    they were.
 
     Args:
         simulation: A simulation (which is copied), its class, or a zero-argument factory.
         points: The active decision points, as ``generate_env`` takes them.
-        seeds: With which seeds plain runs are compared; at least one.
-        episodes: How many episodes of random legal actions are played.
-        max_steps: After how many decisions a run is cut, so that models that never end can be checked as well.
-        time_limit: For about how many seconds to check at most; a single run may take a quarter of it. Running
-            Python code is interrupted; what waits outside of Python (in a sleep, say) is not.
-        fingerprint: What a simulation is compared by after a run: a callable of it that returns numbers, arrays,
-            strings, or containers of these. None: its ``state()``, or else all its attributes.
-        **options: Options of the environments, as ``aec_env`` takes them.
+        seeds: The seeds of plain runs that are compared; at least one.
+        episodes: The number of episodes of random legal actions.
+        max_steps: The number of decisions after which a run is cut, so that models that never end can be checked, too.
+        time_limit: The approximate limit for all checks, in seconds; a single run may take a quarter of it. Running
+            Python code is interrupted; waiting outside of Python (in a sleep, for example) is not.
+        fingerprint: What simulations are compared by after a run: a callable of the simulation that returns numbers,
+            arrays, strings, or containers of these. None: its ``state()``, or else all its attributes.
+        **options: The options of the environments, as ``aec_env`` takes them.
 
     Returns:
-        The report: ``print`` it, or let tests call its ``raise_for_errors``.
+        The report: ``print`` it, or call its ``raise_for_errors`` in tests.
 
     Raises:
-        SimEnvError: The simulation, the points or the options cannot be used at all; the leaf says why.
+        SimEnvError: The simulation, the points or the options cannot be used at all. The subclass tells why.
     """
     chosen = tuple(seeds)
     if not chosen or any(isinstance(s, bool) or not isinstance(s, (int, np.integer)) or s < 0 for s in chosen):
@@ -88,7 +89,7 @@ def check_simulation(
             make_environment(plan, "aec")
     except SimEnvError:
         raise
-    except Exception as error:  # the model's own, from its constructor
+    except Exception as error:  # an exception of the model's constructor
         return _unmade(simulation, error)
     subject = Subject(
         plan, tuple(int(seed) for seed in dict.fromkeys(chosen)), episodes, max_steps, time_limit, fingerprint
@@ -110,7 +111,7 @@ def _run_checks(subject: Subject, report: Report) -> None:
     for check in CHECKS:
         try:
             check(subject, report)
-        except (Exception, SystemExit) as error:  # of the model, from where it was not expected
+        except (Exception, SystemExit) as error:  # an unexpected exception of the model
             report.add_error(error, "while it was checked")
             return
         if not subject.playable:

@@ -1,4 +1,4 @@
-"""Checks of the plain simulation, and that it is the same behind environments, with ``RULE`` throughout."""
+"""Checks of the plain simulation, and comparisons with environments in which ``RULE`` takes all decisions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .runs import Run, TimeUp, global_generators, play_rules, rule_run, seed_glo
 from .subject import SHARE, Opened, Report, Subject
 
 DRIVERS: Final = ("greenlet", "thread")
-"""The drivers with which the plain run is compared."""
+"""The drivers that are compared with the plain run."""
 
 
 # -- the simulation by itself ---------------------------------------------------------------------
 
 
 def check_plain_runs(subject: Subject, report: Report) -> None:
-    """Run the simulation without an environment: does it run, and does it decide anything?"""
+    """Check that the simulation runs without an environment, and decides something."""
     if not takes(make_simulation(subject.plan.source).reset, "seed"):
         report.add("unseeded_reset")
     for seed in subject.seeds:
@@ -54,7 +54,7 @@ def _add_slow_run(subject: Subject, report: Report, run: Run, seed: int) -> None
 
 
 def check_repeated_run(subject: Subject, report: Report) -> None:
-    """Run a seed a second time: what differs then has nothing to do with environments."""
+    """Run a seed a second time: differences then are not due to environments."""
     seed = subject.seeds[0]
     first = subject.plain[seed]
     if subject.drawn:
@@ -150,11 +150,11 @@ def _say_what_was_compared(
 
 
 Difference = tuple[int, str, bool]
-"""The seed of two runs that differ, in what, and whether all that differs is that the second holds more."""
+"""A difference of two runs: the seed, the parts, and whether the second only holds more than the first."""
 
 
 def _compare_view(subject: Subject, report: Report, view: str, driver: str) -> Difference | tuple[()] | None:
-    """Compare one view. Returns where it differs first; nothing if nowhere; None where it does not fit, or fails."""
+    """Compare one view. Return the first difference; () if there is none; None if the view does not fit or fails."""
     for seed, plain in subject.plain.items():
         if not plain.decisions or subject.late:
             continue
@@ -190,7 +190,7 @@ def _add_failed_view(subject: Subject, report: Report, view: str, seed: int, err
         subject.slow = True
         report.add("slow_view", view=view)
     elif not (view == "joint" and isinstance(error, AgentError)):
-        # In the joint view all agents must be known beforehand.
+        # The joint view needs to know all agents beforehand.
         report.add_error(error, f"in the {view} view with RULE throughout, seed {seed}")
 
 
@@ -212,7 +212,7 @@ _MAPPINGS: Final = {
 
 
 def _mappings_at_fault(subject: Subject, report: Report, seed: int) -> list[str]:
-    """Play the AEC view once more, and look at the model before and after each call of a mapping."""
+    """Play the AEC view once more, and compare the model before and after each call of a mapping."""
     found: dict[str, None] = {}
     simulations: list[Any] = []
 
@@ -251,5 +251,5 @@ def _mappings_at_fault(subject: Subject, report: Report, seed: int) -> list[str]
             seed_global_generators(seed)
             within(subject.deadline(), lambda: play(env))
     except (Exception, SystemExit):
-        pass  # which mappings were seen until then is told
+        pass  # report the mappings that were seen until then
     return list(found)

@@ -1,4 +1,4 @@
-"""What PettingZoo and Gymnasium check themselves, and how long a decision takes."""
+"""The tests of PettingZoo and Gymnasium, and the time that a decision takes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from .runs import TimeUp, error_in_words, play_rules, seconds_of_plain_run, seed
 from .subject import Opened, Report, Subject
 
 _SAID_OTHERWISE: Final = (
-    "possible_agents defined",  # PettingZoo's rule where agents are only known when they decide
+    "possible_agents defined",  # PettingZoo's rule if agents are only known when they decide
     "No agents present",  # after the end of each episode of such an environment
     "alternative render modes",
-    "not a NumPy array",  # PettingZoo knows Dict observations of its own environments alone
+    "not a NumPy array",  # PettingZoo allows Dict observations only in its own environments
     "should be gymnasium.spaces.box",
     "space for each agent probably should be",
     "infinity. This is probably",
@@ -40,13 +40,13 @@ _SAID_OTHERWISE: Final = (
     "does not have a render() method",
     "has not defined a render() method",
 )
-"""What PettingZoo and Gymnasium warn of that is no fault, or that the check says in words of its own."""
+"""Texts in warnings of PettingZoo and Gymnasium that are not faults, or that the checks report themselves."""
 
 _IN_PLAIN_WORDS: Final = (
     ("more than 3 dimensions", "many_dimensions"),
     ("minimum and maximum values are equal", "one_value"),
 )
-"""What stands in their warnings, and the finding that says the same."""
+"""Texts in their warnings, and the findings that say the same."""
 
 _TESTS: Final[tuple[tuple[str, str, Callable[[Callable[[], Any]], Any]], ...]] = (
     ("PettingZoo's api_test", "aec", lambda make: api_test(make(), num_cycles=50)),
@@ -56,13 +56,13 @@ _TESTS: Final[tuple[tuple[str, str, Callable[[Callable[[], Any]], Any]], ...]] =
     ("Gymnasium's check_env (single view)", "single", lambda make: check_env(make(), skip_render_check=True)),
     ("Gymnasium's check_env (joint view)", "joint", lambda make: check_env(make(), skip_render_check=True)),
 )
-"""The tests, with the view that they are for; each is called with what makes an environment."""
+"""The tests and their views; each test is called with a factory of environments."""
 
 
 def check_conformance(subject: Subject, report: Report) -> None:
-    """Run what PettingZoo and Gymnasium check; say what they warn of in plain words."""
+    """Run the tests of PettingZoo and Gymnasium; explain their warnings."""
     if subject.late or report.has_errors:
-        # They could only say the same in other words.
+        # They would only repeat these errors in other words.
         report.checked.append("not, because of the errors: what PettingZoo and Gymnasium test themselves")
         return
     passed = []
@@ -81,7 +81,7 @@ def check_conformance(subject: Subject, report: Report) -> None:
 def _passes(
     subject: Subject, report: Report, name: str, view: str, test: Callable[[Callable[[], Any]], Any]
 ) -> list[warnings.WarningMessage] | None:
-    """Run one test. Returns what it has warned of; None where it fails, or tells nothing."""
+    """Run one test. Return its warnings; None if it fails, or tells nothing."""
     plan = subject.plan.amended({"max_steps": subject.max_steps})
     try:
         with Opened(subject, report, view, plan) as env:
@@ -92,7 +92,7 @@ def _passes(
             within(subject.deadline(), lambda: test(lambda: make_environment(plan, view)))
         return caught
     except (TimeUp, InvalidActionError):
-        pass  # the test knows nothing of masks, or of those that change within a round
+        pass  # the test ignores masks, or masks that change within a round
     except AgentError as error:
         if view != "joint":
             report.add_error(error, f"in {name}")
@@ -117,7 +117,7 @@ def _add_warnings(report: Report, name: str, caught: Iterable[warnings.WarningMe
 
 
 def check_timing(subject: Subject, report: Report) -> None:
-    """Measure what a decision takes, where runs come to their end."""
+    """Measure the time per decision, if runs come to their end."""
     seed = subject.seeds[0]
     run = subject.plain[seed]
     if run.cut or not run.decisions or subject.late:
@@ -138,5 +138,5 @@ def check_timing(subject: Subject, report: Report) -> None:
 
 
 def _bare(message: str) -> str:
-    """A message without the codes of colours and what Gymnasium begins it with."""
+    """Return a message without colour codes and without Gymnasium's prefix."""
     return re.sub(r"\x1b\[[0-9;]*m", "", message).removeprefix("WARN: ").strip()

@@ -1,4 +1,4 @@
-"""Checks by episodes of random legal actions: what they range over, and whether they repeat."""
+"""Checks by episodes of random legal actions: ranges, and whether episodes repeat."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .statistics import Collectors
 from .subject import SHARE, Opened, Played, Report, Subject, play
 
 _MOST_ERRORS: Final = 3
-"""After how many failing episodes of random actions no more are played."""
+"""The number of failing random episodes after which no more are played."""
 
 
 def check_episodes(subject: Subject, report: Report) -> None:
@@ -95,7 +95,7 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, known: dict[i
 
 
 def _left_over(subject: Subject, report: Report, seed: int) -> str:
-    """What a simulation holds after a run and a reset that it does not hold after the first reset."""
+    """Return what a simulation holds after a run and a reset, but not after the first reset."""
     looks = []
 
     def look(env: Any) -> None:
@@ -116,7 +116,7 @@ def _left_over(subject: Subject, report: Report, seed: int) -> str:
 
 
 def _compare_side_by_side(subject: Subject, report: Report, envs: Sequence[Any], known: dict[int, Played]) -> None:
-    """Step two environments in turns, and compare their episodes with those of each by itself."""
+    """Step two environments in turns, and compare their episodes with those of each alone."""
     seeds, played = list(known)[:2], (Played(), Played())
 
     def steps() -> None:
@@ -139,9 +139,9 @@ def _compare_side_by_side(subject: Subject, report: Report, envs: Sequence[Any],
 
 
 def _compare_seeds(subject: Subject, report: Report, known: dict[int, Played]) -> None:
-    """Say so if all seeds give the same episode."""
+    """Report if all seeds give the same episode."""
     runs = [(seed, run.decisions, run.fingerprint) for seed, run in subject.plain.items() if run.fingerprint]
-    seed_like = {  # parts that hold nothing but the seed itself
+    seed_like = {  # parts that hold only the seed itself
         general(path)
         for seed, _, held in runs
         for path, value in held.parts.items()
@@ -158,7 +158,7 @@ def _compare_seeds(subject: Subject, report: Report, known: dict[int, Played]) -
 
 
 def _compare_actions(subject: Subject, report: Report, env: Any, seed: int, known: Played) -> None:
-    """Play other actions with the same seed, and say so if they change nothing."""
+    """Play other actions with the same seed, and report if they change nothing."""
     seed_global_generators(seed)
     other = play(subject, env, seed, salt=1)
     if other.error is not None or subject.drawn or len(other.steps) < 2:

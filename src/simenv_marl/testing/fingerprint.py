@@ -1,8 +1,8 @@
-"""What is left of a run: all that an arbitrary simulation holds, written down so that two runs can be compared.
+"""Fingerprints: everything that a simulation holds after a run, to compare two runs.
 
-Models need not be comparable. So their attributes are followed, as far as they lead, down to numbers, strings, arrays
-and the states of random generators; each of these *parts* has a path, by which a difference is told. What cannot be
-compared (open files, generators, locks) is left out, and its kind is noted.
+Models need not be comparable. Therefore their attributes are followed down to numbers, strings, arrays and the states
+of random generators. Each of these *parts* has a path, which a difference reports. Objects that cannot be compared
+(open files, generators, locks) are left out, and their kinds are recorded.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from ..simulation import Sentinel
 
 MOST_PARTS: Final = 50_000
-"""How many parts are compared; larger models are compared in as many."""
+"""The largest number of parts. Larger models are compared by this many parts."""
 
 ABSENT: Final = Sentinel("nothing")
 
@@ -37,9 +37,9 @@ class Fingerprint:
     """All parts of a simulation at one moment.
 
     Attributes:
-        parts: By path.
-        left_out: The kinds of what cannot be compared.
-        complete: Whether there were no more than ``MOST_PARTS``.
+        parts: The parts, by path.
+        left_out: The kinds of objects that cannot be compared.
+        complete: Whether there were at most ``MOST_PARTS``.
     """
 
     parts: dict[str, Any]
@@ -47,11 +47,11 @@ class Fingerprint:
     complete: bool
 
     def differences(self, other: Fingerprint, but: frozenset[str] = frozenset()) -> list[tuple[str, Any, Any]]:
-        """Where two differ: path, and what stands there here and in the other; ``ABSENT`` for nothing.
+        """Return the differences: path, this value and the other value; ``ABSENT`` for a missing part.
 
         Args:
-            other: The other.
-            but: What is not compared: paths, as ``general`` writes them.
+            other: The other fingerprint.
+            but: Paths that are not compared, as ``general`` writes them.
         """
         found = []
         for path, here in self.parts.items():
@@ -68,12 +68,12 @@ class Fingerprint:
 
 
 def fingerprint(simulation: Any, own: Callable[[Any], Any] | None = None) -> Fingerprint:
-    """Write down what a simulation holds.
+    """Return the fingerprint of a simulation.
 
     Args:
         simulation: The simulation.
-        own: What its user has given to be compared by: a callable of the simulation. Without it the
-            simulation's own ``state()``, or else all its attributes.
+        own: The user's callable of the simulation that returns what is compared. Without it: the simulation's own
+            ``state()``, or else all its attributes.
     """
     tell = getattr(simulation, "state", None)
     if own is not None:
@@ -85,8 +85,8 @@ def _written(name: str, root: Any) -> Fingerprint:
     parts: dict[str, Any] = {}
     left_out: set[str] = set()
     met: dict[int, str] = {}
-    kept = []  # what is made on the way: its id must not be given away again
-    # The nearest first: a long history that the model keeps is not to hide the rest of it.
+    kept = []  # keeps temporary objects alive, so that their ids are not reused
+    # Breadth first, so that a long history in the model does not hide the rest.
     left = deque([(name, root)])
     while left and len(parts) < MOST_PARTS:
         path, value = left.popleft()
@@ -103,7 +103,7 @@ def _written(name: str, root: Any) -> Fingerprint:
         elif id(value) in met:
             parts[path] = f"what is also {met[id(value)]}"
         else:
-            if not isinstance(value, (tuple, frozenset)):  # equal ones may or may not be one and the same
+            if not isinstance(value, (tuple, frozenset)):  # equal ones may or may not be the same object
                 met[id(value)] = path
             kept.append(value)
             parts[path] = title(type(value))
@@ -116,7 +116,7 @@ def _written(name: str, root: Any) -> Fingerprint:
 
 
 def _inside(path: str, value: Any) -> Iterator[tuple[str, Any]] | None:
-    """What a value holds, by path; None where that cannot be told."""
+    """Return what a value holds, by path; None if that is unknown."""
     if isinstance(value, (set, frozenset, weakref.WeakSet)):
         return _of_set(path, value)
     if isinstance(value, random.Random):
@@ -150,7 +150,7 @@ def _of_object(path: str, value: Any) -> Iterator[tuple[str, Any]] | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             reduced = value.__reduce_ex__(4)
-    except Exception:  # an open file, a lock, a generator: whatever its reason is
+    except Exception:  # an open file, a lock, a generator, for whatever reason
         return None
     if isinstance(reduced, str):
         return iter([(f"{path} (itself)", reduced)])
@@ -186,25 +186,25 @@ def _of_mapping(path: str, values: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _of_set(path: str, values: Any) -> Iterator[tuple[str, Any]]:
-    """A set has no order: of what is no atom, only how many there are of each kind."""
+    """Return the parts of a set. It has no order: of objects that are not atoms, only the number of each kind."""
     atoms = sorted(repr(value) for value in values if isinstance(value, _ATOMS))
     others = Counter(title(type(value)) for value in values if not isinstance(value, _ATOMS))
     return iter([(f"{path} (members)", ", ".join(atoms)), (f"{path} (kinds)", str(sorted(others.items())))])
 
 
 def general(path: str) -> str:
-    """A path that is the same for all members of a list or dict."""
+    """Return a path that is the same for all members of a list or dict."""
     return re.sub(r"\[[^\]]*\]", "[]", path)
 
 
 def title(thing: Any) -> str:
-    """The name of a class, function or module."""
+    """Return the name of a class, function or module."""
     name = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
     return str(name) if name else type(thing).__qualname__
 
 
 def alike(one: Any, other: Any) -> bool:
-    """Whether two values of atoms, arrays and containers of them are the same, bit for bit."""
+    """Return whether two values (atoms, arrays and containers of these) are the same, bit for bit."""
     if type(one) is not type(other):
         return False
     if isinstance(one, (np.ndarray, np.generic)):
@@ -217,7 +217,7 @@ def alike(one: Any, other: Any) -> bool:
 
 
 def brief(value: Any, depth: int = 3) -> Any:
-    """What of a rule's result can be compared at little cost: atoms, arrays, containers of them; else its kind."""
+    """Return what is cheap to compare of a rule's result: atoms, arrays, containers of these; else its kind."""
     if isinstance(value, _ATOMS) and not isinstance(value, Enum):
         return value
     if isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
@@ -230,7 +230,7 @@ def brief(value: Any, depth: int = 3) -> Any:
 
 
 def shown(value: Any, most: int = 60) -> str:
-    """A value in few words."""
+    """Return a value as a short text."""
     if value is ABSENT:
         return "nothing"
     text = " ".join(repr(value).split())
@@ -238,7 +238,7 @@ def shown(value: Any, most: int = 60) -> str:
 
 
 def differences_in_words(parts: list[tuple[str, Any, Any]], here: str = "first", there: str = "then") -> str:
-    """What differs between two fingerprints, in words."""
+    """Describe the differences of two fingerprints."""
     listed = [f"{path} is {here} {shown(left)}, {there} {shown(right)}" for path, left, right in parts[:3]]
     more = f"; {len(parts) - 3} more" if len(parts) > 3 else ""
     return "; ".join(listed) + more

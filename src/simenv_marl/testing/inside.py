@@ -1,4 +1,4 @@
-"""All that the kit uses of the library's inside. Its other modules use public names, and what stands here."""
+"""All that the checks use of the library's internals. Other modules here use public names and this module."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class ActivePoint:
-    """A decision point that an environment decides: its dotted name, its definition, and its agent (None: many)."""
+    """A decision point that an environment decides: its dotted name, its definition, and its agent (None: several)."""
 
     name: str
     definition: Definition
@@ -36,24 +36,24 @@ class ActivePoint:
 
     @property
     def agents(self) -> str:
-        """Who decides there, in words."""
+        """The agents that decide there, in words."""
         return self.agent if self.agent is not None else "agents named by each call"
 
 
 def active_points(plan: Plan) -> list[ActivePoint]:
-    """The decision points that environments of a plan decide."""
+    """Return the decision points that environments of a plan decide."""
     return [ActivePoint(binding.point.name, binding.definition, binding.agent) for binding in plan.active]
 
 
 def redefined(plan: Plan, change: Callable[[ActivePoint], Definition]) -> Plan:
-    """The same plan with other definitions of its active points."""
+    """Return the same plan with other definitions of its active points."""
     for binding, point in zip(plan.active, active_points(plan), strict=True):
         plan = plan.redefined(binding.point, change(point))
     return plan
 
 
 def make_environment(plan: Plan, view: str) -> Any:
-    """An environment of a plan.
+    """Make an environment of a plan.
 
     Raises:
         ViewError: The plan does not allow the view.
@@ -68,12 +68,12 @@ Main = Callable[[Any], Any]
 
 
 _PLAIN_RUNS: list[Any] = []
-"""The simulations whose main loops run plainly now."""
+"""The simulations whose main loops run without an environment now."""
 
 
 @contextmanager
 def plain_loop(plan: Plan, *, watched: bool) -> Iterator[tuple[Reset, Main]]:
-    """Set in the model what environments of a plan set there: handlers, and generators of its own.
+    """Set up the model as environments of a plan do: handlers, and generators of its own.
 
     Args:
         plan: The plan.
@@ -108,11 +108,11 @@ def plain_loop(plan: Plan, *, watched: bool) -> Iterator[tuple[Reset, Main]]:
 
 @contextmanager
 def watching_rules(plan: Plan, begin: Callable[[str], Callable[[Any], None]]) -> Iterator[None]:
-    """Have the rules of a plan's decision points watched, behind environments and in plain loops.
+    """Watch the rules of a plan's decision points, in environments and in plain loops.
 
     Args:
         plan: The plan.
-        begin: Called with the name of the point as its rule begins to decide. What it returns is called with the
+        begin: Called with the name of the point when its rule begins to decide. What it returns is called with the
             decision, unless the rule raises.
     """
     points = list(dict.fromkeys(point.point for point in plan.points))
@@ -126,13 +126,13 @@ def watching_rules(plan: Plan, begin: Callable[[str], Callable[[Any], None]]) ->
 
 
 def _decides(point: DecisionPoint) -> bool:
-    """Whether a main loop runs here, and not a reset or a mapping, in which decision functions only run their rule."""
+    """Return whether this runs in a main loop. In a reset or a mapping, rules do not count as decisions."""
     stack = stack_of(getcurrent())
     return bool(_PLAIN_RUNS) if stack is None else stack.decides(point.hook)
 
 
 def _watched(point: DecisionPoint, begin: Callable[[str], Callable[[Any], None]]) -> Any:
-    """The rule of a point, which stays a function, a generator function or a coroutine function."""
+    """Return a watched rule of a point; it stays a function, a generator function or a coroutine function."""
     rule: Any = point.rule
 
     def function(*args: Any, **kwargs: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What there is to be decided in a simulation."""
+"""Inspection of a simulation: its decision points and their calls."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ def inspect_simulation(
     time_limit: float = 30.0,
     **options: Unpack[CheckOptions],
 ) -> Inspection:
-    """Tell what there is to be decided in a simulation, and in what order, by running one episode of its own rules.
+    """List the decision points of a simulation and the order of their calls, by running one episode of its own rules.
 
     Args:
         simulation: A simulation (which is copied), its class, or a zero-argument factory.
         points: The decision points, as ``generate_env`` takes them.
-        seed: Of the episode.
-        max_steps: After how many decisions the episode is cut.
-        time_limit: After how many seconds it is.
-        **options: Options of the environments, as ``aec_env`` takes them.
+        seed: The seed of the episode.
+        max_steps: The number of decisions after which the episode is cut.
+        time_limit: The time after which the episode is cut, in seconds.
+        **options: The options of the environments, as ``aec_env`` takes them.
 
     Returns:
-        What was seen; ``print`` it.
+        The inspection; ``print`` it.
 
     Raises:
-        SimEnvError: The simulation, the points or the options cannot be used at all; the leaf says why.
-        Exception: Whatever the model raises when it is made.
+        SimEnvError: The simulation, the points or the options cannot be used at all. The subclass tells why.
+        Exception: Any exception of the model's constructor.
     """
     with quietly():
         plan = Plan.draw_up(simulation, points, options)
@@ -62,7 +62,7 @@ def inspect_simulation(
 
 
 def _agents_of(plan: Plan, seed: int, max_steps: int, deadline: float) -> dict[str, None]:
-    """The agents of an episode with ``RULE`` throughout, in the order in which they joined."""
+    """Return the agents of an episode with ``RULE`` throughout, in the order in which they joined."""
     named: dict[str, None] = {}
     env = make_environment(plan.amended({"max_steps": max_steps}), "aec")
 
@@ -71,14 +71,14 @@ def _agents_of(plan: Plan, seed: int, max_steps: int, deadline: float) -> dict[s
         play_rules(env, named)
 
     seed_global_generators(seed)
-    with suppress(Exception, SystemExit):  # those who were seen until then are told
+    with suppress(Exception, SystemExit):  # report the agents that were seen until then
         within(deadline, play)
     env.close()
     return named
 
 
 def _described(point: ActivePoint) -> PointDescription:
-    """What is to be known of a decision point."""
+    """Describe a decision point."""
     definition = point.definition
     details = []
     if definition.action_mask_mapping is not None:
@@ -101,7 +101,7 @@ def _described(point: ActivePoint) -> PointDescription:
 
 
 def _ending(run: Run) -> str:
-    """How a plain run ended, in words."""
+    """Describe how a plain run ended."""
     number = f"{len(run.decisions)} decisions"
     if run.cut:
         return f"cut after {number}"
@@ -114,10 +114,10 @@ def _ending(run: Run) -> str:
 
 
 def _fitting_views(plan: Plan) -> Iterator[str]:
-    """The views that a plan allows."""
+    """Yield the views that a plan allows."""
     for view in VIEWS:
         try:
             make_environment(plan, view).close()
-        except Exception:  # of the plan, or of the model where the view resets it
+        except Exception:  # of the plan, or of the model if the view resets it
             continue
         yield view

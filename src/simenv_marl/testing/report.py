@@ -1,4 +1,4 @@
-"""What a check has found and what an inspection has seen, as immutable objects that read as plain text."""
+"""The results of a check or an inspection, as immutable objects that print as plain text."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..errors import CheckFailedError
 Severity = Literal["error", "warning", "note"]
 
 SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
-"""In the order of their importance."""
+"""The severities, the most important first."""
 
 WIDTH: Final = 100
 _MOST_COMPONENTS: Final = 12
@@ -26,12 +26,12 @@ _MOST_COMPONENTS: Final = 12
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check has found.
+    """A finding of a check.
 
     Attributes:
         severity: "error": results would be wrong. "warning": learning may suffer. "note": good to know.
-        title: What it is, in one line.
-        explanation: What that means, and what to do.
+        title: The finding in one line.
+        explanation: What it means, and what to do.
         evidence: Where and when it was seen; may be empty.
     """
 
@@ -51,12 +51,12 @@ _WORDS: Final = tomllib.loads(files(__package__).joinpath("findings.toml").read_
 
 
 def finding(name: str, evidence: str = "", **words: Any) -> Finding:
-    """Make a finding whose words stand in ``findings.toml``.
+    """Make a finding from its text in ``findings.toml``.
 
     Args:
-        name: Under which name.
+        name: The name of the finding there.
         evidence: Where and when it was seen.
-        **words: What is put into title and explanation.
+        **words: The values of placeholders in title and explanation.
     """
     entry = _WORDS[name]
     severity = next(severity for severity in SEVERITIES if severity in entry)
@@ -69,13 +69,13 @@ def finding(name: str, evidence: str = "", **words: Any) -> Finding:
 
 @dataclass(frozen=True)
 class ComponentStatistics:
-    """What one component of an observation has ranged over.
+    """The range of one component of an observation.
 
     Attributes:
-        name: Which one: "[2]", "position[0]"; empty where there is only one.
+        name: The component: "[2]", "position[0]"; empty if there is only one.
         low, high: Its bounds.
-        minimum, maximum, mean: Of its values.
-        at_bounds, beyond: Which share of its values was at a bound, and outside of them (or no number).
+        minimum, maximum, mean: The minimum, maximum and mean of its values.
+        at_bounds, beyond: The share of its values that were at a bound, and outside of the bounds (or nan).
     """
 
     name: str
@@ -89,24 +89,24 @@ class ComponentStatistics:
 
     @property
     def constant(self) -> bool:
-        """Whether it was always the same."""
+        """Whether all values were the same."""
         return self.minimum == self.maximum
 
 
 @dataclass(frozen=True)
 class PointStatistics:
-    """What random legal actions have shown of a decision point.
+    """Statistics of a decision point under random legal actions.
 
     Attributes:
         point: Its dotted name.
-        agents: Who decides there: a name, or in words.
+        agents: Its agents: a name, or a description.
         observation_space, action_space: Its spaces, as text.
-        observations: How many observations were made.
-        components: What they ranged over.
-        decisions: How often the point was called, in all episodes.
-        never_legal: Which actions never were legal, where it has a mask.
-        rewards: How many rewards were counted.
-        reward_minimum, reward_maximum, reward_mean: Of these.
+        observations: The number of observations.
+        components: The ranges of the observations' components.
+        decisions: The number of its calls, in all episodes.
+        never_legal: The actions that were never legal, if it has a mask.
+        rewards: The number of rewards.
+        reward_minimum, reward_maximum, reward_mean: The minimum, maximum and mean of the rewards.
     """
 
     point: str
@@ -145,12 +145,13 @@ class PointStatistics:
 
 @dataclass(frozen=True)
 class EpisodeStatistics:
-    """What the episodes of random legal actions were like.
+    """Statistics of the episodes of random legal actions.
 
     Attributes:
-        episodes: How many there were.
+        episodes: The number of episodes.
         shortest, longest, mean: Their lengths in decisions.
-        terminated, truncated, cut: How many came to an end, to the simulation's own limit, and to ``max_steps``.
+        terminated, truncated, cut: The number of episodes that terminated, that reached the simulation's own limit, and
+            that reached ``max_steps``.
     """
 
     episodes: int = 0
@@ -174,7 +175,7 @@ class EpisodeStatistics:
 
 @dataclass(frozen=True)
 class Timing:
-    """What a decision takes, in microseconds: plainly, and with ``RULE`` in the AEC view."""
+    """The time per decision, in microseconds: in the plain run, and with ``RULE`` in the AEC view."""
 
     plain: float
     environment: float
@@ -191,16 +192,16 @@ class Timing:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What ``check_simulation`` has found. Its ``str`` is a text to be read.
+    """The result of ``check_simulation``. Its ``str`` is a text for people.
 
     Attributes:
         simulation: What was checked.
-        findings: What was found, the most important first.
-        checked: What was looked at, in words.
-        observations: By decision point, what random legal actions have shown.
-        episodes: What these episodes were like.
-        calls: In what order the decision points were called in a plain run, compressed.
-        timing: What a decision takes; None where that was not measured.
+        findings: The findings, the most important first.
+        checked: What was examined, in words.
+        observations: The statistics under random legal actions, by decision point.
+        episodes: The statistics of these episodes.
+        calls: The order in which the decision points were called in a plain run, compressed.
+        timing: The time per decision; None if it was not measured.
     """
 
     simulation: str
@@ -217,21 +218,21 @@ class CheckReport:
         return not self.of("error")
 
     def of(self, severity: Severity) -> tuple[Finding, ...]:
-        """The findings of a severity."""
+        """Return the findings of a severity."""
         return tuple(finding for finding in self.findings if finding.severity == severity)
 
     def raise_for_errors(self) -> None:
-        """Raise what was found to be wrong, as tests do.
+        """Raise an error if something is wrong, for tests.
 
         Raises:
-            CheckFailedError: There are findings of severity "error"; it holds them as text.
+            CheckFailedError: There are findings of severity "error"; the message has their text.
         """
         errors = self.of("error")
         if errors:
             raise CheckFailedError("\n\n".join([f"{self.simulation}: {self._counts()}", *map(str, errors)]))
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as dicts, lists, strings and numbers, for JSON; infinite numbers as strings."""
+        """Return the report as dicts, lists, strings and numbers, for JSON; infinite numbers as strings."""
         made: dict[str, Any] = {"ok": self.ok, **_for_json(asdict(self))}
         return made
 
@@ -259,9 +260,9 @@ class PointDescription:
 
     Attributes:
         name: Its dotted name.
-        agents: Who decides there: a name, or in words.
+        agents: Its agents: a name, or a description.
         observation_space, action_space: Its spaces, as text.
-        details: What else there is to know: masks, choices, removals, policies.
+        details: Further properties: masks, choices, removals, policies.
     """
 
     name: str
@@ -282,16 +283,16 @@ class PointDescription:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What ``inspect_simulation`` has seen. Its ``str`` is a text to be read.
+    """The result of ``inspect_simulation``. Its ``str`` is a text for people.
 
     Attributes:
         simulation: What was inspected.
         points: Its decision points.
-        views: Which views its environments may have.
-        calls: In what order the points were called in one plain episode, compressed: ``(a b){30} c``.
-        counts: How often each was called.
+        views: The views that its environments may have.
+        calls: The order in which the points were called in one plain episode, compressed: ``(a b){30} c``.
+        counts: The number of calls of each point.
         ended: How that episode ended, in words.
-        agents: The agents of that episode, behind an environment, in the order in which they joined.
+        agents: The agents of that episode in an environment, in the order in which they joined.
     """
 
     simulation: str
@@ -303,7 +304,7 @@ class Inspection:
     agents: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as dicts, lists, strings and numbers, for JSON."""
+        """Return the inspection as dicts, lists, strings and numbers, for JSON."""
         made: dict[str, Any] = _for_json(asdict(self))
         return made
 
@@ -332,13 +333,13 @@ _MOST_TERMS: Final = 30
 
 
 def order_of(calls: Sequence[str]) -> str:
-    """The order in which decision points were called, compressed and by the shortest names."""
+    """Return the order in which decision points were called, compressed and with the shortest names."""
     short = short_names(list(dict.fromkeys(calls)))
     return compressed(short[name] for name in calls)
 
 
 def compressed(calls: Iterable[str]) -> str:
-    """Write a sequence down with its repetitions, as ``(a b){30} c``; long ones end in an ellipsis."""
+    """Write a sequence with its repetitions, as ``(a b){30} c``; long ones end with an ellipsis."""
     all_calls = list(calls)
     terms = all_calls[:_MOST_CALLS]
     for length in range(1, _LONGEST_BLOCK + 1):
@@ -349,7 +350,7 @@ def compressed(calls: Iterable[str]) -> str:
 
 
 def _folded(terms: Sequence[str], length: int) -> list[str]:
-    """The same terms, with repetitions of blocks of one length written as one term."""
+    """Return the terms, with repetitions of blocks of one length written as one term."""
     made: list[str] = []
     place = 0
     while place < len(terms):
@@ -366,7 +367,7 @@ def _folded(terms: Sequence[str], length: int) -> list[str]:
 
 
 def short_names(points: Sequence[str]) -> dict[str, str]:
-    """The shortest ends of dotted names that tell them apart: of one part, else of two, and so on."""
+    """Return the shortest unique ends of dotted names: of one part, else of two, and so on."""
     short = {}
     for point in points:
         parts = point.split(".")
@@ -380,14 +381,14 @@ def short_names(points: Sequence[str]) -> dict[str, str]:
 
 
 def _wrapped(text: str, margin: str = " " * 9, hang: int | None = None) -> str:
-    """Wrap a text, with a margin before its first line and one before the others (of ``hang`` spaces)."""
+    """Wrap a text, with a margin before its first line and one of ``hang`` spaces before the others."""
     rest = margin if hang is None else " " * hang
     wrapper = TextWrapper(WIDTH, margin, rest, break_long_words=False, break_on_hyphens=False)
     return wrapper.fill(text)
 
 
 def in_digits(value: float) -> str:
-    """A number in four digits."""
+    """Return a number as text with four significant digits."""
     if not math.isfinite(value):
         return "not a number" if math.isnan(value) else "-inf" if value < 0 else "inf"
     return f"{value:.4g}"

@@ -1,7 +1,7 @@
-"""Runs of a simulation that are watched: plain ones, ones with RULE throughout, and episodes of random actions.
+"""Watched runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
 
-Every run has an end, whatever the model does. It is cut at its *limit* of decisions, by an exit that is raised at the
-next one; and when its time is up, by one that is raised in whatever Python code the model is executing.
+Every run has an end, whatever the model does. At its *limit* of decisions, an exit is raised at the next decision. When
+its time is up, an exit is raised in whatever Python code the model is executing.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ class TimeUp(SimulationExit):
 
 Result = TypeVar("Result")
 Look = Callable[[Any], Fingerprint | None]
-"""Writes down what a simulation holds."""
+"""A function that returns the fingerprint of a simulation."""
 
 # -- time -----------------------------------------------------------------------------------------
 
 _AGAIN: Final = 0.5
-"""After how many seconds a model that has swallowed the exit is told again."""
+"""The time in seconds after which the exit is raised again in a model that swallowed it."""
 
 
 def within(deadline: float, function: Callable[[], Result]) -> Result:
-    """Call a function, and raise ``TimeUp`` in it when it is later than a ``time.monotonic()``.
+    """Call a function, and raise ``TimeUp`` in it after a deadline, given as ``time.monotonic()``.
 
-    It interrupts Python code; what waits outside of it (in a sleep, say) is interrupted when it returns.
+    This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
 
     Raises:
-        TimeUp: It was interrupted, or it was too late before.
+        TimeUp: The function was interrupted, or it was too late to call it.
     """
     if time.monotonic() >= deadline:
         raise TimeUp
@@ -69,8 +69,8 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
         watcher.start()
         return function()
     finally:
-        # TimeUp may still be raised until the watcher has ended, and is then delivered at once. (It is not taken back:
-        # in CPython that leaves the interpreter checking for it for ever.)
+        # TimeUp may still be raised until the watcher has ended, and is then delivered at once. (It is not revoked: in
+        # CPython that would leave the interpreter checking for it forever.)
         while True:
             try:
                 over.set()
@@ -86,25 +86,25 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
 
 
 def global_generators() -> tuple[Any, Any]:
-    """The states of Python's and NumPy's global generators."""
+    """Return the states of Python's and NumPy's global generators."""
     return random.getstate(), np.random.get_state(legacy=False)
 
 
 def set_global_generators(states: tuple[Any, Any]) -> None:
-    """Put states of ``global_generators`` back."""
+    """Restore states that ``global_generators`` returned."""
     random.setstate(states[0])
     np.random.set_state(states[1])
 
 
 def seed_global_generators(seed: int) -> None:
-    """Seed both, so that runs can be compared whose model draws from them."""
+    """Seed both generators, so that runs of a model that draws from them can be compared."""
     random.seed(seed)
     np.random.seed(seed % 2**32)
 
 
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Let a model run that may print and warn; the global generators are left as they were.
+    """Run a model that may print and warn; the global generators are left as they were.
 
     Yields:
         The warnings that were not ignored.
@@ -128,15 +128,15 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
 
 @dataclass
 class Run:
-    """What came of a run.
+    """The result of a run.
 
     Attributes:
-        decisions: What was decided: the point's name, and what its rule returned.
-        fingerprint: What the simulation held at its end, or where it was cut.
+        decisions: The decisions: the point's name, and what its rule returned.
+        fingerprint: What the simulation held at its end, or when it was cut.
         cut: Whether it was cut at its limit.
-        error: What it raised.
-        result: What ``run`` returned, of a plain run.
-        drawn: From which global generators it has drawn.
+        error: The exception that it raised.
+        result: What ``run`` returned, in a plain run.
+        drawn: The global generators from which it has drawn.
     """
 
     decisions: list[list[Any]] = field(default_factory=list)
@@ -148,11 +148,11 @@ class Run:
 
     @property
     def calls(self) -> list[str]:
-        """The points that were called, in that order."""
+        """The names of the points that were called, in that order."""
         return [name for name, _ in self.decisions]
 
     def difference(self, other: Run, here: str = "first", there: str = "then") -> str:
-        """Where the decisions differ first from those of another run, in words; empty where they do not."""
+        """Describe the first difference from the decisions of another run; empty if there is none."""
         for number, (left, right) in enumerate(zip(self.decisions, other.decisions, strict=False), 1):
             if left[0] != right[0]:
                 return f"decision {number} is {here} of {left[0]}, {there} of {right[0]}"
@@ -167,8 +167,8 @@ class _Watch:
     """Watches one run, until a limit of decisions.
 
     Attributes:
-        run: What is noted.
-        simulation: The simulation whose run it is.
+        run: The result.
+        simulation: The simulation that runs.
     """
 
     def __init__(self, limit: int, look: Look) -> None:
@@ -177,7 +177,7 @@ class _Watch:
         self._limit, self._look = limit, look
 
     def over(self, plan: Plan, play: Callable[[], Any]) -> Run:
-        """Watch what a function plays, and note whatever it raises."""
+        """Watch what a function plays, and record whatever it raises."""
         run, before = self.run, global_generators()
         with watching_rules(plan, self._begin):
             try:
@@ -209,15 +209,15 @@ class _Watch:
 
 
 def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look, profile: Any = None) -> Run:
-    """Run a simulation's own loop, with nothing around it but a note of what its rules return.
+    """Run a simulation's own loop; only the results of its rules are recorded.
 
     Args:
-        plan: Whose simulation it is.
-        seed: What it is reset with.
-        limit: After how many decisions it is cut.
-        deadline: When its time is up.
-        look: Writes down what the simulation holds at the end.
-        profile: What is told of all calls meanwhile, as ``sys.setprofile`` has it.
+        plan: The plan of the simulation.
+        seed: The seed of the simulation.
+        limit: The number of decisions after which it is cut.
+        deadline: The time at which it is interrupted.
+        look: Returns the fingerprint of the simulation at the end.
+        profile: A profiler for all calls meanwhile, as ``sys.setprofile`` takes it.
     """
     watch, before = _Watch(limit, look), sys.getprofile()
 
@@ -235,7 +235,7 @@ def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look, pr
 
 
 def seconds_of_plain_run(plan: Plan, seed: int, deadline: float) -> float:
-    """Run a simulation's own loop with nothing around it at all. Returns how many seconds that took."""
+    """Run a simulation's own loop without any recording. Return its duration in seconds."""
 
     def play() -> float:
         simulation = make_simulation(plan.source)
@@ -249,7 +249,7 @@ def seconds_of_plain_run(plan: Plan, seed: int, deadline: float) -> float:
 
 
 def rule_run(plan: Plan, env: Any, seed: int, limit: int, deadline: float, look: Look) -> Run:
-    """Run an environment of a plan, of any view, with ``RULE`` throughout, watched."""
+    """Run an environment of a plan, of any view, with ``RULE`` throughout, and watch it."""
 
     def play() -> None:
         env.reset(seed=seed)
@@ -261,11 +261,11 @@ def rule_run(plan: Plan, env: Any, seed: int, limit: int, deadline: float, look:
 
 
 def play_rules(env: Any, selected: dict[str, None] | None = None) -> None:
-    """Play an environment of any view with ``RULE`` throughout, once it has been reset.
+    """Play an environment of any view with ``RULE`` throughout, after its reset.
 
     Args:
         env: The environment.
-        selected: Where the agents are noted that the AEC view selects.
+        selected: A dict that collects the agents that the AEC view selects.
     """
     if not hasattr(env, "agents"):
         while not any(env.step(RULE)[2:4]):
@@ -286,14 +286,14 @@ def play_rules(env: Any, selected: dict[str, None] | None = None) -> None:
 
 @dataclass
 class Step:
-    """What an agent was told at its turn, and what it did (None where its episode has ended)."""
+    """What an agent got at its turn, and what it did (None if its episode has ended)."""
 
     agent: str
     told: tuple[Any, float, bool, bool, dict[str, Any]]
     action: Any
 
     def difference(self, other: Step) -> str:
-        """What differs from a step of another episode, in words; empty where nothing does."""
+        """Describe the difference from a step of another episode; empty if there is none."""
         if self.agent != other.agent:
             return f"is first of {self.agent}, then of {other.agent}"
         names = ("observation", "reward", "terminated", "truncated", "info")
@@ -328,7 +328,7 @@ _CLOCKS: Final = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter"
 
 
 def culprit(error: BaseException) -> str:
-    """Where an error was raised, outside of this library: file, line and function; empty if nowhere."""
+    """Return where an error was raised, outside of this library: file, line and function; empty if nowhere."""
     place, trace = "", error.__traceback__
     while trace is not None:
         code = trace.tb_frame.f_code
@@ -339,17 +339,17 @@ def culprit(error: BaseException) -> str:
 
 
 def error_in_words(error: BaseException, most: int = 300) -> str:
-    """An error with its kind, the first lines of its text, and where it was raised."""
+    """Describe an error: its kind, the first lines of its text, and where it was raised."""
     text, place = " ".join(text_of(error).split()), culprit(error)
     text = text if len(text) <= most else f"{text[: most - 4]} ..."
     return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
 
 
 def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> list[str]:
-    """Run the simulation plainly, and see what it asks that is different each time: clocks, entropy, global generators.
+    """Run the simulation by itself, and find its sources of chance: clocks, entropy, global generators.
 
     Returns:
-        Each as a sentence's end, the place that asks for it included.
+        Each as the end of a sentence, with the place of the call.
     """
     found: dict[str, None] = {}
     library = random.__file__.rpartition("random.py")[0]

@@ -1,4 +1,4 @@
-"""What observations and rewards range over while episodes are played, and what there is to say about that."""
+"""Statistics of observations and rewards during episodes, and the findings that follow from them."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from .report import ComponentStatistics, Finding, PointStatistics, finding
 from .runs import Step
 
 _ENOUGH: Final = 30
-"""Of how many observations something can be said."""
+"""The number of observations that findings need."""
 
 _HUGE: Final = 1e3
 _HARDLY: Final = 0.01
 
 
 class _Leaf(NamedTuple):
-    """One part of an observation: a ``Box`` or another kind of numbers, and where it stands."""
+    """One part of an observation: a ``Box`` or another space of numbers, and its path."""
 
     name: str
     path: tuple[Any, ...]
     space: Any
 
     def bounds(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The lower and the upper bounds."""
+        """Return the lower and the upper bounds."""
         space = self.space
         if isinstance(space, spaces.Box):
             return space.low, space.high
@@ -44,7 +44,7 @@ class _Leaf(NamedTuple):
         return np.zeros(space.shape), np.ones(space.shape)
 
     def names(self) -> list[str]:
-        """What its components are called."""
+        """Return the names of its components."""
         shape = self.space.shape
         return [f"{self.name}{list(place)}" for place in np.ndindex(*shape)] if shape else [self.name]
 
@@ -66,12 +66,12 @@ def _flat(arrays: Iterable[NDArray[Any]]) -> NDArray[np.float64]:
 
 
 class PointCollector:
-    """Collects what is to be known of one decision point."""
+    """Collects the statistics of one decision point."""
 
     def __init__(self, point: ActivePoint) -> None:
         self.point, self._space = point, point.definition.observation_space
         self._leaves = list(_leaves(self._space))
-        # Of all components of an observation, one after the other.
+        # For all components of an observation, one after the other.
         self._names = [name for leaf in self._leaves for name in leaf.names()]
         self._dtypes = [leaf.space.dtype for leaf in self._leaves for _ in leaf.names()]
         self._boxes = [isinstance(leaf.space, spaces.Box) for leaf in self._leaves for _ in leaf.names()]
@@ -82,14 +82,14 @@ class PointCollector:
         self._least, self._most = np.full(size, np.inf), np.full(size, -np.inf)
         self._total, self._at_bounds, self._beyond = np.zeros(size), np.zeros(size), np.zeros(size)
         self._outside: dict[int, float] = {}
-        self._lost: dict[tuple[str, Any], str] = {}  # what casts have changed, by finding and dtype
+        self._lost: dict[tuple[str, Any], str] = {}  # what casts changed, by finding and dtype
         self.observations = self.decisions = 0
         self._unfit = ""
         self._legal: Any = None
         self._rewards: list[float] = []
 
     def observed(self, raw: Any) -> None:
-        """Note an observation, as its mapping has returned it."""
+        """Record an observation, as its mapping returned it."""
         try:
             parts = [np.asarray(reduce(getitem, leaf.path, raw)) for leaf in self._leaves]
         except (LookupError, TypeError, ValueError):
@@ -116,7 +116,7 @@ class PointCollector:
             self._lost.setdefault(("lost_fractions" if self._whole[place] else "rounded", self._dtypes[place]), text)
 
     def stepped(self, step: Step, *, first: bool) -> None:
-        """Note a step of an agent; the reward before its first action is none."""
+        """Record a step of an agent; before its first action there is no reward."""
         observation, reward, terminated, truncated, info = step.told
         if not self._unfit and not self._space.contains(observation):
             self._unfit = shown(observation, 200)
@@ -138,7 +138,7 @@ class PointCollector:
         return [ComponentStatistics(name, *row) for name, row in zip(self._names, rows, strict=True)]
 
     def statistics(self) -> PointStatistics:
-        """What was collected."""
+        """Return the statistics."""
         definition, rewards = self.point.definition, self._rewards
         return PointStatistics(
             point=self.point.name,
@@ -158,12 +158,12 @@ class PointCollector:
     # -- what there is to say ---------------------------------------------------------------------
 
     def findings(self) -> Iterator[Finding]:
-        """What is wrong or worth knowing about what was collected."""
+        """Yield what is wrong or worth knowing."""
         for name, evidence, dtype in self._found():
             yield finding(name, evidence, point=".".join(self.point.name.split(".")[-2:]), dtype=dtype)
 
     def _found(self) -> Iterator[tuple[str, str, Any]]:
-        """What is found: its name, the evidence, and the dtype where it is about one."""
+        """Yield findings: the name, the evidence, and the dtype if it concerns one."""
         if not self.decisions:
             yield "never_called", "", None
             return
@@ -192,7 +192,7 @@ class PointCollector:
                 yield "large_rewards", f"{least:.4g} to {most:.4g}", None
 
     def _about_ranges(self) -> Iterator[tuple[str, str, Any]]:
-        """What is to be said of components, by name of the finding."""
+        """Yield findings about the ranges of components."""
         told: dict[str, list[str]] = {"constant": [], "narrow": [], "large": [], "unbounded": []}
         for part, box in zip(self._components(), self._boxes, strict=True):
             name = part.name or "the value"
@@ -215,7 +215,7 @@ def _listed(texts: Sequence[str], most: int = 5) -> str:
 
 
 class Collectors:
-    """Collects what is to be known of all decision points of a plan.
+    """Collects the statistics of all decision points of a plan.
 
     Attributes:
         plan: The plan for the environment whose episodes are played.
@@ -228,7 +228,7 @@ class Collectors:
         self.plan = redefined(plan, self._tapped)
 
     def _tapped(self, point: ActivePoint) -> Definition:
-        """The definition of a point, whose observations and agents are noted."""
+        """Return the definition of a point that also records observations and agents."""
         of, definition = PointCollector(point), point.definition
         self.points.append(of)
         if point.agent is not None:
@@ -254,7 +254,7 @@ class Collectors:
         return replace(definition, observation_space_mapping=observing, agent=naming)
 
     def played(self, steps: Sequence[Step]) -> None:
-        """Note the steps of an episode. Agents that were declared and never decided are left out."""
+        """Record the steps of an episode. Declared agents that never decided are left out."""
         met: set[str] = set()
         for step in steps:
             if step.agent in self._by_agent:

@@ -1,4 +1,4 @@
-"""What all check functions share: the subject that they check, and the report that they write."""
+"""The subject and the report that all check functions share."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from .report import SEVERITIES, CheckReport, EpisodeStatistics, Finding, PointSt
 from .runs import Run, Step, TimeUp, culprit, error_in_words, plain_run, random_steps, sources_of_chance, within
 
 SHARE: Final = 0.25
-"""How much of the time limit a single run may take."""
+"""The share of the time limit that a single run may take."""
 
 
 @dataclass
 class Subject:
-    """A simulation with its decision points and options, how it is checked, and what is known of it by now.
+    """A simulation with its decision points and options, the parameters of the check, and what is known so far.
 
     Attributes:
-        plan: What its environments are made of.
-        seeds: With which seeds plain runs are compared.
-        episodes: How many episodes of random actions are played.
-        max_steps: After how many decisions a run is cut.
-        limit: For how many seconds it is checked at most.
-        own: What its user compares simulations by.
-        end: When its time is up, by ``time.monotonic()``.
+        plan: The plan of its environments.
+        seeds: The seeds of plain runs that are compared.
+        episodes: The number of episodes of random actions.
+        max_steps: The number of decisions after which a run is cut.
+        limit: The time limit of the check, in seconds.
+        own: The user's callable by which simulations are compared.
+        end: The end of the time limit, as ``time.monotonic()``.
         plain: Its plain runs, by seed.
         repeats: Whether the same seed gives the same plain run.
-        unstable: What differs between plain runs of the same seed, and is not compared: paths in fingerprints.
+        unstable: The parts that differ between plain runs of the same seed and are not compared: paths in fingerprints.
         drawn: The global generators that it draws from.
         slow: Whether a view has taken too long.
-        playable: Whether plain runs decide something and come to an end, so that environments are worth a look.
+        playable: Whether plain runs decide something and end, so that environments can be checked.
     """
 
     plan: Plan
@@ -61,17 +61,17 @@ class Subject:
         return time.monotonic() >= self.end
 
     def deadline(self) -> float:
-        """When a run that begins now must have ended: all have the same time, however late it is."""
+        """Return the deadline of a run that begins now: all have the same time, however late it is."""
         return time.monotonic() + self.limit * SHARE
 
     @property
     def rules(self) -> dict[Any, Any] | None:
-        """The option ``policies`` with the rule in place of each policy."""
+        """Return the option ``policies`` with the rule in place of each policy."""
         return dict.fromkeys(self.plan.options.policies or (), RULE) or None
 
     def look(self, simulation: Any) -> Fingerprint:
-        """Write down what a simulation of it holds."""
-        with outside_simulation():  # what that calls is not to be decided
+        """Return the fingerprint of a simulation."""
+        with outside_simulation():  # decision functions called there run their rule
             return fingerprint(simulation, self.own)
 
     def run_plainly(self, seed: int) -> Run:
@@ -79,31 +79,31 @@ class Subject:
         return plain_run(self.plan, seed, self.max_steps, self.deadline(), self.look)
 
     def differences(self, run: Run, other: Run) -> list[tuple[str, Any, Any]]:
-        """In which parts two runs have left the simulation different."""
+        """Return the parts in which the simulations differ after two runs."""
         if run.fingerprint is None or other.fingerprint is None:
             return []
         return run.fingerprint.differences(other.fingerprint, self.unstable)
 
     def chance(self) -> list[str]:
-        """What the model asks that is different each time."""
+        """Return the calls of the model that return something else each time."""
         try:
             return sources_of_chance(self.plan, self.seeds[0], self.deadline(), self.max_steps)
-        except (Exception, SystemExit):  # it is only to help with the explanation
+        except (Exception, SystemExit):  # it only helps with the explanation
             return []
 
 
 class Opened:
-    """An environment of a subject, which is closed at the end; None where the view does not fit."""
+    """An environment of a subject, which is closed at the end; None if the view does not fit."""
 
     def __init__(self, subject: Subject, report: Report, view: str = "aec", plan: Plan | None = None, **changes: Any):
-        """Say which environment; it is made on entering.
+        """Define the environment; it is made on entering.
 
         Args:
-            subject: Whose environment it is.
-            report: Where errors of its closing are told.
-            view: Its view.
-            plan: Its plan; None: the subject's.
-            **changes: Options that it has in place of the subject's.
+            subject: The subject.
+            report: The report for errors of closing.
+            view: The view.
+            plan: The plan. None: that of the subject.
+            **changes: Options that replace those of the subject.
         """
         self._subject, self._report, self._view = subject, report, view
         self._plan = (subject.plan if plan is None else plan).amended(changes)
@@ -128,7 +128,7 @@ class Opened:
 
 @dataclass
 class Played:
-    """An episode of random actions: its steps, what it raised, and when its last step was."""
+    """An episode of random actions: its steps, its exception, and the time of its last step."""
 
     steps: list[Step] = field(default_factory=list)
     error: BaseException | None = None
@@ -136,11 +136,11 @@ class Played:
 
     @property
     def told(self) -> list[Any]:
-        """What agents were told."""
+        """What the agents got."""
         return [(step.agent, step.told) for step in self.steps]
 
     def difference(self, other: Played) -> str:
-        """Where another one differs first, in words; empty where it does not."""
+        """Describe the first difference from another episode; empty if there is none."""
         for number, (here, there) in enumerate(zip(self.steps, other.steps, strict=False), 1):
             if difference := here.difference(there):
                 return f"step {number}: {difference}"
@@ -152,7 +152,7 @@ class Played:
 
 
 def play(subject: Subject, env: Any, seed: int, salt: int = 0) -> Played:
-    """Play an episode of random legal actions, as far as it gets in the time there is."""
+    """Play an episode of random legal actions, as far as the time allows."""
     played = Played()
 
     def steps() -> None:
@@ -177,19 +177,19 @@ _OF_ERRORS: Final[tuple[tuple[type[BaseException], str, str], ...]] = (
     (NoDecisionError, "", "undecided_error"),
     (AgentError, "", "agent_error"),
 )
-"""The kind of an error, words in its text, and the finding that it is. The first one holds."""
+"""The kind of an error, words in its text, and its finding. The first match counts."""
 
 _ORIGINS: Final = {"plain run": "plain_error", "random legal actions": "action_error", "": "any_error"}
-"""The findings of other errors, by words in where they were raised."""
+"""The findings of other errors, by words in the place where they were raised."""
 
 
 class Report:
     """A report while it is written.
 
     Attributes:
-        findings: What was found so far.
-        checked: What was looked at so far, in words.
-        points, episodes, timing: As ``CheckReport`` has them.
+        findings: The findings so far.
+        checked: What was examined so far, in words.
+        points, episodes, timing: As in ``CheckReport``.
     """
 
     def __init__(self) -> None:
@@ -210,7 +210,7 @@ class Report:
         self.findings.append(finding(name, evidence, **words))
 
     def add_error(self, error: BaseException, where: str) -> None:
-        """Add the finding of what was raised; the same one from the same place is told once."""
+        """Add the finding for an exception; the same one from the same place is reported once."""
         key = type(error).__name__, culprit(error) or text_of(error)
         if key in self._errors:
             return
@@ -228,7 +228,7 @@ class Report:
         self.add("unrepeatable", "\n".join([evidence, *(f"in the model, {source}" for source in sources[:4])]))
 
     def finished(self, subject: Subject) -> CheckReport:
-        """The report as users get it."""
+        """Return the report for users."""
         plain = subject.plain.get(subject.seeds[0])
         return CheckReport(
             simulation=subject.plan.name,

@@ -1,7 +1,7 @@
 """Turns a simulation into reinforcement learning environments, without a change to its main loop.
 
 The simulation stays as it is. The functions in which it decides something become the agents of a PettingZoo
-environment, or one of them becomes a Gymnasium environment::
+environment, or one of them becomes the agent of a Gymnasium environment::
 
     from simenv_marl import RULE, aec_env, make_step
 
@@ -9,32 +9,32 @@ environment, or one of them becomes a Gymnasium environment::
 
 To begin with:
 
-- ``make_step`` says what an agent observes, may do and is rewarded with, where a function of the model decides;
+- ``make_step`` defines the observations, actions and rewards of an agent that decides in a function of the model;
 - ``aec_env``, ``parallel_env``, ``single_env``, ``joint_env`` and ``vector_env`` make environments;
 - ``RULE`` as an action lets the model's own function decide;
-- ``simulate`` and ``evaluate`` run the simulation with policies in it, and compare these with the rule;
+- ``simulate`` and ``evaluate`` run the simulation with policies, and compare these with the rule;
 - ``python -m simenv_marl check MODULE:SIMULATION`` checks a simulation.
 
 The rooms of the package; each imports only from those below it::
 
     __main__                            the command line
-    templates                           models to begin with: the command line copies them
-    planning                            what actions are worth, and policies that decide by that
+    templates                           models to start from: the command line copies them
+    planning                            values of actions, and policies that decide by them
     testing, registration, branching    checks of a simulation; registries; exact continuations of an episode
-    callbacks                           what is raised in callbacks of C code
-    experiments                         policies compared on the same seeds; designs; experiments that resume; effects
-    envs                                views: an episode read as a PettingZoo or Gymnasium environment
-    many                                policies back in the model, in one simulation or in many at once; pictures
-    core                                what happens when: plans, stacks, sessions, episodes, agents
+    callbacks                           exceptions in callbacks of C code
+    experiments                         policies compared on the same seeds; designs; resumable experiments; effects
+    envs                                views: an episode as a PettingZoo or Gymnasium environment
+    many                                policies in the model, in one simulation or in many at once; plots
+    core                                the order of events: plans, stacks, sessions, episodes, agents
     remote                              simulators outside Python: processes that call for decisions
     decision                            make_step: definitions and decision points
-    hooks                               functions that stand in front of a model's own; handlers around their calls
+    hooks                               stand-ins for a model's functions; handlers around their calls
     stepped                             simulations of models that are made with a seed and stepped
-    simulation                          what a simulation is; RULE and TRUNCATED
-    errors                              the tree of errors
+    simulation                          the interface of simulations; RULE and TRUNCATED
+    errors                              the exception classes
 
-``core/episode.py`` is the one place that knows what happens when. ``docs/contributing.md`` shows the way of one
-decision through the rooms.
+``core/episode.py`` alone determines the order of events. ``docs/contributing.md`` follows one decision through the
+rooms.
 """
 
 from . import errors

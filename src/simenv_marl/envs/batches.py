@@ -1,4 +1,4 @@
-"""What goes to and comes from many simulations at once: batches of observations, rewards, flags and actions."""
+"""Batches of observations, rewards, flags and actions of many simulations."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ..errors import InvalidActionError, shown
 from ..simulation import RULE
 
 IGNORED: Final = None
-"""Stands for an action that is not used; no space has it."""
+"""A placeholder for an action that is not used; no space contains it."""
 
 
 class Batch:
-    """What many simulations tell at once.
+    """The results of many simulations.
 
     Attributes:
-        observations: Of the single space, batched.
+        observations: The batched observations.
         rewards: Shape ``(n,)``, float64.
         terminations, truncations: Shape ``(n,)``, bool.
     """
@@ -33,36 +33,36 @@ class Batch:
 
 
 class Actions:
-    """Takes batches of actions apart, and checks them as far as that needs no simulation.
+    """Splits batches of actions, and checks them as far as that needs no simulation.
 
     Attributes:
-        complete: Whether nothing is left to be checked with the simulations.
+        complete: Whether these checks are complete, so that the simulations need not check the actions.
     """
 
     def __init__(self, space: spaces.Space[Any], number: int, point: BoundPoint | None) -> None:
-        """Make ready for batches of a space.
+        """Prepare for batches of a space.
 
         Args:
             space: The action space of one simulation.
-            number: How many simulations there are.
-            point: The decision point that takes the actions; None where several do.
+            number: The number of simulations.
+            point: The decision point of the actions; None if there are several.
         """
         self._number, self._point = number, point
         self._space, self._batch = space, batch_space(space, number)
         self.complete = point is not None and point.legal is None
 
     def split(self, actions: Any, unused: Any = ()) -> list[Any]:
-        """Take a batch apart.
+        """Split a batch.
 
         Args:
-            actions: A batch of the action space; for spaces whose batches are arrays, a sequence serves.
+            actions: A batch of the action space; if batches are arrays, a sequence works, too.
             unused: The numbers of the actions that are not used, and so not checked.
 
         Returns:
-            An action for each simulation; ``IGNORED`` in place of those that are not used.
+            An action for each simulation; ``IGNORED`` instead of those that are not used.
 
         Raises:
-            InvalidActionError: There is not an action for each, or one is not legal. It says which.
+            InvalidActionError: There is not one action for each simulation, or one is not legal. The message names it.
         """
         space = self._space
         if actions is RULE:
@@ -102,5 +102,5 @@ class Actions:
 
 
 def of_one(number: int, error: Any) -> str:
-    """The message of an error about the action of one of many."""
+    """Return the message of an error about one of many actions."""
     return f"sub-environment {number}: {error}"

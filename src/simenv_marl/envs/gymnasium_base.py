@@ -1,4 +1,4 @@
-"""What the views with one agent have in common: they are Gymnasium environments."""
+"""The base class of views with one agent, which are Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .base import View
 
 
 class OneAgentView(View, gym.Env[Any, Any]):
-    """A view with one agent, and so a Gymnasium environment."""
+    """A view with one agent, which is a Gymnasium environment."""
 
     _agent: str
     _own_spaces: tuple[spaces.Space[Any], spaces.Space[Any]] | None = None
 
     def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        """Make spaces for this environment alone: of observations and of actions."""
+        """Make the observation space and the action space, which this environment does not share."""
         raise NotImplementedError
 
     @property
     def _spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        if self._own_spaces is None:  # made when they are asked for: many simulations side by side share what they can
+        if self._own_spaces is None:  # made on demand: many simulations side by side share spaces if possible
             self._own_spaces = self._make_spaces()
             seed = self._session.np_random_seed
             if seed is not None and seed >= 0:
@@ -62,14 +62,14 @@ class OneAgentView(View, gym.Env[Any, Any]):
         return [self.observation_space]
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Which actions are legal now, in the shape in which sb3-contrib's ``MaskablePPO`` asks for it.
+        """Return the action mask of the pending decision, in the shape that sb3-contrib's ``MaskablePPO`` needs.
 
         Returns:
-            Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the masks of its parts, one behind the other.
-            True throughout where the decision point does not restrict its actions.
+            A bool array. Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the concatenated masks of its
+            parts. All values are True if the decision point does not restrict its actions.
 
         Raises:
-            ViewError: The action space is neither, and so there are no masks of it.
+            ViewError: The action space is neither of these, and so has no masks.
             ResetNeededError: There is no episode.
         """
         if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
@@ -82,11 +82,11 @@ class OneAgentView(View, gym.Env[Any, Any]):
         return np.concatenate(parts).astype(np.bool_)
 
     def _legal(self, episode: Episode) -> list[Any]:
-        """The masks of all that is decided in a step."""
+        """Return the masks of all decisions of a step."""
         raise NotImplementedError
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
-        """End the episode that runs, begin another, and seed the generator and the spaces."""
+        """End the running episode, begin another, and seed the generator and the spaces."""
         seed = checked_seed(seed)
         self._make_way()
         if seed is not None and self._own_spaces is not None:

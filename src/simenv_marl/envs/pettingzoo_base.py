@@ -1,4 +1,4 @@
-"""What the views with several agents have in common: they are PettingZoo environments."""
+"""The base class of views with several agents, which are PettingZoo environments."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from .base import View
 
 
 class AgentsView(View):
-    """A view in which agents are told apart. ``possible_agents`` exists only where all are known beforehand.
+    """A view with several agents. ``possible_agents`` exists only if all agents are known beforehand.
 
     Attributes:
-        agents: The agents that are there now.
+        agents: The present agents.
     """
 
     agents: list[str]
@@ -41,11 +41,11 @@ class AgentsView(View):
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
 
     def _start(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
-        """End the episode that runs, begin another, and seed the agents' spaces."""
+        """End the running episode, begin another, and seed the agents' spaces."""
         seed = checked_seed(seed)
         self._make_way()
         episode = self._session.start(seed, options, when)
-        if not self._plan.complete:  # names that may never come again
+        if not self._plan.complete:  # forget names that may never come again
             self._observation_spaces, self._action_spaces = {}, {}
         elif seed is not None:
             for agent in self._action_spaces:
@@ -54,7 +54,7 @@ class AgentsView(View):
 
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Make sure that a plan allows this view.
+        """Check that a plan allows this view.
 
         Raises:
             ViewError: It does not.

@@ -1,8 +1,7 @@
-"""Rows of simulations in processes of their own: how their user starts them, asks them, and brings them to an end.
+"""Rows of simulations in worker processes, as the parent starts them, talks to them and ends them.
 
-Nothing here can wait for ever: a wait for a worker also is one for its death, and a worker whose user is gone finds its
-pipe closed. The memory has no name and there are no semaphores, so that nothing is left behind even by a process that
-is killed.
+No wait is endless: a wait for a worker also ends with its death, and a worker without a parent finds its pipe closed.
+The shared memory has no name and there are no semaphores, so that even a killed process leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ from .rows import SubEnvironments, Told
 from .worker import EXIT, Recipe, is_shareable, share_memory, shared_batch, work
 
 SECONDS_TO_CLOSE: Final = 10.0
-"""How long a worker may take to unwind its simulations and to end."""
+"""The time in seconds that a worker has to unwind its simulations and to end."""
 
 
 class Worker:
     """A process with some of the simulations.
 
     Attributes:
-        first, end: The numbers of its simulations: from the first to before the end.
-        name: What it is called in messages.
+        first, end: The range of its simulations; ``end`` is exclusive.
+        name: Its name in messages.
     """
 
     def __init__(self, number: int, first: int, end: int) -> None:
@@ -45,13 +44,13 @@ class Worker:
 
     @property
     def there(self) -> bool:
-        """Whether it can be asked."""
+        """Whether it is running and can be used."""
         return self._pipe is not None
 
     def start(
         self, context: Any, inherited: list[Connection], recipe: bytes, memory: Any, setup: dict[str, Any]
     ) -> None:
-        """Start the process. It tells when it is ready, or why it will not be."""
+        """Start the process. It reports when it is ready, or why it will not be."""
         ours, theirs = context.Pipe()
         setup = {**setup, "first": self.first, "end": self.end}
         forked = context.get_start_method() == "fork"
@@ -85,7 +84,7 @@ class Worker:
 
     @property
     def sentinel(self) -> int:
-        """Becomes ready when the process ends."""
+        """The handle that becomes ready when the process ends."""
         return int(self._process.sentinel)
 
     def send(self, message: bytes) -> None:
@@ -98,12 +97,12 @@ class Worker:
             self.pipe.send_bytes(message)
         except OSError:
             raise self.died() from None
-        except BaseException:  # the message may be there in part
+        except BaseException:  # part of the message may have been sent
             self.end_now()
             raise
 
     def receive(self) -> Any:
-        """Receive what it has sent.
+        """Receive a message.
 
         Raises:
             WorkerError: It is dead.
@@ -117,7 +116,7 @@ class Worker:
             raise
 
     def died(self) -> WorkerError:
-        """Bury it; the error that says how it died."""
+        """Clean up after its death; return the error that tells how it died."""
         process = self._process
         process.join(1.0)  # its pipe closes a moment before it ends
         code = process.exitcode
@@ -126,7 +125,7 @@ class Worker:
         script = (
             '. In a script, environments with workers are made under `if __name__ == "__main__":`, because each worker'
             " runs the script once more"
-            if code == 1  # of an error, before it could tell of one
+            if code == 1  # an error, before it could report one
             else ""
         )
         return WorkerError(
@@ -135,7 +134,7 @@ class Worker:
         )
 
     def end_now(self, seconds: float = 0.0) -> None:
-        """End the process, by force unless it ends by itself within some seconds."""
+        """End the process, by force if it does not end within some seconds."""
         process, pipe = self._process, self._pipe
         self._process = self._pipe = None
         if pipe is not None:
@@ -152,11 +151,11 @@ class Worker:
 
 
 class Workers:
-    """Rows in processes: used like a ``Row``.
+    """Rows in processes; it has the methods of a ``Row``.
 
     Attributes:
-        failed: Whether an error has left some simulations where the others are not, and all are to be reset.
-        batch: What they write into.
+        failed: Whether, after an error, some simulations have moved and others have not, so that all need a reset.
+        batch: The batch that they write to.
     """
 
     def __init__(
@@ -165,9 +164,9 @@ class Workers:
         """Start the workers.
 
         Raises:
-            OptionValueError: There is no such context, or what the environment is made of cannot be pickled.
+            OptionValueError: The context does not exist, or an argument of the environment cannot be pickled.
             WorkerError: A worker died.
-            BaseException: What making a simulation raises.
+            BaseException: Any exception of making a simulation.
         """
         self._context = _context(context)
         self._space, self._mode, self._number = common.single_observation_space, mode, number
@@ -195,7 +194,7 @@ class Workers:
             raise
 
     def _hire(self) -> None:
-        """Start the workers that are not there."""
+        """Start the workers that are not running."""
         new = [worker for worker in self._workers if not worker.there]
         if not new:
             return
@@ -206,11 +205,11 @@ class Workers:
         self._gather(new, 0)
 
     def _ask(self, method: str, arguments: Callable[[Worker], tuple[Any, ...] | None]) -> list[tuple[Worker, Any]]:
-        """Ask all workers for which there are arguments, and wait for their answers.
+        """Send a request to all workers for which there are arguments, and wait for their answers.
 
         Raises:
-            WorkerError: One is dead.
-            BaseException: What the first raises that raises anything.
+            WorkerError: A worker is dead.
+            BaseException: The first exception of a worker, in their order.
         """
         self._be_theirs()
         self._identity += 1
@@ -223,10 +222,10 @@ class Workers:
         return self._gather([worker for worker, _ in packed], self._identity)
 
     def _be_theirs(self) -> None:
-        """Make sure that this is the process that they talk to.
+        """Check that this process is the parent of the workers.
 
         Raises:
-            WorkerError: It is a fork of that.
+            WorkerError: It is a fork of the parent.
         """
         if os.getpid() != self._process:
             raise WorkerError(
@@ -237,7 +236,7 @@ class Workers:
         """Wait for answers.
 
         Raises:
-            BaseException: What the first worker raises that raises anything.
+            BaseException: The first exception of a worker, in their order.
         """
         results, errors = self._collect(asked, identity)
         for worker in asked:
@@ -248,7 +247,7 @@ class Workers:
     def _collect(
         self, asked: list[Worker], identity: int, seconds: float | None = None
     ) -> tuple[dict[Worker, Any], dict[Worker, BaseException]]:
-        """Wait until all have answered, have died or have let some seconds go by. Returns results, and errors."""
+        """Wait until all have answered, have died or have exceeded the time. Return results and errors."""
         until = None if seconds is None else monotonic() + seconds
         results: dict[Worker, Any] = {}
         errors: dict[Worker, BaseException] = {}
@@ -261,14 +260,14 @@ class Workers:
                 if worker.pipe not in ready and worker.sentinel not in ready:
                     continue
                 try:
-                    if worker.pipe not in ready and not worker.pipe.poll():  # it has died, and has not answered before
+                    if worker.pipe not in ready and not worker.pipe.poll():  # it died without an answer
                         raise worker.died()
                     answered, fine, answer = worker.receive()
                 except WorkerError as error:
                     errors[worker] = error
                     continue
                 if answered != identity:
-                    continue  # to what was asked before its user was interrupted
+                    continue  # the answer to a request before an interrupt
                 if fine:
                     results[worker] = answer
                 else:
@@ -280,7 +279,7 @@ class Workers:
 
     @property
     def ended(self) -> set[int]:
-        """The numbers of those whose episode has ended and has not begun anew."""
+        """The numbers of the simulations whose episode has ended and was not reset yet."""
         batch = self.batch
         if self._mode == AutoresetMode.SAME_STEP or not (batch.terminations.any() or batch.truncations.any()):
             return set()
@@ -288,11 +287,11 @@ class Workers:
 
     @property
     def views(self) -> list[Any]:
-        """The environments of the simulations, which are not here."""
+        """The environments of the simulations, which are in other processes."""
         raise AttributeError("the sub-environments are in other processes; use call(), get_attr() and set_attr()")
 
     def reset(self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: Sequence[int]) -> Told:
-        """As ``Row.reset``, and start those workers anew that have died."""
+        """Reset as ``Row.reset``; start dead workers anew."""
         self.failed = True
 
         def arguments(worker: Worker) -> tuple[Any, ...] | None:
@@ -305,11 +304,11 @@ class Workers:
         return told
 
     def check(self, actions: Sequence[Any]) -> None:
-        """As ``Row.check``."""
+        """Check actions as ``Row.check``."""
         self._ask("check", lambda worker: (actions[worker.first : worker.end],))
 
     def step(self, actions: Sequence[Any]) -> Told:
-        """As ``Row.step``."""
+        """Step as ``Row.step``."""
         self.failed = True
         told = self._told(self._ask("step", lambda worker: (actions[worker.first : worker.end],)))
         self.failed = False
@@ -326,18 +325,18 @@ class Workers:
         return told
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
-        """As ``Row.call``."""
+        """Call as ``Row.call``."""
         return [value for _, values in self._ask("call", lambda _: (name, args, kwargs)) for value in values]
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """As ``Row.set_attr``."""
+        """Set an attribute as ``Row.set_attr``."""
         self._ask("set_attr", lambda worker: (name, values[worker.first : worker.end]))
 
     def close(self) -> None:
         """Unwind all simulations and end the workers, by force after some seconds.
 
         Raises:
-            BaseException: What the first simulation raises that raises anything; the others are unwound all the same.
+            BaseException: The first exception of a simulation; the others are unwound, too.
         """
         self._be_theirs()
         try:
@@ -351,18 +350,18 @@ class Workers:
             if len(results) + len(errors) < len(there):
                 warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are ended by force", ResourceWarning)
             for worker, error in errors.items():
-                if worker.there:  # else it has died, and there is nothing left to be closed
+                if worker.there:  # else it died, and there is nothing to close
                     raise error
         finally:
             self.abandon()
 
     @property
     def suspended(self) -> bool:
-        """Whether something is still to be ended here: nothing is."""
+        """Whether something has to be ended in this process: nothing has."""
         return False
 
     def abandon(self) -> None:
-        """End the workers; from a finalizer, too: raises nothing."""
+        """End the workers. It may be called by a finalizer and raises nothing."""
         if os.getpid() != self._process:
             return  # they are those of the process of which this is a fork
         for worker in self._workers:

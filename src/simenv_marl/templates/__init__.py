@@ -1,7 +1,7 @@
-"""Models to begin with: one file each, from the model's class to a trained policy, and the tests that belong to it.
+"""Templates: models to start from, one file each, from the model's class to a trained policy, with tests.
 
-``python -m simenv_marl new plain|simpy|mesa NAME`` copies one of the modules of this package, with ``NAME`` in it. They
-run as they are, too: ``python -m simenv_marl.templates.plain``.
+``python -m simenv_marl new plain|simpy|mesa NAME`` copies one of the modules of this package and puts ``NAME`` into it.
+They also run as they are: ``python -m simenv_marl.templates.plain``.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ KINDS: Final = {
 """The kinds of templates, and the packages that each needs besides ``simenv-marl[experiments]``."""
 
 PLACEHOLDER: Final = "MyModel"
-"""What stands in the templates for the class of the model; their module stands for the name itself."""
+"""The name of the model's class in the templates, which is replaced; so is the name of their module."""
 
 
 @dataclass(frozen=True)
 class Written:
-    """What was written.
+    """The files that were written.
 
     Attributes:
-        kind: Of the template.
+        kind: The kind of the template.
         files: The module, and its tests.
     """
 
@@ -63,14 +63,15 @@ def write_template(kind: str, name: str, folder: Path | None = None) -> Written:
 
     Args:
         kind: One of ``KINDS``.
-        name: Of the new module. Its class is called likewise: ``water_tank`` has a ``WaterTank``.
-        folder: Where to write; made if it does not exist. None: a folder of that name in the current one.
+        name: The name of the new module. Its class gets the same name in CamelCase: ``water_tank`` has a ``WaterTank``.
+        folder: The folder to write to; it is created if it does not exist. None: a folder of that name in the current
+            one.
 
     Returns:
-        What was written.
+        The files that were written.
 
     Raises:
-        OptionValueError: The name cannot be used, a file is there already, or the folder cannot be written to.
+        OptionValueError: The name cannot be used, a file exists already, or the folder cannot be written to.
     """
     template = _text(kind)
     class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
@@ -97,7 +98,7 @@ def _text(module: str) -> str:
 
 
 def _check_name(name: str, class_name: str, template: str) -> None:
-    """Refuse names that are none, that hide another module, or whose class the template has already."""
+    """Refuse names that are not valid, that hide another module, or whose class exists in the template."""
     example = "; choose one like water_tank"
     if not name.isidentifier() or keyword.iskeyword(name) or not class_name.isidentifier():
         raise OptionValueError(
@@ -116,7 +117,7 @@ def _check_name(name: str, class_name: str, template: str) -> None:
 
 
 def _installed(name: str) -> bool:
-    """Whether Python finds a module or package of that name anywhere but in the current folder."""
+    """Return whether Python finds a module or package of that name anywhere but in the current folder."""
     here = ("", str(Path.cwd()))
     spec = PathFinder.find_spec(name, [entry for entry in sys.path if entry not in here])
     return spec is not None and spec.origin is not None

@@ -36,7 +36,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     @property
     def observation_space(self) -> spaces.Space[Any]:
-        """The observation space, of this environment alone."""
+        """The observation space, which this environment does not share."""
         return self._spaces[0]
 
     @observation_space.setter
@@ -45,7 +45,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     @property
     def action_space(self) -> spaces.Space[Any]:
-        """The action space, of this environment alone."""
+        """The action space, which this environment does not share."""
         return self._spaces[1]
 
     @action_space.setter

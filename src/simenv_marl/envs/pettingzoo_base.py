@@ -72,7 +72,7 @@ class AgentsView(View):
         return tuple(self._observation(episode, agent) for agent in self.possible_agents)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The observation space of an agent: of this environment alone, and always the same object.
+        """Return the observation space of an agent. Environments do not share it, and it is always the same object.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -81,7 +81,7 @@ class AgentsView(View):
         return space if space is not None else self._make_spaces(agent)[0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The action space of an agent: of this environment alone, and always the same object.
+        """Return the action space of an agent. Environments do not share it, and it is always the same object.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -91,19 +91,19 @@ class AgentsView(View):
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """By possible agent, its observation space: for learners that ask for all at once.
+        """The observation spaces of all possible agents, by name.
 
         Raises:
-            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+            AttributeError: Not all agents are known beforehand; then there is no ``possible_agents`` either.
         """
         return {agent: self.observation_space(agent) for agent in self.possible_agents}
 
     @property
     def action_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """By possible agent, its action space: for learners that ask for all at once.
+        """The action spaces of all possible agents, by name.
 
         Raises:
-            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+            AttributeError: Not all agents are known beforehand; then there is no ``possible_agents`` either.
         """
         return {agent: self.action_space(agent) for agent in self.possible_agents}
 
@@ -133,7 +133,7 @@ class AgentsView(View):
             seed_space(space, seed, agent)
 
     def _observation(self, episode: Episode, agent: str) -> Any:
-        """The latest observation of an agent, as a copy of the caller's own."""
+        """Return the latest observation of an agent, as a new copy."""
         found = episode.agent(agent)
         if found is None or found.observation is None or (self._padded and found.ended):
             return self._point(agent).blank()

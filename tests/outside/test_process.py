@@ -167,7 +167,7 @@ def test_it_runs_without_an_environment():
     simulation.reset(4)
     assert simulation.run() is None
     assert simulation.result == by_its_rule(4)
-    with pytest.raises(SimulationError, match="each but once"):
+    with pytest.raises(SimulationError, match="call reset"):
         simulation.run()
     simulation.reset(4, {"truncated": True})
     assert simulation.run() is TRUNCATED

@@ -32,7 +32,7 @@ class AgentsView(View):
             SimEnvError: Something in the plan cannot work.
         """
         if plan.options.padded and not plan.complete:
-            raise OptionValueError("padded=True needs a roster: say in possible_agents= who there may be")
+            raise OptionValueError("padded=True needs a roster: name all agents in possible_agents=")
         super().__init__(plan)
         if plan.possible_agents is not None:
             self.possible_agents = plan.possible_agents

@@ -229,7 +229,7 @@ class Workers:
         """
         if os.getpid() != self._process:
             raise WorkerError(
-                "the workers are those of the process of which this one is a fork; make another environment"
+                "the workers belong to the process from which this one was forked; make another environment"
             )
 
     def _gather(self, asked: list[Worker], identity: int) -> list[tuple[Worker, Any]]:

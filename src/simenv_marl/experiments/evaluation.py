@@ -398,7 +398,7 @@ def distinct_seeds(given: Iterable[int]) -> list[int]:
         raise OptionValueError("seeds must be some integers, such as range(32): there are none")
     twice = next((seed for seed in seeds if seeds.count(seed) > 1), None) if len(set(seeds)) < len(seeds) else None
     if twice is not None:
-        raise OptionValueError(f"the seed {twice} is there twice: it would bring the same again, and count as more")
+        raise OptionValueError(f"the seed {twice} is there twice: its result would be counted twice")
     return seeds
 
 

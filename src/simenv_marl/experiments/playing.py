@@ -176,7 +176,7 @@ def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
         OptionValueError: They contain ``policies``; the contenders define these.
     """
     if "policies" in options:
-        raise OptionValueError("who decides is said by contenders: there is no option policies here")
+        raise OptionValueError("there is no option policies here: give the policies of each contender in its dict")
     return {name: list(value) if isinstance(value, Iterator) else value for name, value in options.items()}
 
 

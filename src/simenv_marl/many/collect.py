@@ -259,7 +259,7 @@ def checked_seeds(seeds: Any) -> list[int]:
     checked = []
     for seed in seeds:
         if seed is None:
-            raise OptionValueError("seeds must be integers: None would draw one, and nobody would know which")
+            raise OptionValueError("seeds must be integers, not None: an unknown seed could not be repeated")
         checked.append(checked_seed(seed))
     return checked  # type: ignore[return-value]
 

@@ -141,7 +141,7 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
     """
     if not isinstance(trajectories, Trajectories):
         raise OptionValueError(
-            f"{shown(dataset_id)} is to be made of what collect_episodes has returned under one key, not of"
+            f"the data set {shown(dataset_id)} needs what collect_episodes has returned under one key, not"
             f" {shown(trajectories)}"
         )
     (path,) = _check_free([dataset_id])

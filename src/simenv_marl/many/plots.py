@@ -368,7 +368,7 @@ def plot_returns(
     groups = groups_of(collected, per)
     number = sum(len(rows) for rows in groups.values())
     if not number:
-        raise OptionValueError("there is nothing to draw: nobody has decided in any episode")
+        raise OptionValueError("there is nothing to draw: no agent has decided in any episode")
     if number > LISTED:
         raise OptionValueError(f"per={per!r} would draw {number} rows, more than {LISTED}; per='policy' draws fewer")
     titles = list(dict.fromkeys(title for rows in groups.values() for title in rows))

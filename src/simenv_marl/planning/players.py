@@ -383,6 +383,6 @@ def player_of(env: Any, base: Any) -> Player:
     """
     view = getattr(env, "unwrapped", env)
     if not isinstance(view, View):
-        raise ViewError(f"only in environments of one simulation actions can be tried out; {shown(env)} is none")
+        raise ViewError(f"actions can only be tried in an environment of one simulation, not in {shown(env)}")
     view.check_pending()
     return next(made for kind, made in PLAYERS.items() if isinstance(view, kind))(env, base)

@@ -301,7 +301,7 @@ class Child:
         process, begun = self._process, 0.0
         if process.owner != os.getpid():
             raise WrongThreadError(
-                f"{self} belongs to another process, of which this one is a fork; reset() starts one for this one"
+                f"{self} belongs to the process from which this one was forked; reset() starts another one"
             )
         while lines:
             try:

@@ -200,7 +200,7 @@ class ProcessSimulation(SimulationInterface):
         link = self._link
         child, frame, link.first = link.child, link.first, None
         if child is None or frame is None:
-            raise SimulationError("run() runs an episode that reset() has begun, and each but once")
+            raise SimulationError("run() runs each episode once: call reset() first")
         functions = dict(zip(self._names(), self.points, strict=True))
         try:
             while "end" not in frame:
@@ -249,7 +249,7 @@ class ProcessSimulation(SimulationInterface):
         """
         child = self._link.child
         if child is None or "reseed" not in child.can:
-            raise BranchError(f'{child or "a process that was not started"} has not said "reseed" among what it can')
+            raise BranchError(f'{child or "a process that was not started"} has not announced "reseed" in its hello')
         self._link.seed = int(seed)
 
     # -- frames -----------------------------------------------------------------------------------

@@ -357,7 +357,7 @@ class Workers:
 
     @property
     def suspended(self) -> bool:
-        """Whether something has to be ended in this process: nothing has."""
+        """Whether something has to be ended in this process; always False."""
         return False
 
     def abandon(self) -> None:

@@ -311,7 +311,7 @@ class Hook(Target):
 
     @property
     def stale(self) -> bool:
-        """Whether something else has been set in its place, while nothing was set there for it."""
+        """Whether something else has replaced it while no stand-in was set in its place."""
         return self.place is not None and not self._holders and not self.place.is_free(self)
 
     def hold(self, holder: object) -> None:

@@ -90,7 +90,7 @@ class Panel:
 
 
 def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
-    """Return what is to be drawn as a dict by policy key."""
+    """Return the trajectories to draw as a dict by policy key."""
     if isinstance(trajectories, Trajectories):
         return {None: trajectories}
     if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):

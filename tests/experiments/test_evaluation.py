@@ -348,7 +348,7 @@ def refused(match, error=OptionValueError, **arguments):
         ("metric", {"metric": "level"}),
         ("called like another column", {"metric": {"seed": level}}),
         ("workers", {"workers": -2}),
-        ("said by contenders", {"policies": {}}),
+        ("policies of each contender", {"policies": {}}),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_runs(match, arguments):

@@ -365,7 +365,7 @@ def test_episodes_in_which_nobody_decides():
     with pytest.raises(OptionValueError, match=r"episode 0 \(seed 0\)"):
         plot_timeline(found, 0)
     plot_timeline(found, 1)
-    with pytest.raises(OptionValueError, match="nobody"):
+    with pytest.raises(OptionValueError, match="no agent has decided"):
         plot_returns(collect_episodes(script(main), {ant: ones}, seeds=[0]))
 
 

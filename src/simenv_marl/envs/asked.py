@@ -1,4 +1,4 @@
-"""The environment for a policy that asks for it: the single view of the deciding agent."""
+"""The environment that a policy is given which asks for it: the single view of the agent for which it decides."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from .single import SimulationEnv
 
 
 class AskedEnv(SimulationEnv):
-    """The single view of an agent while its policy is called. It is made for ``branch``, and functions that use it.
+    """The single view of an agent while its policy is asked. It is for ``branch``, and what is made of that.
 
-    The decision is pending; what the policy returns is the answer. A branch of it is an environment like any other: it
-    can be stepped, and returns the agent's observations and rewards. There, all other agents follow their policies, or
-    their rule if they have none.
+    Its decision is pending, and is answered by what the policy returns. In a branch it is an environment like any
+    other: it can be stepped, and tells the agent's observations and rewards. All other agents are left to their
+    policies there, and to their rule where they have none.
     """
 
     def __init__(self, session: Session) -> None:
         """Make the view.
 
         Args:
-            session: A session whose episode is calling a policy that asks for the environment.
+            session: A session in whose episode a policy is asked that is given the environment.
         """
         self._plan = self._made_of = session.plan
         self._session = session
@@ -42,14 +42,14 @@ class AskedEnv(SimulationEnv):
         return copy.deepcopy((definition.observation_space, definition.action_space))
 
     def begin_branch(self) -> None:
-        """Wait for this agent alone, in a branch."""
+        """Wait for the agent alone, now that this is a branch."""
         if not self._branched:
             self._branched = True
             self._session.step_out()
             self._running().single_out(self._own)
 
     def check_pending(self) -> None:
-        """Check that the decision is pending.
+        """Make sure that the decision is pending.
 
         Raises:
             ResetNeededError, ReentrancyError: It was answered.
@@ -59,10 +59,10 @@ class AskedEnv(SimulationEnv):
             raise episode.refusal()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """In a branch: answer the pending decision and run to the agent's next one, as every single view does.
+        """In a branch: answer the pending decision and run to the agent's next one, as in every single view.
 
         Raises:
-            ReentrancyError: This is not a branch.
+            ReentrancyError: This is no branch.
         """
         if not self._branched:
             raise ReentrancyError(
@@ -71,7 +71,7 @@ class AskedEnv(SimulationEnv):
         return super().step(action)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
-        """Refuse to reset: this is the environment of one decision.
+        """Refuse: it is the environment of one decision.
 
         Raises:
             ReentrancyError: Always.
@@ -82,7 +82,7 @@ class AskedEnv(SimulationEnv):
         """In a branch: end it.
 
         Raises:
-            ReentrancyError: This is not a branch.
+            ReentrancyError: This is no branch.
         """
         if not self._branched:
             raise ReentrancyError(
@@ -91,10 +91,10 @@ class AskedEnv(SimulationEnv):
         super().close()
 
     def replayed(self) -> AskedEnv:
-        """Make an environment in exactly the same state, for ``branch``.
+        """Make an environment that stands just where this one stands: a copy for ``branch``.
 
         Raises:
-            BranchError: The state cannot be reached.
+            BranchError: It cannot be brought there.
         """
         if self._running().alone:
             raise BranchError(

@@ -1,4 +1,4 @@
-"""Batches of observations, rewards, flags and actions of many simulations."""
+"""What goes to and comes from many simulations at once: batches of observations, rewards, flags and actions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ..errors import InvalidActionError, shown
 from ..simulation import RULE
 
 IGNORED: Final = None
-"""A placeholder for an action that is not used; no space contains it."""
+"""Stands for an action that is not used; no space has it."""
 
 
 class Batch:
-    """The results of many simulations.
+    """What many simulations tell at once.
 
     Attributes:
-        observations: The batched observations.
+        observations: Of the single space, batched.
         rewards: Shape ``(n,)``, float64.
         terminations, truncations: Shape ``(n,)``, bool.
     """
@@ -33,36 +33,36 @@ class Batch:
 
 
 class Actions:
-    """Splits batches of actions, and checks them as far as that needs no simulation.
+    """Takes batches of actions apart, and checks them as far as that needs no simulation.
 
     Attributes:
-        complete: Whether these checks are complete, so that the simulations need not check the actions.
+        complete: Whether nothing is left to be checked with the simulations.
     """
 
     def __init__(self, space: spaces.Space[Any], number: int, point: BoundPoint | None) -> None:
-        """Prepare for batches of a space.
+        """Make ready for batches of a space.
 
         Args:
             space: The action space of one simulation.
-            number: The number of simulations.
-            point: The decision point of the actions; None if there are several.
+            number: How many simulations there are.
+            point: The decision point that takes the actions; None where several do.
         """
         self._number, self._point = number, point
         self._space, self._batch = space, batch_space(space, number)
         self.complete = point is not None and point.legal is None
 
     def split(self, actions: Any, unused: Any = ()) -> list[Any]:
-        """Split a batch.
+        """Take a batch apart.
 
         Args:
-            actions: A batch of the action space; if batches are arrays, a sequence works, too.
+            actions: A batch of the action space; for spaces whose batches are arrays, a sequence serves.
             unused: The numbers of the actions that are not used, and so not checked.
 
         Returns:
-            An action for each simulation; ``IGNORED`` instead of those that are not used.
+            An action for each simulation; ``IGNORED`` in place of those that are not used.
 
         Raises:
-            InvalidActionError: There is not one action for each simulation, or one is not legal. The message names it.
+            InvalidActionError: There is not an action for each, or one is not legal. It says which.
         """
         space = self._space
         if actions is RULE:
@@ -102,5 +102,5 @@ class Actions:
 
 
 def of_one(number: int, error: Any) -> str:
-    """Return the message of an error about one of many actions."""
+    """The message of an error about the action of one of many."""
     return f"sub-environment {number}: {error}"

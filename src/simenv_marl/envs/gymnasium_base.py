@@ -1,4 +1,4 @@
-"""The base class of views with one agent, which are Gymnasium environments."""
+"""What the views with one agent have in common: they are Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .base import View
 
 
 class OneAgentView(View, gym.Env[Any, Any]):
-    """A view with one agent, which is a Gymnasium environment."""
+    """A view with one agent, and so a Gymnasium environment."""
 
     _agent: str
     _own_spaces: tuple[spaces.Space[Any], spaces.Space[Any]] | None = None
 
     def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        """Make the observation space and the action space, which this environment does not share."""
+        """Make spaces for this environment alone: of observations and of actions."""
         raise NotImplementedError
 
     @property
     def _spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        if self._own_spaces is None:  # made on demand: many simulations side by side share spaces if possible
+        if self._own_spaces is None:  # made when they are asked for: many simulations side by side share what they can
             self._own_spaces = self._make_spaces()
             seed = self._session.np_random_seed
             if seed is not None and seed >= 0:
@@ -36,7 +36,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     @property
     def observation_space(self) -> spaces.Space[Any]:
-        """The observation space, which this environment does not share."""
+        """The observation space, of this environment alone."""
         return self._spaces[0]
 
     @observation_space.setter
@@ -45,7 +45,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     @property
     def action_space(self) -> spaces.Space[Any]:
-        """The action space, which this environment does not share."""
+        """The action space, of this environment alone."""
         return self._spaces[1]
 
     @action_space.setter
@@ -62,31 +62,31 @@ class OneAgentView(View, gym.Env[Any, Any]):
         return [self.observation_space]
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return the action mask of the pending decision, in the shape that sb3-contrib's ``MaskablePPO`` needs.
+        """Which actions are legal now, in the shape in which sb3-contrib's ``MaskablePPO`` asks for it.
 
         Returns:
-            A bool array. Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the concatenated masks of its
-            parts. All values are True if the decision point does not restrict its actions.
+            Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the masks of its parts, one behind the other.
+            True throughout where the decision point does not restrict its actions.
 
         Raises:
-            ViewError: The action space is neither of these, and so has no masks.
+            ViewError: The action space is neither, and so there are no masks of it.
             ResetNeededError: There is no episode.
         """
         if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
             raise ViewError(
-                f"there are only masks of Discrete and MultiDiscrete action spaces, and not of {self.action_space}; a"
-                " joint environment of discrete actions has a MultiDiscrete with flatten=True"
+                f"there are masks of Discrete and MultiDiscrete action spaces, and not of {self.action_space}; joint"
+                " environments of discrete actions have a MultiDiscrete with flatten=True"
             )
         masks = self._legal(self._running())
         parts = [part for mask in masks for part in (mask if isinstance(mask, tuple) else (mask,))]
         return np.concatenate(parts).astype(np.bool_)
 
     def _legal(self, episode: Episode) -> list[Any]:
-        """Return the masks of all decisions of a step."""
+        """The masks of all that is decided in a step."""
         raise NotImplementedError
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
-        """End the running episode, begin another, and seed the generator and the spaces."""
+        """End the episode that runs, begin another, and seed the generator and the spaces."""
         seed = checked_seed(seed)
         self._make_way()
         if seed is not None and self._own_spaces is not None:

@@ -1,4 +1,4 @@
-"""The base class of views with several agents, which are PettingZoo environments."""
+"""What the views with several agents have in common: they are PettingZoo environments."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from .base import View
 
 
 class AgentsView(View):
-    """A view with several agents. ``possible_agents`` exists only if all agents are known beforehand.
+    """A view in which agents are told apart. ``possible_agents`` exists only where all are known beforehand.
 
     Attributes:
-        agents: The present agents.
+        agents: The agents that are there now.
     """
 
     agents: list[str]
@@ -32,7 +32,7 @@ class AgentsView(View):
             SimEnvError: Something in the plan cannot work.
         """
         if plan.options.padded and not plan.complete:
-            raise OptionValueError("padded=True needs a roster: name all agents in possible_agents=")
+            raise OptionValueError("padded=True needs a roster: say in possible_agents= who there may be")
         super().__init__(plan)
         if plan.possible_agents is not None:
             self.possible_agents = plan.possible_agents
@@ -41,11 +41,11 @@ class AgentsView(View):
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
 
     def _start(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
-        """End the running episode, begin another, and seed the agents' spaces."""
+        """End the episode that runs, begin another, and seed the agents' spaces."""
         seed = checked_seed(seed)
         self._make_way()
         episode = self._session.start(seed, options, when)
-        if not self._plan.complete:  # forget names that may never come again
+        if not self._plan.complete:  # names that may never come again
             self._observation_spaces, self._action_spaces = {}, {}
         elif seed is not None:
             for agent in self._action_spaces:
@@ -54,7 +54,7 @@ class AgentsView(View):
 
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Check that a plan allows this view.
+        """Make sure that a plan allows this view.
 
         Raises:
             ViewError: It does not.
@@ -72,7 +72,7 @@ class AgentsView(View):
         return tuple(self._observation(episode, agent) for agent in self.possible_agents)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the observation space of an agent. Environments do not share it, and it is always the same object.
+        """The observation space of an agent: of this environment alone, and always the same object.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -81,7 +81,7 @@ class AgentsView(View):
         return space if space is not None else self._make_spaces(agent)[0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the action space of an agent. Environments do not share it, and it is always the same object.
+        """The action space of an agent: of this environment alone, and always the same object.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -91,19 +91,19 @@ class AgentsView(View):
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """The observation spaces of all possible agents, by name.
+        """By possible agent, its observation space: for learners that ask for all at once.
 
         Raises:
-            AttributeError: Not all agents are known beforehand; then there is no ``possible_agents`` either.
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
         """
         return {agent: self.observation_space(agent) for agent in self.possible_agents}
 
     @property
     def action_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """The action spaces of all possible agents, by name.
+        """By possible agent, its action space: for learners that ask for all at once.
 
         Raises:
-            AttributeError: Not all agents are known beforehand; then there is no ``possible_agents`` either.
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
         """
         return {agent: self.action_space(agent) for agent in self.possible_agents}
 
@@ -133,7 +133,7 @@ class AgentsView(View):
             seed_space(space, seed, agent)
 
     def _observation(self, episode: Episode, agent: str) -> Any:
-        """Return the latest observation of an agent, as a new copy."""
+        """The latest observation of an agent, as a copy of the caller's own."""
         found = episode.agent(agent)
         if found is None or found.observation is None or (self._padded and found.ended):
             return self._point(agent).blank()

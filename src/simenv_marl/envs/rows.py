@@ -1,7 +1,7 @@
 """Many simulations of one plan, suspended side by side in one process and moved together.
 
-A *row* has the sessions of its sub-environments. It resets and moves their simulations, and writes the results to
-arrays. The Gymnasium view of a sub-environment is made on demand.
+A *row* holds the sessions of its sub-environments, resets and moves their simulations, and leaves what comes of it in
+arrays. The Gymnasium view of one of them is made when it is asked for.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from .joint import Joint, SimulationJointEnv
 from .single import single_view, with_goals
 
 Told = list[tuple[int, dict[str, Any]]]
-"""Infos with the numbers of their sub-environments, in the order of merging."""
+"""Infos, each with the number of its sub-environment, in the order in which they are to be merged."""
 
 
 class SubEnvironments:
-    """What all sub-environments of a plan share.
+    """What all sub-environments of a plan have in common.
 
     Attributes:
-        plan: Their plan.
-        joint: The joint agent of joint views; None for single views.
-        metadata: Their metadata.
-        single_observation_space, single_action_space: The spaces of one sub-environment.
+        plan: What they are made of.
+        joint: What they are as joint views; None where they are single views.
+        metadata: What they say about themselves.
+        single_observation_space, single_action_space: The spaces of one of them.
     """
 
     def __init__(self, plan: Plan, view: str | None) -> None:
-        """Find the view and the spaces of a plan; if agents are still unknown, reset a simulation to ask for them.
+        """Find out what a plan asks for; where agents are yet unknown, reset a simulation to ask.
 
         Args:
-            plan: The plan.
-            view: "single", "joint", or None: single if one point with one string agent is active, else joint.
+            plan: What they are to be made of.
+            view: "single", "joint", or None: single where one point with one string agent is active.
 
         Raises:
             SimEnvError: The plan does not allow the view.
@@ -89,9 +89,9 @@ class Row:
 
     Attributes:
         sessions: Their simulations.
-        batch: The batch that they write to.
-        ended: The numbers of those whose episode has ended and was not reset yet.
-        failed: Whether, after an error, some of them have moved and others have not, so that all need a reset.
+        batch: What they write into.
+        ended: The numbers of those whose episode has ended and has not begun anew.
+        failed: Whether an error has left some of them where the others are not, and all are to be reset.
     """
 
     def __init__(
@@ -100,14 +100,14 @@ class Row:
         """Make the simulations.
 
         Args:
-            common: What they share.
-            batch: The batch that they write to.
-            mode: When episodes that have ended are reset.
-            number: The number of simulations.
-            offset: The number of simulations before this row, for error messages.
+            common: What they have in common.
+            batch: What they are to write into.
+            mode: When episodes that have ended begin anew.
+            number: How many there are to be.
+            offset: How many there are before the row, for those who are told of an error.
 
         Raises:
-            BaseException: Any exception of making a simulation.
+            BaseException: What making a simulation raises.
         """
         self.batch, self._mode, self._offset, self._common = batch, mode, offset, common
         self._stack = stacker(common.single_observation_space, cast=True, other=concatenate)
@@ -115,7 +115,7 @@ class Row:
         self._shows = common.plan.options.render_mode == "human"
         self._observed: list[Any] = [None] * number
         self._views: list[OneAgentView] = []
-        self._episodes: list[Any] = []  # the episodes of these agents, in the single view
+        self._episodes: list[Any] = []  # of which these are the agents, in the single view
         self._agents: list[Any] = []
         self.ended: set[int] = set()
         self.failed = False
@@ -129,18 +129,18 @@ class Row:
             raise
 
     def reset(self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: Sequence[int]) -> Told:
-        """Reset some sub-environments.
+        """Begin the episodes of some sub-environments anew.
 
         Args:
-            seeds: The seeds of all sub-environments.
-            options: The options for those that are reset.
-            chosen: The numbers of those that are reset.
+            seeds: For all of them.
+            options: For all that are reset.
+            chosen: The numbers of those.
 
         Returns:
             Their infos.
 
         Raises:
-            BaseException: Any exception of a simulation or a mapping. The row has ``failed`` unless nothing has moved.
+            BaseException: Whatever a simulation or a mapping raises. Unless nothing has moved, the row has ``failed``.
         """
         told: Told = []
         number = 0
@@ -159,10 +159,10 @@ class Row:
         return told
 
     def check(self, actions: Sequence[Any]) -> None:
-        """Check actions in ways that need the simulations. Nothing moves.
+        """Check actions against what only the simulations know. Nothing moves.
 
         Raises:
-            InvalidActionError: An action is not legal. The message names its simulation.
+            InvalidActionError: One is not legal. It says which.
         """
         joint = self._common.joint
         for number, action in enumerate(actions):
@@ -180,16 +180,16 @@ class Row:
                 raise InvalidActionError(of_one(self._offset + number, error)) from None
 
     def step(self, actions: Sequence[Any]) -> Told:
-        """Answer all pending decisions, each with its action, and run each simulation to its next decision.
+        """Answer all pending decisions, each with its action, and run each simulation to its next one.
 
         Args:
-            actions: A checked action for each sub-environment.
+            actions: An action for each sub-environment, checked.
 
         Returns:
-            Their infos that are not empty.
+            Their infos, as far as there is something in them.
 
         Raises:
-            BaseException: Any exception of a simulation or a mapping. The row has ``failed`` unless nothing has moved.
+            BaseException: Whatever a simulation or a mapping raises. Unless nothing has moved, the row has ``failed``.
         """
         told: Told = []
         begun = {number: self._again(number) for number in sorted(self.ended)}
@@ -250,7 +250,7 @@ class Row:
         return told
 
     def _end_of(self, episode: Episode) -> tuple[bool, bool] | None:
-        """Return whether an episode has terminated, and was truncated, by its view; None if it is running."""
+        """Whether an episode has terminated, and was truncated, as its view tells it; None if it goes on."""
         if self._agent in episode.ended and self._common.single:
             return True, False
         return (episode.terminated, episode.truncated) if episode.over else None
@@ -269,7 +269,7 @@ class Row:
                 raise
 
     def _begin(self, number: int, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode. Return its first observation and info."""
+        """Begin an episode. Returns its first observation and info."""
         joint, session = self._common.joint, self.sessions[number]
         episode = session.start(seed, options, When.DECISION if joint is None else When.RETURN)
         if self._shows:
@@ -288,9 +288,9 @@ class Row:
             raise
 
     def _fail(self, number: int, error: BaseException, first: int = -1) -> None:
-        """Add the number of the sub-environment to an error; if anything has moved, all need a reset.
+        """Tell which sub-environment an error is of; if anything has moved, all are to be reset.
 
-        ``first`` is the number of the sub-environment that moves first.
+        ``first`` is the number of the one that was to move first.
         """
         annotate(error, f"simenv_marl: in sub-environment {self._offset + number}")
         if number != first or not self._waits(self.sessions[number]):  # else nothing has moved
@@ -309,7 +309,7 @@ class Row:
         """Call a method of each view, or get its attribute.
 
         Raises:
-            BaseException: Any exception of a view.
+            BaseException: What a view raises.
         """
         results = []
         for view in self.views:
@@ -328,8 +328,8 @@ class Row:
         """Unwind all simulations.
 
         Raises:
-            ReentrancyError, WrongThreadError: They cannot be ended from here, and stay open.
-            BaseException: The first exception of a simulation; the others are unwound, too.
+            ReentrancyError, WrongThreadError: They cannot be ended from here, and go on.
+            BaseException: What the first simulation raises that raises anything; the others are unwound all the same.
         """
         raised: BaseException | None = None
         for number, session in enumerate(self.sessions):
@@ -351,7 +351,7 @@ class Row:
 
     @property
     def suspended(self) -> bool:
-        """Whether a simulation still waits for an action, or a patch is still to be undone."""
+        """Whether a simulation still waits for an action, or something is still to be put back."""
         return not all(session.idle for session in self.sessions)
 
     @staticmethod
@@ -359,6 +359,6 @@ class Row:
         return session.episode is not None and session.episode.pending is not None
 
     def abandon(self) -> None:
-        """Unwind all simulations. It is called by a finalizer and raises nothing."""
+        """Unwind all simulations, from a finalizer: raises nothing."""
         for session in self.sessions:
             session.abandon()

@@ -1,7 +1,7 @@
-"""A worker process with some of the simulations of a vector environment: its recipe, and its main loop.
+"""A process with some of the simulations of a vector environment: what it is made of, and its main loop.
 
-A worker and its parent exchange one message for all of its simulations in each direction. Observations, rewards and
-flags are in shared memory. Observations that are not arrays are part of the message.
+Between a worker and its user goes one message for all of its simulations, and one back. Observations, rewards and flags
+lie in memory that both see; observations of a kind that has no array go along with the message.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ EXIT: Final = b""
 
 
 class _Unlocked:
-    """An array in shared memory without a lock, and so without a semaphore that a killed process could leave."""
+    """An array in shared memory without a lock, and so without a semaphore that a killed process could leave behind."""
 
     def __init__(self, array: Any) -> None:
         self._array = array
 
     def get_obj(self) -> Any:
-        """Return the array, for Gymnasium."""
+        """The array, as Gymnasium asks for it."""
         return self._array
 
 
 class _UnlockedContext:
-    """A context that makes arrays without locks, where a context of ``multiprocessing`` makes those with locks."""
+    """Makes such arrays, as a context of ``multiprocessing`` makes those with locks."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
@@ -54,7 +54,7 @@ class _UnlockedContext:
 
 
 def is_shareable(space: spaces.Space[Any]) -> bool:
-    """Return whether batches of a space consist of arrays of fixed size."""
+    """Whether batches of a space are arrays of one size, and nothing else."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         parts = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
         return all(map(is_shareable, parts))
@@ -62,7 +62,7 @@ def is_shareable(space: spaces.Space[Any]) -> bool:
 
 
 def _record_space(space: spaces.Space[Any]) -> spaces.Dict:
-    """Return the space of everything that a simulation returns in a step."""
+    """The space of all that a simulation tells in a step."""
     flag: Any = spaces.Box(0, 1, (), np.bool_)
     told: dict[str, Any] = {
         "rewards": spaces.Box(-np.inf, np.inf, (), np.float64), "terminations": flag, "truncations": flag,
@@ -71,24 +71,24 @@ def _record_space(space: spaces.Space[Any]) -> spaces.Dict:
 
 
 def share_memory(space: spaces.Space[Any], number: int, context: Any) -> Any:
-    """Make shared memory for the results of many simulations' steps.
+    """Make memory for what many simulations tell in a step.
 
     Args:
-        space: The observation space of one simulation.
-        number: The number of simulations.
+        space: The observation space of one of them.
+        number: How many there are.
         context: The context of ``multiprocessing`` whose processes share it.
     """
     return create_shared_memory(_record_space(space), number, _UnlockedContext(context))  # type: ignore[arg-type]
 
 
 def shared_batch(space: spaces.Space[Any], number: int, memory: Any, share: slice | None = None) -> Batch:
-    """Make a batch whose arrays are in shared memory.
+    """Make a batch whose arrays lie in shared memory.
 
     Args:
         space: The observation space of one simulation.
-        number: The number of simulations.
-        memory: The result of ``share_memory``.
-        share: The simulations of the batch. None: all.
+        number: How many simulations there are.
+        memory: What ``share_memory`` has made.
+        share: The simulations of the batch; None: all.
     """
     told: Any = read_from_shared_memory(_record_space(space), memory, number)
     share = slice(0, number) if share is None else share
@@ -101,7 +101,7 @@ def shared_batch(space: spaces.Space[Any], number: int, memory: Any, share: slic
 
 
 def _part(batch: Any, share: slice) -> Any:
-    """Return some of the rows of batched observations, as views."""
+    """Some of the rows of batched observations, as views."""
     if isinstance(batch, dict):
         return {key: _part(value, share) for key, value in batch.items()}
     if isinstance(batch, tuple):
@@ -114,7 +114,7 @@ def _part(batch: Any, share: slice) -> Any:
 
 @dataclass(frozen=True)
 class Recipe:
-    """The ingredients of a worker's simulations, as they were given to ``vector_env``."""
+    """What the simulations of a worker are made of, as it was given to ``vector_env``."""
 
     simulation: Any
     points: Any
@@ -122,11 +122,11 @@ class Recipe:
     view: str | None
 
     def plan(self) -> Plan:
-        """Make the plan."""
+        """Draw up a plan of it."""
         return Plan.draw_up(self.simulation, self.points, self.options)
 
     def spelt_out(self, common: SubEnvironments) -> Recipe:
-        """Return the same recipe with what only this process knows: the registered points, and the agents."""
+        """The same, with what only this process could find out: which points are registered, which agents there are."""
         points, options = self.points, self.options
         named = [named.point for named in common.plan._named]
         if points is None and [point.name for point in named] == decision_points():
@@ -150,20 +150,20 @@ def work(
     end: int,
     mode: AutoresetMode,
 ) -> None:
-    """Run a worker.
+    """The main function of a worker.
 
     Args:
-        pipe: The pipe to its parent.
-        others: Inherited ends of pipes that are not its own.
+        pipe: To its user.
+        others: Ends of pipes that it has inherited and that are not its own.
         recipe: A pickled recipe.
-        memory: The shared memory.
-        number: The number of all simulations.
+        memory: What both share.
+        number: How many simulations there are in all.
         first: The number of the worker's first simulation.
         end: The number after that of its last one.
-        mode: When episodes that have ended are reset.
+        mode: When episodes that have ended begin anew.
     """
     with suppress(ValueError):  # not in a main thread
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and tells the worker what to do
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for its user, who then says what to do
     for other in others:
         other.close()
     row: Row | None = None
@@ -180,7 +180,7 @@ def work(
         _send(pipe, 0)
         while (message := pipe.recv_bytes()) != EXIT:
             _serve(pipe, row, message, sends_rows=not is_shareable(space))
-    except (EOFError, OSError):  # the parent is gone
+    except (EOFError, OSError):  # its user is gone
         pass
     finally:
         if row is not None:

@@ -1,7 +1,8 @@
-"""Rows of simulations in worker processes, as the parent starts them, talks to them and ends them.
+"""Rows of simulations in processes of their own: how their user starts them, asks them, and brings them to an end.
 
-No wait is endless: a wait for a worker also ends with its death, and a worker without a parent finds its pipe closed.
-The shared memory has no name and there are no semaphores, so that even a killed process leaves nothing behind.
+Nothing here can wait for ever: a wait for a worker also is one for its death, and a worker whose user is gone finds its
+pipe closed. The memory has no name and there are no semaphores, so that nothing is left behind even by a process that
+is killed.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ from .rows import SubEnvironments, Told
 from .worker import EXIT, Recipe, is_shareable, share_memory, shared_batch, work
 
 SECONDS_TO_CLOSE: Final = 10.0
-"""The time in seconds that a worker has to unwind its simulations and to end."""
+"""How long a worker may take to unwind its simulations and to end."""
 
 
 class Worker:
     """A process with some of the simulations.
 
     Attributes:
-        first, end: The range of its simulations; ``end`` is exclusive.
-        name: Its name in messages.
+        first, end: The numbers of its simulations: from the first to before the end.
+        name: What it is called in messages.
     """
 
     def __init__(self, number: int, first: int, end: int) -> None:
@@ -44,13 +45,13 @@ class Worker:
 
     @property
     def there(self) -> bool:
-        """Whether it is running and can be used."""
+        """Whether it can be asked."""
         return self._pipe is not None
 
     def start(
         self, context: Any, inherited: list[Connection], recipe: bytes, memory: Any, setup: dict[str, Any]
     ) -> None:
-        """Start the process. It reports when it is ready, or why it will not be."""
+        """Start the process. It tells when it is ready, or why it will not be."""
         ours, theirs = context.Pipe()
         setup = {**setup, "first": self.first, "end": self.end}
         forked = context.get_start_method() == "fork"
@@ -84,7 +85,7 @@ class Worker:
 
     @property
     def sentinel(self) -> int:
-        """The handle that becomes ready when the process ends."""
+        """Becomes ready when the process ends."""
         return int(self._process.sentinel)
 
     def send(self, message: bytes) -> None:
@@ -97,12 +98,12 @@ class Worker:
             self.pipe.send_bytes(message)
         except OSError:
             raise self.died() from None
-        except BaseException:  # part of the message may have been sent
+        except BaseException:  # the message may be there in part
             self.end_now()
             raise
 
     def receive(self) -> Any:
-        """Receive a message.
+        """Receive what it has sent.
 
         Raises:
             WorkerError: It is dead.
@@ -116,7 +117,7 @@ class Worker:
             raise
 
     def died(self) -> WorkerError:
-        """Clean up after its death; return the error that tells how it died."""
+        """Bury it; the error that says how it died."""
         process = self._process
         process.join(1.0)  # its pipe closes a moment before it ends
         code = process.exitcode
@@ -125,7 +126,7 @@ class Worker:
         script = (
             '. In a script, environments with workers are made under `if __name__ == "__main__":`, because each worker'
             " runs the script once more"
-            if code == 1  # an error, before it could report one
+            if code == 1  # of an error, before it could tell of one
             else ""
         )
         return WorkerError(
@@ -134,7 +135,7 @@ class Worker:
         )
 
     def end_now(self, seconds: float = 0.0) -> None:
-        """End the process, by force if it does not end within some seconds."""
+        """End the process, by force unless it ends by itself within some seconds."""
         process, pipe = self._process, self._pipe
         self._process = self._pipe = None
         if pipe is not None:
@@ -151,11 +152,11 @@ class Worker:
 
 
 class Workers:
-    """Rows in processes; it has the methods of a ``Row``.
+    """Rows in processes: used like a ``Row``.
 
     Attributes:
-        failed: Whether, after an error, some simulations have moved and others have not, so that all need a reset.
-        batch: The batch that they write to.
+        failed: Whether an error has left some simulations where the others are not, and all are to be reset.
+        batch: What they write into.
     """
 
     def __init__(
@@ -164,9 +165,9 @@ class Workers:
         """Start the workers.
 
         Raises:
-            OptionValueError: The context does not exist, or an argument of the environment cannot be pickled.
+            OptionValueError: There is no such context, or what the environment is made of cannot be pickled.
             WorkerError: A worker died.
-            BaseException: Any exception of making a simulation.
+            BaseException: What making a simulation raises.
         """
         self._context = _context(context)
         self._space, self._mode, self._number = common.single_observation_space, mode, number
@@ -194,7 +195,7 @@ class Workers:
             raise
 
     def _hire(self) -> None:
-        """Start the workers that are not running."""
+        """Start the workers that are not there."""
         new = [worker for worker in self._workers if not worker.there]
         if not new:
             return
@@ -205,11 +206,11 @@ class Workers:
         self._gather(new, 0)
 
     def _ask(self, method: str, arguments: Callable[[Worker], tuple[Any, ...] | None]) -> list[tuple[Worker, Any]]:
-        """Send a request to all workers for which there are arguments, and wait for their answers.
+        """Ask all workers for which there are arguments, and wait for their answers.
 
         Raises:
-            WorkerError: A worker is dead.
-            BaseException: The first exception of a worker, in their order.
+            WorkerError: One is dead.
+            BaseException: What the first raises that raises anything.
         """
         self._be_theirs()
         self._identity += 1
@@ -222,21 +223,21 @@ class Workers:
         return self._gather([worker for worker, _ in packed], self._identity)
 
     def _be_theirs(self) -> None:
-        """Check that this process is the parent of the workers.
+        """Make sure that this is the process that they talk to.
 
         Raises:
-            WorkerError: It is a fork of the parent.
+            WorkerError: It is a fork of that.
         """
         if os.getpid() != self._process:
             raise WorkerError(
-                "the workers belong to the process from which this one was forked; make another environment"
+                "the workers are those of the process of which this one is a fork; make another environment"
             )
 
     def _gather(self, asked: list[Worker], identity: int) -> list[tuple[Worker, Any]]:
         """Wait for answers.
 
         Raises:
-            BaseException: The first exception of a worker, in their order.
+            BaseException: What the first worker raises that raises anything.
         """
         results, errors = self._collect(asked, identity)
         for worker in asked:
@@ -247,7 +248,7 @@ class Workers:
     def _collect(
         self, asked: list[Worker], identity: int, seconds: float | None = None
     ) -> tuple[dict[Worker, Any], dict[Worker, BaseException]]:
-        """Wait until all have answered, have died or have exceeded the time. Return results and errors."""
+        """Wait until all have answered, have died or have let some seconds go by. Returns results, and errors."""
         until = None if seconds is None else monotonic() + seconds
         results: dict[Worker, Any] = {}
         errors: dict[Worker, BaseException] = {}
@@ -260,14 +261,14 @@ class Workers:
                 if worker.pipe not in ready and worker.sentinel not in ready:
                     continue
                 try:
-                    if worker.pipe not in ready and not worker.pipe.poll():  # it died without an answer
+                    if worker.pipe not in ready and not worker.pipe.poll():  # it has died, and has not answered before
                         raise worker.died()
                     answered, fine, answer = worker.receive()
                 except WorkerError as error:
                     errors[worker] = error
                     continue
                 if answered != identity:
-                    continue  # the answer to a request before an interrupt
+                    continue  # to what was asked before its user was interrupted
                 if fine:
                     results[worker] = answer
                 else:
@@ -279,7 +280,7 @@ class Workers:
 
     @property
     def ended(self) -> set[int]:
-        """The numbers of the simulations whose episode has ended and was not reset yet."""
+        """The numbers of those whose episode has ended and has not begun anew."""
         batch = self.batch
         if self._mode == AutoresetMode.SAME_STEP or not (batch.terminations.any() or batch.truncations.any()):
             return set()
@@ -287,11 +288,11 @@ class Workers:
 
     @property
     def views(self) -> list[Any]:
-        """The environments of the simulations, which are in other processes."""
+        """The environments of the simulations, which are not here."""
         raise AttributeError("the sub-environments are in other processes; use call(), get_attr() and set_attr()")
 
     def reset(self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: Sequence[int]) -> Told:
-        """Reset as ``Row.reset``; start dead workers anew."""
+        """As ``Row.reset``, and start those workers anew that have died."""
         self.failed = True
 
         def arguments(worker: Worker) -> tuple[Any, ...] | None:
@@ -304,11 +305,11 @@ class Workers:
         return told
 
     def check(self, actions: Sequence[Any]) -> None:
-        """Check actions as ``Row.check``."""
+        """As ``Row.check``."""
         self._ask("check", lambda worker: (actions[worker.first : worker.end],))
 
     def step(self, actions: Sequence[Any]) -> Told:
-        """Step as ``Row.step``."""
+        """As ``Row.step``."""
         self.failed = True
         told = self._told(self._ask("step", lambda worker: (actions[worker.first : worker.end],)))
         self.failed = False
@@ -325,18 +326,18 @@ class Workers:
         return told
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
-        """Call as ``Row.call``."""
+        """As ``Row.call``."""
         return [value for _, values in self._ask("call", lambda _: (name, args, kwargs)) for value in values]
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """Set an attribute as ``Row.set_attr``."""
+        """As ``Row.set_attr``."""
         self._ask("set_attr", lambda worker: (name, values[worker.first : worker.end]))
 
     def close(self) -> None:
         """Unwind all simulations and end the workers, by force after some seconds.
 
         Raises:
-            BaseException: The first exception of a simulation; the others are unwound, too.
+            BaseException: What the first simulation raises that raises anything; the others are unwound all the same.
         """
         self._be_theirs()
         try:
@@ -350,18 +351,18 @@ class Workers:
             if len(results) + len(errors) < len(there):
                 warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are ended by force", ResourceWarning)
             for worker, error in errors.items():
-                if worker.there:  # else it died, and there is nothing to close
+                if worker.there:  # else it has died, and there is nothing left to be closed
                     raise error
         finally:
             self.abandon()
 
     @property
     def suspended(self) -> bool:
-        """Whether something has to be ended in this process; always False."""
+        """Whether something is still to be ended here: nothing is."""
         return False
 
     def abandon(self) -> None:
-        """End the workers. It may be called by a finalizer and raises nothing."""
+        """End the workers; from a finalizer, too: raises nothing."""
         if os.getpid() != self._process:
             return  # they are those of the process of which this is a fork
         for worker in self._workers:

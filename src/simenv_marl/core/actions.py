@@ -1,4 +1,4 @@
-"""What is decided: actions are checked against their space, and legal ones are told by masks."""
+"""Actions: checks against the action space, and masks of the legal actions."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ..simulation import Sentinel
 from .spaces import duplicate
 
 ILLEGAL: Final = Sentinel("ILLEGAL")
-"""What an action check answers for an action outside its space."""
+"""An action check returns this for an action outside its space."""
 
 Check = Callable[[Any], Any]
-"""Takes an action, returns it as its mapping is to receive it, or ``ILLEGAL``."""
+"""Takes an action. Returns it in the form that its mapping receives, or ``ILLEGAL``."""
 
 MASK: Final = "action_mask"
-"""Where PettingZoo and Gymnasium look for the legal actions, in infos and in observations."""
+"""The key of the action mask in infos and in observations, by the convention of PettingZoo and Gymnasium."""
 
-_ONE_BYTE = "?bB"  # the dtypes of which each number is one byte
-_SMALL = 16  # elements up to which comparing python floats beats four numpy calls
+_ONE_BYTE = "?bB"  # dtypes with one byte per number
+_SMALL = 16  # up to this many elements, comparing Python floats is faster than four calls of NumPy
 
 
 # -- checks ----------------------------------------------------------------------------------------
@@ -33,14 +33,14 @@ _SMALL = 16  # elements up to which comparing python floats beats four numpy cal
 def action_check(space: spaces.Space[Any]) -> Check:
     """Make the function that checks actions against a space.
 
-    Integers for a ``Discrete`` come out as python integers, a scalar for a one-element ``Box`` as it went in,
-    and all else as copies, for a ``Box`` in its dtype.
+    The function returns an action of a ``Discrete`` as a Python integer, and a scalar for a one-element ``Box``
+    unchanged. It returns all other actions as copies; those of a ``Box`` have the dtype of the ``Box``.
 
     Args:
         space: The action space, of any kind.
 
     Returns:
-        A function that answers ``ILLEGAL`` for what is not in the space.
+        A function that returns ``ILLEGAL`` for an action outside the space.
     """
     if isinstance(space, spaces.Discrete):
         return _discrete_check(space)
@@ -50,7 +50,7 @@ def action_check(space: spaces.Space[Any]) -> Check:
     def check(action: Any) -> Any:
         try:
             return duplicate(action) if space.contains(action) else ILLEGAL
-        except Exception:  # a space may choke on what is none of its elements
+        except Exception:  # some spaces raise for a value that is not in them
             return ILLEGAL
 
     return check
@@ -74,7 +74,7 @@ def _discrete_check(space: spaces.Discrete) -> Check:
 
 
 def _scalar(action: Any) -> Any:
-    """The one element of an array without axes; None for all else."""
+    """The element of a zero-dimensional array; None for all other values."""
     return action[()] if isinstance(action, np.ndarray) and action.shape == () else None
 
 
@@ -104,9 +104,9 @@ def _box_check(space: spaces.Box) -> Check:
             return ILLEGAL
         if array.dtype.kind not in kinds or (array.shape != shape and not (scalar and array.shape == ())):
             return ILLEGAL
-        if kinds == "iu":  # compared before the cast, which may wrap integers around
+        if kinds == "iu":  # compare before the cast, because the cast may wrap integers around
             cast = array.astype(dtype, copy=True) if legal(array) else None
-        else:  # compared after the cast, so that a bound is legal in every precision
+        else:  # compare after the cast, so that a bound is legal in every precision
             with np.errstate(over="ignore"):
                 cast = array.astype(dtype, copy=True)
             cast = cast if legal(cast) else None
@@ -118,13 +118,13 @@ def _box_check(space: spaces.Box) -> Check:
 
 
 def clipping_check(space: spaces.Space[Any]) -> Check:
-    """Make the function that checks actions against a space, once those of its ``Box`` spaces are clipped.
+    """Make the function that clips the parts of actions that belong to a ``Box``, and checks the result.
 
     Args:
         space: The action space, of any kind.
 
     Returns:
-        A function that answers ``ILLEGAL`` for what is not in the space but for lying outside a ``Box``.
+        A function that returns ``ILLEGAL`` for an action that is not in the space even after clipping.
     """
     check, clip = action_check(space), partial(_clipped, space)
 
@@ -136,7 +136,7 @@ def clipping_check(space: spaces.Space[Any]) -> Check:
 
 
 def _clipped(space: spaces.Space[Any], action: Any) -> Any:
-    """An action with its numbers clipped into the ``Box`` spaces of a space; what does not fit them, as it is."""
+    """Clip the numbers of an action into the ``Box`` spaces of a space; leave parts that do not fit unchanged."""
     if isinstance(space, spaces.Dict) and isinstance(action, Mapping):
         return {key: _clipped(space[key], part) if key in space.spaces else part for key, part in action.items()}
     if isinstance(space, spaces.Tuple) and isinstance(action, (tuple, list)) and len(action) == len(space):
@@ -160,14 +160,14 @@ def _clipped(space: spaces.Space[Any], action: Any) -> Any:
 
 
 def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
-    """Make the function that casts the legal actions to a mask of an action space.
+    """Make the function that casts a mask of the legal actions of an action space.
 
     Args:
         space: A ``Discrete`` (mask of shape ``(n,)``) or ``MultiDiscrete`` (a tuple of masks).
 
     Returns:
-        A function that gives the mask as new np.int8 arrays of 0 and 1, and raises ``MaskError`` for a
-        mask of another shape, with other values or with no legal action.
+        A function that returns the mask as new np.int8 arrays of 0 and 1. It raises ``MaskError`` for a mask that
+        has another shape or other values, or that allows no action.
     """
     if isinstance(space, spaces.MultiDiscrete):
         parts = [_mask_of(int(number), space) for number in space.nvec.ravel()]
@@ -193,7 +193,7 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
             given, mask = mask, mask.astype(bool)
             if not (mask == given).all():
                 raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
-        marks = mask.tobytes()  # comparing bytes beats three numpy calls
+        marks = mask.tobytes()  # comparing bytes is faster than three calls of NumPy
         if marks.strip(b"\0\1"):
             raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
         if 1 not in marks:
@@ -204,7 +204,7 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
 
 
 def open_mask(space: spaces.Space[Any]) -> Any:
-    """Make the mask of an action space that allows everything."""
+    """Make the mask of an action space that allows every action."""
     if isinstance(space, spaces.MultiDiscrete):
         return tuple(np.ones(int(number), np.int8) for number in space.nvec.ravel())
     assert isinstance(space, spaces.Discrete)
@@ -212,7 +212,7 @@ def open_mask(space: spaces.Space[Any]) -> Any:
 
 
 def mask_allows(space: spaces.Space[Any], mask: Any, action: Any) -> bool:
-    """Whether a mask of ``mask_cast`` allows an action that is in the space."""
+    """Whether a mask that ``mask_cast`` returned allows an action of the space."""
     if isinstance(space, spaces.MultiDiscrete):
         choices = (action - space.start).ravel()
         return all(part[choice] for part, choice in zip(mask, choices, strict=True))
@@ -221,11 +221,11 @@ def mask_allows(space: spaces.Space[Any], mask: Any, action: Any) -> bool:
 
 
 def only_choice(space: spaces.Space[Any], mask: Any) -> Any:
-    """The one legal action of a space; None where there are several.
+    """The only legal action of a space; None if there are several.
 
     Args:
         space: The action space.
-        mask: What ``mask_cast`` has made; None: all of the space is legal.
+        mask: A mask that ``mask_cast`` returned. None: all actions of the space are legal.
     """
     if isinstance(space, spaces.MultiDiscrete):
         parts = open_mask(space) if mask is None else mask

@@ -1,4 +1,4 @@
-"""What an episode knows of one agent: what becomes of its decisions, how it is rewarded and observed."""
+"""One agent of an episode: how its decisions are handled, and how it is rewarded and observed."""
 
 from __future__ import annotations
 
@@ -24,45 +24,45 @@ if TYPE_CHECKING:
     from .episode import Episode
 
 WAIT: Final = Sentinel("WAIT")
-"""Returned in place of a reply to the simulation: the episode waits for an action, or is over."""
+"""Returned instead of a reply to the simulation if the episode waits for an action, or is over."""
 
 _NOTHING: Final[dict[str, Any]] = {}
-"""The keyword arguments of calls that have none. It is only ever unpacked."""
+"""The keyword arguments of calls without any. Nothing writes to this dict."""
 
 
 class Agent:
-    """What an episode knows of one agent.
+    """One agent of an episode.
 
     Attributes:
-        name: Its name.
-        point: The decision point at which it decides.
-        policy: The policy that answers for it; None: the environment's user.
-        deferred: Whether that policy answers many decisions at once, and so an episode waits for it.
-        looks: Whether that policy is given the environment.
-        consultations: How often such a policy was asked at once.
-        clock: Returns the simulation's time; None where it has none.
+        name: The name.
+        point: The decision point at which the agent decides.
+        policy: The policy that answers the agent's decisions. None: the environment's user answers them.
+        deferred: Whether that policy answers many decisions at once, so that the episode waits for it.
+        looks: Whether that policy gets the environment.
+        consultations: How many of the agent's decisions were put to a policy that gets the environment.
+        clock: Returns the simulation's time. None if the simulation has no time.
         settle: Rewards and observes the agent: see ``settling``.
-        settle_again: The same once it has decided before.
-        decided: Whether its reward mapping was asked in this episode; the first value is dropped.
-        acted: Whether an action of its user was used in the latest round.
-        ended: Whether its episode has ended before the simulation's.
-        led: Whether its decisions are none of its user's any more.
-        present: Whether its latest info comes from an observation; False where there was nothing to observe.
-        reward: The reward of its action before, as of its latest decision or its end.
-        asked: Whether its user was asked for an action in this episode, where forced moves are skipped.
-        carried: The rewards of its forced moves that its next reward is to tell.
-        observation: Its latest observation, cast to its space; None before its first observation.
-        handed_out: The observation that a view has given away, and which is not to be given away again.
-        info: The info of its latest decision, a dict of its own.
-        mask, choices: The legal actions of its pending decision, where its point restricts them.
-        offered: The choices of its latest decision, where the rule's decision is to be found among them.
-        rule_action: The action that its latest decision by the rule corresponds to; None if that is not known.
-        memory: What differences remember for it.
-        plugins: The plugins of its environment; None if it has none.
-        now, answered_at: The time of its latest decision, and of the decision before.
-        entity, rest, kwargs: The arguments of its latest decision: see ``keep``.
-        tells: Whether its next info tells of ``rule_action``.
-        group, notes: What a runner of many episodes keeps of it.
+        settle_again: Does the same for an agent that has decided before.
+        decided: Whether the reward mapping was called in this episode. Its first value is dropped.
+        acted: Whether the latest round used an action that the user gave for the agent.
+        ended: Whether the agent's episode ended before the simulation's.
+        led: Whether the environment's user no longer answers the agent's decisions.
+        present: Whether the latest info comes from an observation. False if there was nothing to observe.
+        reward: The reward of the agent's previous action, as of its latest decision or its end.
+        asked: Whether the user was asked for an action in this episode. Used where forced moves are skipped.
+        carried: The sum of the rewards of forced moves. It is added to the agent's next reward.
+        observation: The latest observation, cast to its space. None before the first one.
+        handed_out: The observation that a view has returned and must not return a second time.
+        info: The info of the latest decision. The dict is the agent's own.
+        mask, choices: The legal actions of the pending decision, if the decision point restricts them.
+        offered: The choices of the latest decision, among which the rule's decision is looked up.
+        rule_action: The action that corresponds to the rule's latest decision. None if it is not known.
+        memory: The values that ``difference`` remembers for the agent.
+        plugins: The plugins of the environment. None if it has none.
+        now, answered_at: The times of the latest decision and of the one before.
+        entity, rest, kwargs: The arguments of the latest decision: see ``keep``.
+        tells: Whether the next info contains ``rule_action``.
+        group, notes: Used by runners of many episodes.
     """
 
     __slots__ = (
@@ -99,7 +99,7 @@ class Agent:
         self.kwargs: dict[str, Any] = _NOTHING
 
     def follow(self, policy: Any) -> None:
-        """Have a policy answer for it; None: the environment's user."""
+        """Let a policy answer the agent's decisions. None: the environment's user answers them."""
         self.policy = policy
         self.deferred, self.looks = isinstance(policy, DeferredPolicy), isinstance(policy, AskingPolicy)
 
@@ -108,47 +108,47 @@ class Agent:
     def keep(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
         """Keep the arguments of a decision.
 
-        The first one of an entity-level point is kept weakly where it can be, so that the model can let go of the
-        entity. While its decision is pending, the simulation holds it.
+        At an entity-level point the first argument is the entity. It is held by a weak reference if it supports one,
+        so that the model can free it. While the decision is pending, the simulation holds it.
 
         Returns:
-            Whether the entity is another one than before.
+            Whether the entity is a different one than before.
         """
         before, self.entity, self.rest, self.kwargs = self.entity, None, args, kwargs
         if not args or self.point.agent is not None:
             return False
-        with suppress(TypeError):  # what cannot be referred to weakly
+        with suppress(TypeError):  # not every object supports weak references
             self.entity, self.rest = ref(args[0]), args[1:]
         return self.entity is None or self.entity is not before
 
     def arguments(self) -> tuple[Any, ...] | None:
-        """The positional arguments of the latest decision; None where there was none, or the entity is gone."""
+        """The positional arguments of the latest decision; None if there was none, or if the entity is gone."""
         if self.entity is None:
             return self.rest
         first = self.entity()
         return None if first is None else (first, *self.rest)  # type: ignore[misc]
 
     def release(self) -> None:
-        """Let go of the arguments; the agent has no more to observe."""
+        """Release the arguments. The agent has nothing more to observe."""
         self.entity = self.rest = self.answered_at = None
         self.kwargs = _NOTHING
 
-    # -- what becomes of a decision ---------------------------------------------------------------
+    # -- decisions --------------------------------------------------------------------------------
 
     @property
     def deliver(self) -> Callable[..., Any] | None:
-        """Turns a reply into what a call of its decision function returns: see ``BoundPoint``."""
+        """Turns a reply into the value that the decision function returns: see ``BoundPoint``."""
         return self.point.deliver
 
     @property
     def told(self) -> Any:
-        """The event that tells what its rule decides: see ``BoundPoint``."""
+        """The event that reports what the rule decides: see ``BoundPoint``."""
         return self.point.told
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Decide: be settled, and wait for an action; or do what is to be done in its stead.
+        """Handle a decision: settle the agent and wait for an action, or do what the episode does instead.
 
-        Where its point has no other agent, the agent itself is the event that crosses from the simulation.
+        If the decision point has no other agent, the agent itself is the event that the simulation sends.
         """
         point = self.point
         if point.agent is None:
@@ -162,18 +162,18 @@ class Agent:
         else:
             if point.one_entity and args and self.rest and self.rest[0] is not args[0]:
                 point.warn_of_several(self.name)
-            self.rest, self.kwargs = args, kwargs  # what it is called on is no entity that a model would let go
+            self.rest, self.kwargs = args, kwargs  # a strong reference: the first argument is no entity of the model
         episode.latest = self
         decide = episode.decide
-        if decide is not None:  # in a round, or when the last step has been taken
+        if decide is not None:  # in a round, after the last step, or where forced moves are skipped
             return decide(episode, self, args, kwargs)
-        settle = self.settle_again  # fetched before it is called: calling it at its attribute is slower
+        settle = self.settle_again  # a local variable: calling the attribute directly is slower
         settle(self, args, kwargs)
         episode.pending = self
         return WAIT
 
     def choose(self, action: Any) -> Any:
-        """Turn a checked action into the choice that it stands for, in a box, or leave it to ``RULE``."""
+        """Return the choice that a checked action stands for, in a list of one; return ``RULE`` unchanged."""
         choices, self.choices = self.choices, None
         if self.point.recorded:
             self.offered = choices
@@ -182,7 +182,7 @@ class Agent:
     # -- infos ------------------------------------------------------------------------------------
 
     def inform(self) -> dict[str, Any]:
-        """Make the info of an observation: the time, the mask, the rule's action."""
+        """Make the info of an observation: the time, the action mask and the rule's action."""
         info: dict[str, Any] = {} if self.clock is None else self.tell_time()
         mask = self.mask
         if mask is not None:
@@ -194,14 +194,14 @@ class Agent:
         return info
 
     def unsee(self) -> None:
-        """Have nothing to observe: no reward, and the info of any other agent of its point with all actions legal."""
+        """Set the reward to 0.0, and the info to that of an agent with nothing to observe and all actions legal."""
         self.reward, self.present = 0.0, False
         self.info = {} if self.clock is None else self.tell_time()
         if self.point.legal is not None:
             self.info[MASK] = self.point.open_mask()
 
     def tell_time(self) -> dict[str, Any]:
-        """The simulation's time, and how much of it has gone by since the agent's decision before."""
+        """Note the time. Return it, and the time elapsed since the agent's previous decision, as an info."""
         clock: Any = self.clock
         time, before = clock(), self.answered_at
         self.now = now = time if type(time) is float else float(time)
@@ -213,13 +213,13 @@ Settle = Callable[..., None]
 
 
 def settling(point: BoundPoint) -> tuple[Settle, Settle]:
-    """Make what rewards and observes the agents of a decision point.
+    """Make the functions that reward and observe the agents of a decision point.
 
     Returns:
-        Two functions of the agent, and of the arguments of the call that is decided on: positional, and by keyword. The
-        first takes three flags besides: whether it rewards, whether it observes, and whether this is the agent's end.
-        The second is for agents that have decided before; it leaves out what the point does not need. Both raise
-        ``RewardError``, ``ObservationError`` and ``MaskError``.
+        Two functions. Both take the agent, and the positional and keyword arguments of the call of the decision
+        function. The first also takes three flags: whether to reward, whether to observe, and whether this is the
+        agent's end. The second is for agents that have decided before, and skips what the point does not need.
+        Both raise ``RewardError``, ``ObservationError`` and ``MaskError``.
     """
     reward_mapping, observation_mapping, cast = point.reward_mapping, point.observation_mapping, point.cast
     legal, masked = point.legal, bool(point.masked_parts)
@@ -242,7 +242,7 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
                 if type(value) is not float or value - value != 0.0:
                     value = checked_reward(agent, value)
                 agent.reward = value
-            elif reward and not last:  # nothing was done yet that could be rewarded
+            elif reward and not last:  # the agent has not acted yet, so this value rewards nothing
                 reward_mapping(*args, **kwargs)
                 agent.decided, agent.settle_again = True, again
             if observe:
@@ -253,7 +253,7 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
                     except MaskError:
                         if not last:
                             raise
-                        # At its end an agent is asked nothing more, and so nothing needs to be legal.
+                        # The agent will not be asked again, so no action needs to be legal.
                         agent.mask, agent.choices = point.open_mask(), None
                 agent.info = {} if quiet and agent.clock is None else agent.inform()
                 if masked:
@@ -266,7 +266,7 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
                     point.finite(agent.observation)
         finally:
             if here is not None:
-                if before is None:  # no function is called: at the end of the stack none might run
+                if before is None:  # without a function call, which could fail at the recursion limit
                     del EVALUATING[here]
                 else:
                     EVALUATING[here] = before
@@ -284,7 +284,7 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
             agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
         finally:
             if here is not None:
-                if before is None:  # no function is called: at the end of the stack none might run
+                if before is None:  # without a function call, which could fail at the recursion limit
                     del EVALUATING[here]
                 else:
                     EVALUATING[here] = before
@@ -294,10 +294,10 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
 
 
 def checked_reward(agent: Agent, reward: Any) -> float:
-    """A reward as a python float.
+    """Convert a reward to a Python float.
 
     Raises:
-        RewardError: It is not one finite number.
+        RewardError: The reward is not one finite number.
     """
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):

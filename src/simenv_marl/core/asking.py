@@ -1,10 +1,11 @@
-"""Policies that ask for the environment in which they decide: those with a keyword-only parameter ``_environment``.
+"""Policies that ask for the environment in which they decide: they have a keyword-only parameter ``_environment``.
 
-Such a policy is wrapped when a plan binds it, so that nothing is paid for it where no policy asks. What it is given is
-made by the views, of which this room knows nothing: they say how, in ``AskingPolicy.make``.
+A plan wraps such a policy when it binds it, so that other policies cost nothing extra. The views make the environment
+that the policy gets. This module does not know the views; they set ``AskingPolicy.make``.
 
-In a branch of such an environment, and in one in which a planner tries out a candidate, no policy is given another one:
-two that branch would ask each other for ever. Its ``base`` answers there, if it has that attribute, else the rule.
+In a branch of such an environment, and in a branch in which a planner tries a candidate action, no policy gets an
+environment: two policies that branch would ask each other for ever. There the policy's attribute ``base`` answers, or
+the rule if the policy has none.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from ..simulation import RULE, positional
 from .bound import asks_for
 
 PLANNING: Final[ContextVar[bool]] = ContextVar("simenv_marl.planning", default=False)
-"""Whether this runs in a branch in which a planner tries out a candidate."""
+"""Whether this code runs in a branch in which a planner tries a candidate action."""
 
 ENVIRONMENT: Final = "_environment"
-"""The parameter of policies that ask for the environment."""
+"""The parameter by which a policy asks for the environment."""
 
 
 def takes_info(policy: Callable[..., Any]) -> bool:
-    """Whether a policy is to be called with the observation and the info, and not with the observation alone."""
+    """Whether a policy takes the observation and the info, and not the observation alone."""
     parameters = positional(policy)
     return len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info")
 
@@ -38,14 +39,14 @@ def asks_for_environment(policy: Any) -> bool:
 
 
 def base_of(base: Any, agent: str) -> Any:
-    """Who decides for an agent where a base does: one by agent is looked up, and a planner is its own base.
+    """Find the base policy of an agent. A dict is looked up by agent; a planner is replaced by its own base.
 
     Args:
         base: ``RULE``, a policy, or a dict of these by agent.
-        agent: The agent.
+        agent: The agent's name.
 
     Returns:
-        ``RULE`` or a policy; one that asks for the environment only where it has no attribute ``base``.
+        ``RULE`` or a policy. The policy asks for the environment only if it has no attribute ``base``.
     """
     while True:
         if isinstance(base, Mapping):
@@ -57,14 +58,14 @@ def base_of(base: Any, agent: str) -> Any:
 
 
 class AskingPolicy:
-    """A policy that is given the environment, with its decision pending.
+    """The wrapper of a policy that gets the environment, with the decision pending.
 
     Attributes:
-        policy: The policy.
+        policy: The wrapped policy.
     """
 
     make: Callable[[Any], Any]
-    """Makes the environment of a session, in which such a policy decides; set by the views."""
+    """Takes a session and makes the environment that the policy gets. The views set it."""
 
     def __init__(self, policy: Callable[..., Any]) -> None:
         self.policy = policy
@@ -72,7 +73,7 @@ class AskingPolicy:
         self._session: Callable[[], Any] = _nothing
 
     def given(self, session: Any) -> AskingPolicy:
-        """The same, for the episodes of a session, which is held weakly."""
+        """Copy the wrapper for the episodes of a session, which it holds by a weak reference."""
         made = copy.copy(self)
         made._session = ref(session)
         return made
@@ -81,8 +82,8 @@ class AskingPolicy:
         """Ask the policy.
 
         Raises:
-            OptionValueError: It is asked where there is no one episode.
-            BaseException: What the policy raises.
+            OptionValueError: There is no session, and so no environment to give.
+            BaseException: Any error that the policy raises.
         """
         session = self._session()
         if session is None:
@@ -95,22 +96,22 @@ class AskingPolicy:
         return self.answer(observation, info, AskingPolicy.make(session))
 
     def _by_base(self, observation: Any, info: Any, agent: str) -> Any:
-        """What the policy's base answers for an agent."""
+        """Ask the policy's base for the action of an agent."""
         base = base_of(getattr(self.policy, "base", RULE), agent)
         if base is RULE or not callable(base) or asks_for_environment(base):
             return RULE
         return base(observation, info) if takes_info(base) else base(observation)
 
     def answer(self, observation: Any, info: Any, environment: Any) -> Any:
-        """What the policy answers in an environment."""
+        """Ask the policy for an action, and give it an environment."""
         given = (observation, info) if self._informed else (observation,)
         return self.policy(*given, **{ENVIRONMENT: environment})
 
 
 def _nothing() -> None:
-    """Stands for a session that is not known."""
+    """Stand for a session that is not known."""
 
 
 def given_session(policy: Any, session: Any) -> Any:
-    """A policy of a plan, with the session given to it if it asks for the environment."""
+    """Give a session to a policy that asks for the environment; return any other policy unchanged."""
     return policy.given(session) if isinstance(policy, AskingPolicy) else policy

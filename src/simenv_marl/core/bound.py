@@ -1,4 +1,4 @@
-"""Decision points under one environment's definitions, made ready to be called."""
+"""Decision points bound to the definitions of one environment, ready to be called."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from .actions import ILLEGAL, MASK
 from .points import NamedPoint
 
 Policy = Callable[[Any, dict[str, Any]], Any]
-"""A policy as the episode calls it: of the observation and the info, returns the action."""
+"""A policy as the episode calls it: it takes the observation and the info, and returns the action."""
 
 
 class DeferredPolicy:
-    """A policy that answers many decisions at once: an episode waits for it as it waits for its user."""
+    """A policy that answers many decisions in one call. An episode waits for it as it waits for the user."""
 
     def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer a decision at once, of an episode that is a branch and waits for one agent alone."""
+        """Answer one decision at once, in an episode that is a branch and waits for one agent only."""
         raise NotImplementedError
 
 
@@ -34,7 +34,7 @@ MAPPINGS: Final = (
     "observation_space_mapping", "action_space_mapping", "reward_mapping", "apply", "choices", "rule_action_mapping",
     "agent", "action_mask_mapping", "achieved_goal_mapping", "desired_goal_mapping",
 )  # fmt: skip
-"""Those parts of a definition, beside ``removed_by``, that get the simulation if they ask for it."""
+"""The parts of a definition, besides ``removed_by``, that get the simulation if they ask for it."""
 
 
 def asks_for_simulation(function: Any) -> bool:
@@ -43,7 +43,7 @@ def asks_for_simulation(function: Any) -> bool:
 
 
 def asks_for(function: Any, name: str) -> bool:
-    """Whether a function has a keyword-only parameter of a name."""
+    """Whether a function has a keyword-only parameter with a given name."""
     if not callable(function):
         return False
     if type(function) is FunctionType and not hasattr(function, "__wrapped__"):
@@ -55,16 +55,19 @@ def asks_for(function: Any, name: str) -> bool:
         return False
     if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
         return False
-    own = inspect.signature(function, follow_wrapped=False).parameters  # what is wrapped may be given it by the wrapper
+    own = inspect.signature(function, follow_wrapped=False).parameters  # a wrapper may pass it on as **kwargs
     return name in own or any(p.kind is p.VAR_KEYWORD for p in own.values())
 
 
 def given_simulation(definition: Definition, simulation: Any) -> Definition:
-    """The same definition, with the simulation given to those of its mappings that ask for it.
+    """Give the simulation to the mappings of a definition that ask for it.
 
     Args:
         definition: The definition.
-        simulation: The simulation; None to find out whether any of them asks.
+        simulation: The simulation. None serves to find out whether any mapping asks.
+
+    Returns:
+        The changed definition; the given definition itself if no mapping asks.
     """
 
     def given(function: Any) -> Any:
@@ -79,27 +82,29 @@ def given_simulation(definition: Definition, simulation: Any) -> Definition:
 
 
 class BoundPoint:
-    """A decision point under one environment's definition. Holds nothing of any episode.
+    """A decision point bound to the definition of one environment. It holds no state of any episode.
 
     Attributes:
         point: The decision point.
-        definition: Its definition.
-        agent: The name of its agent; None where ``name_agent`` tells it at each call.
-        name_agent: A callable of the call's arguments; None where ``agent`` tells it.
-        policy: The policy that answers all its decisions; None: its agents' own policies, or the environment's user.
+        definition: The definition.
+        agent: The name of the agent. None if ``name_agent`` names it at each call.
+        name_agent: A callable that takes the call's arguments and names the agent. None if ``agent`` names it.
+        policy: The policy that answers all decisions of the point. None: the agents' own policies answer them, or the
+            environment's user does.
         reward_mapping, observation_mapping: The mappings.
-        cast: Casts observations to their space.
-        finite: Makes sure that an observation is finite where its space is bounded; None where it is not.
-        check: Checks an action against its space; returns it as its mapping is to receive it, or ``ILLEGAL``.
+        cast: Casts an observation to the observation space.
+        finite: Raises for an observation that is not finite where its space is bounded. None if no bound is finite.
+        check: Checks an action against the action space. Returns it in the form that its mapping receives, or
+            ``ILLEGAL``.
         convert: Turns a checked action into the reply to the simulation.
-        legal: Returns the mask of a call, and the choices if it has any; None where all actions are always legal.
-        deliver: In the simulation, turns the reply into what a call of the decision function returns; None where the
-            reply is that.
-        tells: Whether infos tell which action a decision of the rule corresponds to.
-        recorded: Whether the episode is told what the rule decides.
-        told: The event that tells it; None if it is not told.
+        legal: Returns the mask of a call, and its choices if it has any. None if all actions are always legal.
+        deliver: Turns the reply, on the simulation's side, into the value that the decision function returns. None if
+            the reply is that value.
+        tells: Whether infos contain the action that corresponds to a decision of the rule.
+        recorded: Whether the simulation reports the rule's decisions to the episode.
+        told: The event that reports them. None if they are not reported.
         settle: Rewards and observes the agents of the point.
-        one_entity: Whether all its decisions are taken to be those of one object, since nothing was said of agents.
+        one_entity: Whether one object is expected to make all decisions, because the definition does not name agents.
     """
 
     __slots__ = (
@@ -120,11 +125,11 @@ class BoundPoint:
         """Bind a decision point.
 
         Args:
-            named: The decision point, and its definition.
-            agent: The name of its agent; None where it has many.
-            policy: The policy that answers all its decisions.
-            recorded: Whether decisions are recorded, those of the rule included.
-            clips: Whether actions of ``Box`` spaces are clipped.
+            named: The decision point and its definition.
+            agent: The name of its agent. None if a callable names its agents.
+            policy: The policy that answers all decisions of the point.
+            recorded: Whether decisions are recorded, including those of the rule.
+            clips: Whether actions outside a ``Box`` are clipped.
         """
         definition = named.definition
         self.point: DecisionPoint = named.point
@@ -151,7 +156,7 @@ class BoundPoint:
         self.legal = _legal(definition, named.point.name)
 
     def warn_of_several(self, agent: str) -> None:
-        """Warn that several objects decide under one name; once."""
+        """Warn once that several objects decide under the name of one agent."""
         self.one_entity = False
         warn_user(
             f"several objects decide at {self.point.name} as one agent, {agent!r}: their rewards and differences mix."
@@ -161,7 +166,7 @@ class BoundPoint:
     # -- observations -----------------------------------------------------------------------------
 
     def observe(self, args: tuple[Any, ...], kwargs: dict[str, Any], mask: Any) -> Any:
-        """Observe a call, and put its mask where the observation space has a place for it.
+        """Observe a call. Where the observation space has an entry for the action mask, put the mask there.
 
         Raises:
             ObservationError: The observation does not fit its space.
@@ -175,7 +180,7 @@ class BoundPoint:
         return self.cast(value)
 
     def blank(self) -> Any:
-        """Make the observation of an agent that was not observed yet: zero, and with all actions legal."""
+        """Make the observation of an agent that was not observed yet: zero, with all actions legal."""
         observation = spaces.blank(self.definition.observation_space)
         if self.legal is None or not self.masked_parts:
             return observation
@@ -200,10 +205,10 @@ class BoundPoint:
         Args:
             action: The action.
             agent: The agent whose action it is.
-            mask: Which actions are legal; None: all of the space.
+            mask: The mask of the legal actions. None: all actions of the space are legal.
 
         Returns:
-            The action as ``convert`` takes it.
+            The action in the form that ``convert`` takes.
 
         Raises:
             InvalidActionError: The action is not legal.
@@ -223,15 +228,15 @@ class BoundPoint:
 
         Args:
             decision: The decision.
-            args: The arguments of the call that was decided.
-            kwargs: Those passed by keyword.
-            choices: The choices of the call, where the point has choices.
+            args: The positional arguments of the call that was decided.
+            kwargs: Its keyword arguments.
+            choices: The choices of the call, if the point has choices.
 
         Returns:
             The action; None if no action corresponds.
 
         Raises:
-            InvalidActionError: The action that corresponds is not in the action space.
+            InvalidActionError: The corresponding action is not in the action space.
         """
         definition = self.definition
         if self._rule_action is not None:
@@ -248,7 +253,7 @@ class BoundPoint:
             return next(same, None)
         try:
             return None if self._inverse is None else self._inverse.get(decision)
-        except TypeError:  # a decision that cannot be looked up
+        except TypeError:  # the decision is not hashable
             return None
 
 
@@ -257,7 +262,7 @@ def _same(action: Any) -> Any:
 
 
 def _masked_parts(space: gym_spaces.Space[Any]) -> list[str]:
-    """The keys of those parts of an observation that hold a mask; "" stands for the whole observation."""
+    """The keys of the parts of an observation that contain a mask; "" stands for the whole observation."""
     parts: dict[str, Any] = {"": space}
     if isinstance(space, gym_spaces.Dict) and "desired_goal" in space.spaces:
         parts["observation"] = space["observation"]
@@ -268,7 +273,7 @@ def _masked_parts(space: gym_spaces.Space[Any]) -> list[str]:
 
 
 def _rule_action(mapping: Any) -> Callable[..., Any] | None:
-    """Let ``rule_action_mapping`` be called with the decision and the call's arguments, whatever it is."""
+    """Make ``rule_action_mapping``, a dict or a callable, a function of the decision and the call's arguments."""
     if mapping is None:
         return None
     return _look_back(mapping) if isinstance(mapping, Mapping) else _of_decision(mapping)
@@ -290,7 +295,7 @@ def _look_back(actions: Mapping[Any, Any]) -> Callable[..., Any]:
 
 
 def _of_decision(mapping: Callable[..., Any]) -> Callable[..., Any]:
-    """Let a mapping be called with the decision and the call's arguments, whether it takes these or not."""
+    """Make a mapping a function of the decision and the call's arguments, even if it takes the decision only."""
     try:
         parameters = list(inspect.signature(mapping).parameters.values())
     except (TypeError, ValueError):
@@ -330,7 +335,7 @@ def _chosen(mapping: Callable[..., Any], most: int, name: str, args: Any, kwargs
 
 
 def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
-    """Make what turns a reply into the value of a call, which for a generator function is a generator."""
+    """Make the function that turns a reply into the value of a call; for a generator function that is a generator."""
     apply = definition.apply
     if definition.choices is not None:
         apply = _unboxed if apply is None else partial(_applied, apply)
@@ -348,12 +353,12 @@ def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
 
 
 def _unboxed(box: list[Any], *args: Any, **kwargs: Any) -> Any:
-    """The choice in a box, in which it crosses so that the user's side keeps nothing of it alive."""
+    """Take the choice out of its list. It crosses in a list so that the user's side keeps no reference to it."""
     return box.pop()
 
 
 def _applied(apply: Callable[..., Any], box: list[Any], *args: Any, **kwargs: Any) -> Any:
-    """Do with the choice in a box what ``apply`` does."""
+    """Call ``apply`` with the choice, which crosses in a list."""
     return apply(box.pop(), *args, **kwargs)
 
 

@@ -1,7 +1,7 @@
 """The threads, processes and sockets that simulations open.
 
-In a thread that a simulation has started decisions are refused: the simulation itself goes on meanwhile. A forked
-process cannot go on with any of them.
+A decision in a thread that the simulation started is refused, because the simulation itself runs on meanwhile. None of
+these things continue to work in a forked process.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 class Children:
-    """What one simulation has started and opened, over all its episodes.
+    """The threads, processes and sockets that one simulation has opened, over all its episodes.
 
     Attributes:
-        driver: The simulation's; None once its stack has ended, when decision functions run their rule.
+        driver: The simulation's driver. None once its stack has ended; from then on decision functions run their rule.
     """
 
     __slots__ = ("_opened", "driver")
@@ -38,11 +38,11 @@ class Children:
         self._opened: WeakSet[Any] = WeakSet()
 
     def note(self, thing: Any) -> None:
-        """Note what the simulation has opened."""
+        """Note a thing that the simulation has opened."""
         self._opened.add(thing)
 
     def alive(self) -> dict[Any, str]:
-        """What of all that is not over yet: in some words each, sockets by descriptor."""
+        """Describe each thing that is still alive or open, in a few words. The keys of sockets are descriptors."""
         found: dict[Any, str] = {}
         for thread in STACKS.values():
             if isinstance(thread, ChildThread) and thread.children is self:
@@ -57,7 +57,7 @@ class Children:
 
 
 class ChildThread:
-    """Stands in ``STACKS`` for a thread that a simulation has started: decisions are refused there."""
+    """The entry in ``STACKS`` for a thread that a simulation started. Decisions are refused there."""
 
     plugins: Any = None
 
@@ -66,25 +66,25 @@ class ChildThread:
         self._thread = get_ident()
 
     def taker(self, hook: Hook, here: greenlet) -> Taker | None:
-        """What refuses a decision that the environment would have to make."""
+        """The function that refuses a call which the environment would have to decide; None for other calls."""
         return self.refusal_of(hook, "a thread that the simulation has started")
 
     def refusal_of(self, hook: Hook, where: str) -> Taker | None:
-        """The same, wherever it is asked for."""
+        """The same, with a description of the place of the call for the error message."""
         driver = self.children.driver
         return None if driver is None else driver.refusal_of(hook, where)
 
     def hide(self) -> None:
-        """There is nothing to hide: it is entered in no hook."""
+        """Do nothing: no hook has an entry for this thread."""
 
     show = forked_worker = hide
 
     def decides(self, hook: Hook) -> bool:
-        """Nothing is decided there."""
+        """Return False: nothing is decided in this thread."""
         return False
 
     def forked(self) -> None:
-        """The process was forked, and this is the child, in which only one thread is left."""
+        """Remove the entries of a thread that does not exist in this process, the child of a fork."""
         if self._thread != get_ident():
             for stack in [stack for stack, thread in STACKS.items() if thread is self]:
                 del STACKS[stack]
@@ -119,7 +119,7 @@ def _opening(open_it: Any) -> Any:
 
 
 class _Watch:
-    """A method that tells, while there are simulations, what they open: of a class, for the whole process."""
+    """A patch of a method of a class that notes, while there are simulations, what they open."""
 
     def __init__(self, owner: type, name: str, watching: Callable[[Any], Any]) -> None:
         self._owner, self._name, self._watching = owner, name, watching
@@ -127,14 +127,14 @@ class _Watch:
         self._set: Any = None
 
     def set(self) -> None:
-        """Set it, unless it is set."""
+        """Set the patch, unless it is set."""
         if self._set is None:
             self._before = vars(self._owner)[self._name]
             self._set = self._watching(self._before)
             setattr(self._owner, self._name, self._set)
 
     def put_back(self) -> None:
-        """Put back what stood there, unless something else has been set meanwhile, which may well call it."""
+        """Restore the method, unless other code has replaced the patch meanwhile, and may still call it."""
         if self._set is not None and vars(self._owner)[self._name] is self._set:
             setattr(self._owner, self._name, self._before)
             self._before = self._set = None
@@ -149,9 +149,9 @@ _WATCHES: Final = (
 
 
 def watch() -> None:
-    """Find out, until ``unwatch``, what simulations start and open.
+    """Note what simulations start and open, until ``unwatch``.
 
-    Threads do not know by whom they were started, and inherit nothing that would tell.
+    This takes patches, because a thread does not know which thread started it.
     """
     with LOCK:
         for watched in _WATCHES:
@@ -159,7 +159,7 @@ def watch() -> None:
 
 
 def unwatch() -> None:
-    """Undo it if there are no simulations any more."""
+    """Remove the patches if there are no simulations any more."""
     if STACKS:
         return
     with LOCK:
@@ -169,7 +169,7 @@ def unwatch() -> None:
 
 
 def _adopt(thread: Thread, children: Children) -> Callable[[], None]:
-    """Enter a thread that is about to be started as one of a simulation's. Returns what undoes that."""
+    """Register a thread that is about to start as one of a simulation's. Return the function that undoes this."""
     run, own = thread.run, vars(thread).get("run")
 
     def adopted() -> None:

@@ -1,4 +1,4 @@
-"""What an environment has around it whenever something runs for it on its user's side."""
+"""The context in which an environment's code runs on the user's side: plugins, generators, claim and driver."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from .rng import GlobalRandom
 
 
 class Claim:
-    """Makes sure that one thread at a time uses an environment that any thread may use."""
+    """A lock for an environment that any thread may use, but only one at a time."""
 
     def __init__(self) -> None:
-        # Its ``_is_owned`` is what ``threading.Condition`` asks of a lock.
+        # ``_is_owned`` is private, but ``threading.Condition`` relies on it, too.
         self._lock: Any = RLock()
         self._process = os.getpid()
 
     @property
     def held(self) -> bool:
-        """Whether it is this thread that uses the environment."""
+        """Whether the current thread uses the environment."""
         owned: bool = self._lock._is_owned()
         return owned and self._process == os.getpid()
 
     def __enter__(self) -> None:
-        if self._process != os.getpid():  # a fork: the thread that may have held the lock is not in this process
+        if self._process != os.getpid():  # after a fork, the thread that held the lock may not exist
             self._lock, self._process = RLock(), os.getpid()
         try:
             claimed = self._lock.acquire(blocking=False)
@@ -46,10 +46,10 @@ class Claim:
 
 
 class at_work(outside_simulation):  # noqa: N801 - it is used like a function
-    """Keep what runs for an environment apart from what runs around it, with the environment's plugins and generators.
+    """Run code of an environment in its own context, with its plugins and random generators.
 
-    Needed around all that runs for an environment on its user's side, but for steps in which ``getcurrent()``
-    is the driver's ``caller`` and ``EVALUATING`` is empty.
+    All code that runs for an environment on the user's side needs this context. The exception are steps in which
+    ``getcurrent()`` is the driver's ``caller`` and ``EVALUATING`` is empty.
     """
 
     __slots__ = ("_claim", "_driver", "_rng")
@@ -61,13 +61,13 @@ class at_work(outside_simulation):  # noqa: N801 - it is used like a function
         claim: Claim | None = None,
         driver: Any = None,
     ) -> None:
-        """Prepare it.
+        """Prepare the context.
 
         Args:
-            evaluation: The environment's plugins; None if it has none.
-            rng: Its own state of the global generators; None if it has none.
-            claim: What makes sure that one thread at a time uses it; None where only one thread can.
-            driver: The driver to enter, where the simulation is going to be resumed; None where it is not.
+            evaluation: The environment's plugins. None if it has none.
+            rng: The environment's own state of the global generators. None if it has none.
+            claim: The lock that lets one thread at a time use the environment. None if only one thread can use it.
+            driver: The driver to enter, if the simulation is going to be resumed. None if it is not.
         """
         super().__init__(evaluation)
         self._rng, self._claim, self._driver = rng, claim, driver

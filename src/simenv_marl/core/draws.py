@@ -1,7 +1,7 @@
-"""Finding out whether a simulation draws from the global generators, which all else in the process shares.
+"""A check whether a simulation draws from the global random generators, which the whole process shares.
 
-During the first decisions of each kind of simulation, how much the generators have used up is compared before and
-after the simulation was at work. From then on nothing of this is in the way.
+During the first decisions of each class of simulations, the state of the generators is compared before and after the
+simulation runs. After that the check costs nothing.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from .switch import BaseDriver, Event
 from .threads import SIMULATION, ThreadDriver
 
 DECISIONS: Final = 1_000
-"""During so many decisions a kind of simulation is watched."""
+"""The number of decisions during which a class of simulations is watched."""
 
 GLIMPSE: Final = 5_000
-"""In less than so many nanoseconds no other thread can be woken and draw."""
+"""A time in nanoseconds that is too short for another thread to wake up and draw."""
 
 _left: Final[WeakKeyDictionary[type, int]] = WeakKeyDictionary()
-"""By class of simulations: during how many more."""
+"""The number of decisions that are left to watch, by class of simulations."""
 
 
 def is_watched(simulation: Any) -> bool:
-    """Whether simulations of its kind are still watched."""
+    """Whether simulations of this class are still watched."""
     return _left.get(type(simulation), DECISIONS) > 0
 
 
 def watched(simulation: Any, work: Callable[[], Any], *, in_thread: bool) -> Any:
-    """Let a simulation work; warn if the global generators have moved meanwhile.
+    """Run a simulation, and warn if it has drawn from the global generators.
 
     Args:
         simulation: The simulation.
-        work: What lets it work.
-        in_thread: Whether it does so in a thread of its own, while its user's waits and others may run.
+        work: The function that runs it.
+        in_thread: Whether the simulation has its own thread, so that other threads may run while the user's waits.
 
     Returns:
-        What the work returns.
+        The result of ``work``.
     """
     before, begun = used_up(), _others()
     result = work()
@@ -59,17 +59,17 @@ def watched(simulation: Any, work: Callable[[], Any], *, in_thread: bool) -> Any
 
 
 def _others() -> int:
-    """For how many nanoseconds all other threads have run."""
+    """The time in nanoseconds for which all other threads have run."""
     return process_time_ns() - thread_time_ns()
 
 
 def _alone() -> bool:
-    """Whether there is no other thread that can have drawn while a simulation was at work."""
+    """Whether no other thread can have drawn while a simulation ran."""
     return all(thread is current_thread() or thread.name == SIMULATION for thread in enumerate_threads())
 
 
 class WatchedDriver:
-    """Stands for a driver in an episode as long as the simulation is watched."""
+    """The stand-in for an episode's driver as long as the simulation is watched."""
 
     __slots__ = ("_driver", "_session")
 
@@ -78,7 +78,7 @@ class WatchedDriver:
 
         Args:
             driver: Its driver.
-            session: The session, whose episode gets the driver itself as soon as there is nothing left to find out.
+            session: The session. Its episode gets the driver itself as soon as the check is over.
         """
         self._driver, self._session = driver, ref(session)
 
@@ -86,7 +86,7 @@ class WatchedDriver:
         return getattr(self._driver, name)
 
     def resume(self, reply: Any) -> Event:
-        """Let the simulation go on with a reply; return the event that comes from it next."""
+        """Resume the simulation with a reply; return its next event."""
         session: Any = self._session()
         if session is not None and is_watched(session.simulation):
             event: Event = watched(

@@ -1,4 +1,4 @@
-"""The drivers by name, and simulations with the stacks on which they were made."""
+"""The drivers by name, and ready-made simulations with the stacks on which they were made."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ DRIVERS: Final[Mapping[str, Callable[..., BaseDriver]]] = {"greenlet": GreenletD
 
 
 def run_job(driver: BaseDriver, job: Callable[[], Any], context: Context | None = None) -> Any:
-    """Run something on a stack in which nothing is decided; return what it returns.
+    """Run a job on a simulation's stack, where decision functions run their rule; return its result.
 
     Raises:
-        BaseException: What it raises.
+        BaseException: Any error that the job raises.
     """
     try:
         driver.prepare(job, context=context)
         kind, box, _ = driver.resume(None)
     except BaseException:
-        driver.unwind()  # an interrupt has come while it was waited for
+        driver.unwind()  # an interrupt has ended the wait
         raise
     value = box.pop()
     if kind is FINISHED:
@@ -40,18 +40,18 @@ def run_job(driver: BaseDriver, job: Callable[[], Any], context: Context | None 
 
 
 class Spare:
-    """A simulation that was made to be looked at, on a stack of its own, until an environment takes both.
+    """A simulation that a plan made for inspection, with its stack. The first environment takes both.
 
     Attributes:
         kind: The driver's name.
-        driver, simulation: The stack, and the simulation that was made there.
+        driver, simulation: The stack, and the simulation that was made on it.
     """
 
     def __init__(self, source: Any, kind: str) -> None:
-        """Make it.
+        """Make a simulation.
 
         Raises:
-            SimulationError: The source makes none.
+            SimulationError: The source does not make a simulation.
         """
         self.kind = kind
         self.driver = DRIVERS[kind]()
@@ -63,6 +63,6 @@ class Spare:
             raise
 
     def taken(self) -> tuple[BaseDriver, Any]:
-        """The driver and the simulation, which are another's to end from now on."""
+        """Hand over the driver and the simulation. From now on the caller must end them."""
         self._end.detach()
         return self.driver, self.simulation

@@ -1,4 +1,4 @@
-"""How an episode ends: by the end of the simulation, by a truncation, by an error, or because it is closed."""
+"""The end of an episode: by the end of the simulation, by a truncation, by an error, or by closing it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from .rng import GlobalRandom
 from .switch import BaseDriver
 
 MANY_ROUNDS: Final = 100
-"""After so many rounds without an action for the pending agent its user is warned."""
+"""The number of rounds in a row without an action for the pending agent after which the user is warned."""
 
 REFUSALS: Final[Mapping[str, tuple[type[Exception], str]]] = {
     "new": (NotResetError, "there is no episode yet; call reset() first"),
@@ -52,33 +52,34 @@ REFUSALS: Final[Mapping[str, tuple[type[Exception], str]]] = {
     "over": (EpisodeOverError, "the episode is over; call reset() to begin the next one"),
     "closed": (ClosedError, "the environment is closed; call reset() to use it again"),
 }
-"""By the state of an environment: why no action can be taken."""
+"""For each state of an environment in which no action can be taken: the class and the message of the error."""
 
 
 def refusal(state: str) -> Exception:
-    """The error that says why no action can be taken in a state."""
+    """Make the error that says why no action can be taken in a state."""
     kind, text = REFUSALS[state]
     return kind(text)
 
 
 class Ending(Participants):
-    """An episode, as far as its state and its end are concerned.
+    """The part of an episode that handles its state and its end.
 
     Attributes:
-        pending: The agent whose decision waits for an answer; None while the episode moves, and when it is over.
+        pending: The agent whose decision waits for an answer. None while the episode moves, and when it is over.
         begun: Whether the reset of the environment is over.
         over: Whether the episode is over.
         running: Whether the simulation's ``run`` has not ended yet.
-        unwinding: Whether it is being ended.
-        failed_in_model: Whether the error that has ended the episode came from the simulation.
-        terminated, truncated: How it ended; both False until then, and where an error has ended it.
-        unheard: Whether the episode has ended before its user was asked, since all decisions were forced: the first
-            step tells of it.
-        untold: Agents that forced moves have ended during the reset, whose reward and end the first round tells.
+        unwinding: Whether the simulation is being unwound.
+        failed_in_model: Whether the error that ended the episode came from the simulation.
+        terminated, truncated: How the episode ended. Both are False before its end, and if an error ended it.
+        unheard: Whether the episode ended before the user was asked, because all decisions were forced. The first
+            step reports this end.
+        untold: Agents whose episode ended at a forced move during the reset. The first round reports their rewards
+            and ends.
         turns: How many actions the environment's user has given.
-        seed: What the simulation was reset with.
-        driver: Its stack.
-        plugins: The plugins of the environment; None if it has none.
+        seed: The seed of the simulation's reset.
+        driver: The driver of the simulation.
+        plugins: The plugins of the environment. None if it has none.
     """
 
     __slots__ = (
@@ -97,7 +98,7 @@ class Ending(Participants):
         """Prepare an episode: see ``Episode``."""
         clock = getattr(simulation, "time", None)
         if clock is not None and (plan.plugins is not None or plan.options.global_rng):
-            clock = partial(_within, plan.plugins, around, clock)  # views read it, too
+            clock = partial(_within, plan.plugins, around, clock)  # views call it, too, outside of ``at_work``
         super().__init__(plan, simulation, clock)
         self.driver, self.seed, self.plugins, self._around = driver, seed, plan.plugins, around
         self.pending: Agent | None = None
@@ -109,31 +110,31 @@ class Ending(Participants):
         self.untold: list[Agent] = []
 
     def at_work(self) -> at_work:
-        """What is to be around all that runs for the environment."""
+        """The context in which the environment's code must run."""
         return at_work(self.plugins, *self._around, self.driver)
 
     def _hear(self) -> None:
-        """Where no decision is pending: let the user learn of an end before the first one, or refuse."""
+        """Handle a step without a pending decision: report an end that the user has not heard of, or refuse."""
         if not self.unheard:
             raise self.refusal()
         self.unheard = False
 
     def _enter(self, move: Callable[[Any, Any, bool], None], given: Any) -> None:
-        """Make a move at work."""
+        """Make a move in the environment's context."""
         here = getcurrent()
         if here is not self.driver.caller or EVALUATING:
             with self.at_work():
                 move(self, given, True)
             return
         assert self.plugins is not None
-        EVALUATING[here] = self.plugins  # as ``at_work`` does it, where nothing else is to be seen to
+        EVALUATING[here] = self.plugins  # the only part of ``at_work`` that is needed here
         try:
             move(self, given, True)
         finally:
             del EVALUATING[here]
 
     def finish(self, *, truncated: bool) -> None:
-        """End the episode of all agents that are left."""
+        """End the episode of all live agents."""
         self.pending = None
         for agent in self.agents.values():
             self.conclude(agent)
@@ -142,7 +143,7 @@ class Ending(Participants):
             self._look_for_absent()
 
     def _look_for_absent(self) -> None:
-        """Warn of agents that the environment's options name, and which have not appeared; of each once."""
+        """Warn of agents that the environment's options name and that have not appeared, once for each agent."""
         wanted = self._plan.wanted
         present = [name for name, agent in self.agents.items() if agent.decided or agent.observation is not None]
         present += [*self.answered, *self.ended]
@@ -155,13 +156,13 @@ class Ending(Participants):
             )
 
     def refusal(self) -> Exception:
-        """The error that says why no action can be taken now."""
+        """Make the error that says why no action can be taken now."""
         if self.unwinding:
             return refusal("moving")
         return refusal("over" if self.over else "moving" if self.begun else "resetting")
 
     def without_decision(self) -> str:
-        """What there is to say of an episode that has ended without a decision of its user's."""
+        """Make the message for an episode that ended without a decision for the environment's user."""
         points = ", ".join(point.point.name for point in self._plan.active)
         ended = f"{type(self._simulation).__name__}.run() came to its end without a decision of"
         if self.answered:
@@ -180,13 +181,13 @@ class Ending(Participants):
         )
 
     def check(self, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Check the actions of a round as far as they can be checked before anything moves.
+        """Check the actions of a round, as far as this is possible before the simulation moves.
 
         Returns:
-            The actions, as mappings take them.
+            The actions in the form that mappings take.
 
         Raises:
-            UnknownAgentError, InvalidActionError, EpisodeOverError, ReentrancyError: As ``play`` raises them.
+            UnknownAgentError, InvalidActionError, EpisodeOverError, ReentrancyError: See ``play``.
         """
         pending, agents, checked = self.pending, self.agents, {}
         if pending is None:
@@ -210,19 +211,19 @@ class Ending(Participants):
         return checked
 
     def fail(self, error: BaseException) -> None:
-        """End the episode for an error, which gets a note that says where it came from."""
+        """End the episode because of an error, and add a note to the error that says where it arose."""
         self.pending, self.over = None, True
         self.annotate(error)
         try:
             problems = self._unwind()
-        except Warning as warning:  # where these are errors; another one must not take its place
+        except Warning as warning:  # warnings may be errors; this one must not replace the original error
             problems = [warning]
         for problem in problems:
             annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {shown(problem)}")
         clear_frames(error)
 
     def annotate(self, error: BaseException) -> None:
-        """Add a note to an error that says at which decision of which agent it arose."""
+        """Add a note to an error: at which decision of which agent it arose."""
         agent = self.latest
         if agent is None:
             where = "before the first decision"
@@ -233,12 +234,12 @@ class Ending(Participants):
         annotate(error, f"simenv_marl: {where}; seed {self.seed}")
 
     def close(self) -> None:
-        """Unwind the simulation, if it is suspended; answer none of its decisions.
+        """Unwind the simulation if it is suspended, without answering its decisions.
 
         Raises:
-            ReentrancyError: The simulation is moving, or is being unwound.
-            WrongThreadError: It is suspended in another thread.
-            BaseException: What the simulation raises in its ``stop`` or while it unwinds.
+            ReentrancyError: The simulation is moving or is being unwound.
+            WrongThreadError: The simulation is suspended in another thread.
+            BaseException: Any error that the simulation raises in its ``stop`` or while it unwinds.
         """
         if self.running and self.driver.lost():
             self.running, self.over = False, True
@@ -253,18 +254,18 @@ class Ending(Participants):
         self.pending, self.over = None, True
 
     def abandon(self) -> None:
-        """Unwind the simulation when its environment is gone, from wherever that is noticed."""
+        """Unwind the simulation of an environment that was garbage-collected. Any thread may call this."""
         if self.pending is None and not self.over:
-            return  # the process ends while it is moving in another thread, which ends with it
+            return  # the process is exiting, and the other thread in which the simulation moves ends with it
         self.pending, self.over = None, True
         if not self.running or not self.driver.reachable():
-            return  # else its own thread unwinds it, as soon as that switches again
+            return  # the simulation's own thread unwinds it at its next switch
         with self.at_work():
             for problem in self._unwind():
                 warn_user(f"a simulation that was abandoned raised {shown(problem)}", ResourceWarning)
 
     def _unwind(self) -> list[BaseException]:
-        """Unwind the simulation, if it is suspended. Returns what it has raised."""
+        """Unwind the simulation if it is suspended. Return the errors that it raised."""
         if not self.running:
             return []
         self.unwinding = True
@@ -286,11 +287,11 @@ class Ending(Participants):
 
     @property
     def unwound(self) -> bool:
-        """Whether the episode is over, and nothing is left of it in the simulation."""
+        """Whether the episode is over and the simulation is unwound."""
         return self.over and not self.running
 
 
 def _within(plugins: Any, around: Any, function: Callable[[], Any]) -> Any:
-    """Call a function at work."""
+    """Call a function in the environment's context."""
     with at_work(plugins, *around):
         return function()

@@ -1,4 +1,4 @@
-"""One episode of one simulation: the one place that knows what happens when.
+"""One episode of one simulation. This module alone determines the order of events.
 
 An episode::
 
@@ -11,18 +11,18 @@ A decision::
     simulation                     episode, on its user's stack
     ----------                     ----------------------------
     calls a decision function
-      suspended          ------>   ``arise``: who decides? the rule: back to the simulation
-                                   ``settle``: reward of the action before (the first of an episode is dropped),
+      suspended          ------>   ``arise``: if the rule decides, back to the simulation
+                                   ``settle``: reward of the previous action (the first of an episode is dropped),
                                      legal actions, info, observation
-                                   a policy answers: back to the simulation with its action
+                                   if a policy answers, back to the simulation with its action
                                    else PENDING, until the user answers
-                                   ``answer``: the action checked, mapped to the decision
+                                   ``answer``: check the action and map it to the decision
       returns            <------   ``resume``
     returns from ``run``
-      ended              ------>   of each agent: last reward, last observation; OVER
+      ended              ------>   last reward and last observation of each agent; OVER
 
-Views differ in who answers, and in when agents are settled (``When``); each of the steps above is written once.
-While an episode is RESETTING or MOVING on its user's side, decision functions that are called run their rule.
+Views differ in who answers, and in when agents are settled (``When``). They share the code of all steps above.
+While an episode is RESETTING or MOVING on the user's side, decision functions run their rule.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ from .spaces import duplicate
 from .switch import BaseDriver
 
 LONGEST_TAPE: Final = 200_000
-"""How many actions are kept for a replay. A simulation that never ends is not to fill the memory."""
+"""How many actions are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""
 
 LOST: Final[deque[Any]] = deque(maxlen=0)
-"""The tape of an episode with more actions, and of one that is not going to be replayed: it keeps nothing."""
+"""The tape of an episode that has more actions or is never replayed. It keeps nothing."""
 
 MISSING: Final = Sentinel("MISSING")
 
@@ -63,9 +63,9 @@ class When(Enum):
     """When the agents of an episode are rewarded and observed.
 
     Attributes:
-        DECISION: The one that decides, as its decision arises (AEC and single views).
-        RETURN: All that live, when a step returns (parallel and joint views).
-        NEVER: Agents are only observed, as a policy is asked (``simulate``, ``simulate_many``).
+        DECISION: Each agent when its decision arises (AEC and single views).
+        RETURN: All live agents when a step returns (parallel and joint views).
+        NEVER: Agents are not rewarded, and are observed only when a policy is asked (``simulate``, ``simulate_many``).
     """
 
     DECISION = "decision"
@@ -74,15 +74,15 @@ class When(Enum):
 
 
 class Episode(Ending):
-    """One run of a simulation, from its reset to its end. Holds nothing of the environment.
+    """One run of a simulation, from its reset to its end. It has no reference to the environment.
 
     Attributes:
-        tape: What the user and policies have answered, in that order; ``LOST`` where that is not kept.
-        most_steps: The step with which the episode is truncated; infinity where none is.
-        limit: The next number of turns at which something is to be seen to: see ``_come_to_limit``.
+        tape: The answers of the user and of policies, in order. ``LOST`` if they are not kept.
+        most_steps: The number of steps after which the episode is truncated; infinity without ``max_steps``.
+        limit: The next number of turns at which ``_come_to_limit`` is called.
         last_time: The time at the latest step of a joint view.
-        skips: Whether decisions with one legal action are answered with it.
-        stalled: How many rounds have had no action for the pending agent since the simulation last moved.
+        skips: Whether a decision with one legal action is answered with it.
+        stalled: The number of rounds without an action for the pending agent since the simulation last moved.
     """
 
     __slots__ = (
@@ -102,13 +102,13 @@ class Episode(Ending):
         """Prepare an episode of a simulation that has been reset.
 
         Args:
-            plan: What the environment is made of.
+            plan: The plan of the environment.
             simulation: The simulation.
-            driver: Its stack, on which the next ``resume`` begins its ``run``.
-            seed: What it was reset with.
+            driver: The simulation's driver. Its next ``resume`` begins ``run``.
+            seed: The seed of the simulation's reset.
             when: When agents are settled.
-            around: What ``at_work`` is to put around all that runs for the environment.
-            script: The tape of another episode, which is to be replayed; None: it is an episode of its own.
+            around: The generators and the claim of the environment's context: see ``at_work``.
+            script: The tape of another episode to replay. None: this is an ordinary episode.
         """
         super().__init__(plan, simulation, driver, seed, around)
         self.when = when
@@ -123,14 +123,14 @@ class Episode(Ending):
         self.last_time: float | None = None
         self.tape: Any = LOST if plan.unanswered and not plan.looked_into else []
         self.script = None if script is None else deque(script)
-        self._left: dict[str, Any] = {}  # the actions of a round that are not used yet
+        self._left: dict[str, Any] = {}  # the unused actions of the current round
 
     def begin(self) -> None:
         """Run the simulation to its first decision.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            BaseException: Any error of the model, a mapping or a policy.
         """
         with self.at_work():
             try:
@@ -138,7 +138,7 @@ class Episode(Ending):
                 if not self.over and self.when is not When.NEVER and self.consulted is None:
                     self._return(settle=self.when is When.RETURN)
                     for agent in self.agents.values() if self.skips else ():
-                        agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # a reset tells no rewards
+                        agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards
                     self.untold = self.just_ended if self.skips else []
                 self.begun = True
             except BaseException as error:
@@ -153,16 +153,16 @@ class Episode(Ending):
     # -- answers ----------------------------------------------------------------------------------
 
     def step(self, action: Any, entered: bool = False) -> None:
-        """Answer the pending decision and run to the next one that the user is to answer, or to the end.
+        """Answer the pending decision and run to the user's next decision, or to the end.
 
         Args:
             action: An action of the pending agent, or ``RULE``.
-            entered: Whether it is made at work already.
+            entered: Whether the environment's context is already entered.
 
         Raises:
             InvalidActionError: The action is not legal. Nothing has moved.
             EpisodeOverError, ReentrancyError: No decision is pending.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            BaseException: Any error of the model, a mapping or a policy.
         """
         agent = self.pending
         if agent is None:
@@ -173,7 +173,7 @@ class Episode(Ending):
             return
         try:
             if action is not RULE:
-                check = agent.point.check  # fetched before it is called: calling it at its attribute is slower
+                check = agent.point.check  # a local variable: calling the attribute directly is slower
                 legal = check(action)
                 if legal is ILLEGAL or agent.mask is not None:
                     legal = agent.point.checked(action, agent.name, agent.mask)
@@ -187,21 +187,21 @@ class Episode(Ending):
             raise
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
-        """Turn an agent's action into the reply that the simulation gets, and let go of what only the decision needed.
+        """Turn an agent's action into the reply to the simulation, and release what only this decision needed.
 
         Args:
-            agent: The agent, whose decision has arisen.
-            action: An action that was checked, or ``RULE``, which is its own reply.
-            turn: Whether it answers the pending decision.
+            agent: The agent whose decision has arisen.
+            action: A checked action, or ``RULE``, which is its own reply.
+            turn: Whether the user answers the pending decision.
 
         Returns:
             The reply, for the driver's ``resume``.
 
         Raises:
-            BaseException: Whatever a mapping raises. The decision stays pending.
+            BaseException: Any error of a mapping. The decision stays pending.
         """
         try:
-            self.pending = None  # while mappings run, an action of theirs is refused
+            self.pending = None  # so that an action from inside a mapping is refused
             kept = action
             if agent.choices is not None:
                 reply = agent.choose(action)
@@ -210,7 +210,7 @@ class Episode(Ending):
             else:
                 if type(action) is not int and turn:
                     kept = duplicate(action)  # before a mapping can change it
-                convert = agent.point.convert  # fetched before it is called: calling it at its attribute is slower
+                convert = agent.point.convert  # a local variable: calling the attribute directly is slower
                 reply = convert(action)
         except BaseException:
             if turn:
@@ -225,7 +225,7 @@ class Episode(Ending):
         return reply
 
     def _come_to_limit(self) -> None:
-        """See to the tape, which is not to grow for ever, and to the last step."""
+        """Drop a tape that has grown too long, and prepare the truncation if this was the last step."""
         if len(self.tape) > LONGEST_TAPE:
             self.tape = LOST
         self.limit = self.most_steps
@@ -240,34 +240,34 @@ class Episode(Ending):
         tape.append(answer)
 
     def go_on(self, reply: Any) -> None:
-        """Let the simulation go on with a reply, up to the next decision that the user is to answer, or to the end.
+        """Resume the simulation with a reply, and run to the user's next decision, or to the end.
 
         Raises:
-            BaseException: Whatever the model, a mapping or a policy raises. The episode is then to ``fail``.
+            BaseException: Any error of the model, a mapping or a policy. The caller must then call ``fail``.
         """
         while True:
-            resume = self.driver.resume  # fetched before it is called: calling it at its attribute is slower
+            resume = self.driver.resume  # a local variable: calling the attribute directly is slower
             event, args, kwargs = resume(reply)
             reply = event.arise(self, args, kwargs)
             if reply is WAIT:
                 return
-            event = args = kwargs = None  # else they would keep alive what the model lets go meanwhile
+            event = args = kwargs = None  # so that they keep nothing alive that the model frees meanwhile
 
     def play(self, actions: Mapping[str, Any], entered: bool = False) -> None:
-        """Play a round: answer decisions, each agent's once, up to the first whose action is missing, or to the end.
+        """Play a round: use each agent's action once, up to the first decision without an action, or to the end.
 
-        Then all live agents are settled.
+        Then settle all live agents.
 
         Args:
-            actions: By agent: an action, or ``RULE``.
-            entered: Whether it is made at work already.
+            actions: An action, or ``RULE``, for each agent's name.
+            entered: Whether the environment's context is already entered.
 
         Raises:
-            UnknownAgentError: An action is for an agent that does not live. Nothing has moved.
-            InvalidActionError: An action is not legal. Nothing has moved. One that only becomes illegal by
+            UnknownAgentError: An action is for an agent that is not live. Nothing has moved.
+            InvalidActionError: An action is not legal. Nothing has moved. An action that is legal now and illegal at
                 its turn counts as missing.
             EpisodeOverError, ReentrancyError: No decision is pending.
-            BaseException: Whatever the model, a mapping or a policy raises.
+            BaseException: Any error of the model, a mapping or a policy.
         """
         if self.pending is None:
             self._hear()
@@ -292,7 +292,7 @@ class Episode(Ending):
             else:
                 self.stalled = 0
                 self.go_on(reply)
-            if not self.over and self.consulted is None:  # else a replay has come to where the other episode stands
+            if not self.over and self.consulted is None:  # ``consulted`` is set where a replay ends
                 self._return(truncate=bool(actions) and self.turns == self.most_steps)
         except BaseException as error:
             self.fail(error)
@@ -301,14 +301,14 @@ class Episode(Ending):
             self.warn_of_standstill()
 
     def dispatch(self, point: BoundPoint, name: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """See to a decision of an agent that was not met at this point as one of the user's.
+        """Handle a decision of an agent that is not yet known at this point as an agent of the user's.
 
         Returns:
             The reply to the simulation, or ``WAIT``.
 
         Raises:
-            AgentError: The name is none, or belongs to another point, or to an agent that has ended.
-            BaseException: Whatever a mapping or a policy raises.
+            AgentError: The name is not a string, or belongs to another point, or to an agent that has ended.
+            BaseException: Any error of a mapping or a policy.
         """
         if name is None:
             return RULE
@@ -318,16 +318,16 @@ class Episode(Ending):
         return agent.arise(self, args, kwargs)
 
     def consult(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Have a policy answer.
+        """Let a policy answer a decision.
 
         Returns:
-            The reply to the simulation; ``WAIT`` where the policy is asked later, for many decisions at once.
+            The reply to the simulation; ``WAIT`` if the policy is asked later, for many decisions at once.
 
         Raises:
             InvalidActionError: The policy's action is not legal.
-            BaseException: Whatever a mapping or the policy raises.
+            BaseException: Any error of a mapping or the policy.
         """
-        if self.done:  # the simulation may go on for ever without a decision of its user's
+        if self.done:  # else the simulation might run for ever without a decision for the user
             self.finish(truncated=False)
             return WAIT
         if agent.policy is RULE:
@@ -349,13 +349,13 @@ class Episode(Ending):
         return self.answer(agent, action, False)
 
     def single_out(self, agent: Agent) -> None:
-        """Wait for the agent alone that is consulted; it is rewarded from now on, and ends as in a single view."""
+        """Turn a branch into a single view of the consulted agent: reward it from now on, and wait for it only."""
         if list(self.agents.values()) != [agent]:
-            self.most_steps = self.limit = inf  # what counts are the steps of others
+            self.most_steps = self.limit = inf  # ``max_steps`` counts the steps of other agents
         super().single_out(agent)
         self.when, self.decide = When.DECISION, Episode._decide_unless_forced if self.skips else None
         self.begun, self.untold, self._left, agent.asked = True, [], {}, True
-        if not agent.decided:  # nothing was done yet that could be rewarded
+        if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
             with self.at_work():
                 agent.settle(agent, agent.arguments(), agent.kwargs, observe=False)
         self.consulted, self.pending = None, agent
@@ -363,16 +363,16 @@ class Episode(Ending):
     # -- decisions --------------------------------------------------------------------------------
 
     def _decide_too_late(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Truncate the episode: the user has taken the last step."""
+        """Truncate the episode, because the user has taken the last step."""
         self.finish(truncated=True)
         return WAIT
 
     def _decide_unless_forced(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Settle an agent, whose rewards add up until it has a choice."""
+        """Settle an agent. Its rewards add up until it has more than one legal action."""
         agent.settle_again(agent, args, kwargs)
         agent.reward, agent.carried = agent.reward + agent.carried, 0.0
         forced = self._forced(agent)
-        if forced is not None or not agent.asked:  # a reset, too, tells no rewards
+        if forced is not None or not agent.asked:  # ``reset`` returns no rewards either
             agent.reward, agent.carried = 0.0, agent.reward
         if forced is not None:
             return self._answer_forced(agent, forced)
@@ -381,7 +381,7 @@ class Episode(Ending):
         return WAIT
 
     def _answer_forced(self, agent: Agent, action: Any) -> Any:
-        """Answer with the one legal action; as rewards do, the elapsed time adds up until the agent is asked."""
+        """Answer with the only legal action. The elapsed time adds up until the agent is asked, as rewards do."""
         before = agent.answered_at
         reply = self.answer(agent, action, False)
         if before is not None:
@@ -389,11 +389,11 @@ class Episode(Ending):
         return reply
 
     def _forced(self, agent: Agent) -> Any:
-        """The one legal action of an agent; None where it has a choice."""
+        """The only legal action of an agent; None if it has several."""
         return only_choice(agent.point.definition.action_space, agent.mask)
 
     def _decide_in_round(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Answer a decision of an agent of the user's with its action of the round, or wait for the next round."""
+        """Answer a decision with the agent's action of this round, or wait for the next round."""
         if agent.point.legal is not None:
             agent.mask, agent.choices = agent.point.legal(args, kwargs)
         if self.clock is not None:
@@ -410,21 +410,22 @@ class Episode(Ending):
                 return WAIT
             agent.acted = True
         self.latest = agent
-        if not agent.decided:  # it was never settled, and acts at once
+        if not agent.decided:  # it acts before it was ever settled
             agent.settle(agent, agent.arguments(), agent.kwargs, observe=False)
         return self.answer(agent, action, False)
 
     def _return(self, *, settle: bool = True, truncate: bool = False) -> None:
-        """See to the agents that wait for their turns, as a step or a reset returns.
+        """Reward and observe the agents when a step or a reset returns.
 
         Args:
-            settle: Whether live agents are rewarded and observed; else those that are announced are observed.
+            settle: Whether all live agents are rewarded and observed. If False, only agents that ``expected_calls``
+                announces, and that have not decided, are observed.
             truncate: Whether the episode ends here.
         """
-        following, self.pending = self.pending, None  # while mappings run, an action of theirs is refused
+        following, self.pending = self.pending, None  # so that an action from inside a mapping is refused
         announced = {}
         for agent, call in self.announced():
-            if agent is not following and agent not in announced:  # of several calls the next one counts
+            if agent is not following and agent not in announced:  # the first of several calls counts
                 announced[agent] = call
                 if (settle or not agent.decided) and agent.keep(call, {}):
                     self.remember(agent, call[0])
@@ -444,5 +445,5 @@ class Episode(Ending):
             elif agent in announced and not agent.decided:
                 agent.settle(agent, args, agent.kwargs, reward=False)
             if agent.choices is not None and agent is not following:
-                agent.choices = None  # they are asked for again when it decides
+                agent.choices = None  # ``legal`` returns them again when the agent decides
         self.pending = following

@@ -1,20 +1,20 @@
-"""What comes from a simulation, and what becomes of it in its episode.
+"""The events that a simulation sends, and how its episode handles them.
 
-A call that crosses from the simulation is ``(event, args, kwargs)``. Of each kind of event there is a class, whose
-method ``arise(episode, args, kwargs)`` returns the reply to the simulation, or ``WAIT``: the episode waits for an
-action, or is over.
+The simulation sends a tuple ``(event, args, kwargs)``. Each kind of event has a class. Its method
+``arise(episode, args, kwargs)`` returns the reply to the simulation, or ``WAIT`` if the episode waits for an action or
+is over.
 
-| event | what has happened | what becomes of it |
+| event | what happened | what the episode does |
 |---|---|---|
-| ``Agent`` | the one agent of a point decides | it is settled, and the episode waits |
-| ``Decision`` | an agent decides that ``agent=`` names | it is found or joins; and then the same |
-| ``Answered`` | an agent decides for which a policy answers | it is observed, and the policy is asked |
-| ``Removed`` | a function of ``removed_by=`` is called | its agents are settled for the last time and leave |
-| ``Ended`` | the simulation calls ``end_agent`` | that agent is settled for the last time and leaves |
-| ``Told`` | a rule has decided | its action is noted |
-| ``Finished`` | ``run`` has returned | all agents end |
-| ``Failed``, ``Refused`` | the simulation has raised; a decision was refused | the error is raised |
-| ``Stalled`` | a callback has raised, and the C code that called it goes on and on | the error is raised |
+| ``Agent`` | the only agent of a decision point decides | settle the agent and wait |
+| ``Decision`` | an agent that ``agent=`` names decides | find the agent or let it join; then the same |
+| ``Answered`` | an agent whose policy answers decides | observe the agent and ask the policy |
+| ``Removed`` | a function of ``removed_by=`` is called | settle its agents for the last time and remove them |
+| ``Ended`` | the simulation calls ``end_agent`` | settle that agent for the last time and remove it |
+| ``Told`` | a rule has decided | note the corresponding action |
+| ``Finished`` | ``run`` has returned | end all agents |
+| ``Failed``, ``Refused`` | the simulation has raised; a decision was refused | raise the error |
+| ``Stalled`` | a callback has raised, and the C code that called it does not end | raise the error |
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class Decision(BoundPoint):
-    """A decision of the agent that ``agent=`` names, or of the one agent of a point where a policy answers for it."""
+    """A decision of an agent that ``agent=`` names, or of the only agent of a point if a policy answers for it."""
 
     __slots__ = ()
 
@@ -44,7 +44,7 @@ class Decision(BoundPoint):
         name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
         try:
             agent = episode.agents.get(name)
-        except TypeError:  # it is no name at all
+        except TypeError:  # not hashable, and so no name
             agent = None
         if agent is None or agent.point is not self:
             return episode.dispatch(self, name, args, kwargs)
@@ -52,12 +52,12 @@ class Decision(BoundPoint):
 
 
 class Answered(BoundPoint):
-    """A decision of a point whose agents are all answered by a policy."""
+    """A decision at a point where policies answer for all agents."""
 
     __slots__ = ()
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Have the policy answer."""
+        """Let the policy answer."""
         name = self.agent or self.name_agent(*args, **kwargs)
         agent = episode.answered.get(name) if type(name) is str else None
         if agent is None or agent.point is not self:
@@ -71,9 +71,9 @@ class Removed:
 
     Attributes:
         point: The function.
-        of: The points whose agents it ends; for each a callable of the call's arguments that names the agent, or None;
-            and then the class whose instances are such agents, if it is known.
-        deliver, told: None: the call always runs the function, and nothing is told of its result.
+        of: A tuple for each decision point whose agents it ends: the point; a callable that takes the call's arguments
+            and names the agent, or None; the class whose instances are such agents, or None if it is not known.
+        deliver, told: None, because the call always runs the function, and its result is not reported.
     """
 
     __slots__ = ("of", "point")
@@ -85,7 +85,7 @@ class Removed:
         self.of: list[tuple[BoundPoint, Callable[..., Any] | None, type | None]] = []
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Give the agents their last rewards and observations while they are whole, and let the call go on."""
+        """Give the agents their last rewards and observations while their entities are whole; then run the call."""
         for point, name in self._named(episode, args, kwargs):
             agent = episode.agents.get(name)
             if agent is not None and agent.point is point:
@@ -107,13 +107,13 @@ class Ended:
     """A call of the simulation's ``end_agent``.
 
     Attributes:
-        deliver, told: None: the call always goes on, and nothing is told of its result.
+        deliver, told: None, because the call always runs the function, and its result is not reported.
     """
 
     deliver = told = None
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """End the agent's episode, if it is a live agent of the environment."""
+        """End the agent's episode if it is a live agent of the environment."""
         name = kwargs["name"] if "name" in kwargs else args[1]
         agent = episode.agents.get(name) if isinstance(name, str) else None
         if agent is not None:
@@ -122,11 +122,11 @@ class Ended:
 
 
 class Told:
-    """A decision that the rule of a point has taken.
+    """A decision that the rule of a point has made.
 
     Attributes:
         point: The decision point.
-        deliver, told: None: the simulation just goes on.
+        deliver, told: None, because the simulation continues with its own decision.
     """
 
     __slots__ = ("point",)
@@ -137,7 +137,7 @@ class Told:
         self.point = point
 
     def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Note which action it corresponds to. The arguments are the decision, and those of its call."""
+        """Note the action that corresponds to the decision. ``args``: the decision, its call's args and kwargs."""
         decision, call_args, call_kwargs = args
         point = self.point
         name = point.agent or point.name_agent(*call_args, **call_kwargs)
@@ -153,7 +153,7 @@ class Finished:
     """The simulation's ``run`` has returned."""
 
     def arise(self, episode: Episode, box: list[Any], _: Any) -> Any:
-        """End the episode of all agents. The box holds what ``run`` has returned."""
+        """End the episode of all agents. The box holds the value that ``run`` returned."""
         episode.running = False
         episode.finish(truncated=box.pop() is TRUNCATED)
         return WAIT
@@ -163,37 +163,37 @@ class Failed:
     """The simulation's ``run`` has raised."""
 
     def arise(self, episode: Episode, box: list[Any], _: Any) -> Any:
-        """Raise the error, which the box holds."""
+        """Raise the error in the box."""
         episode.running, episode.failed_in_model = False, True
         raise box.pop()
 
 
 class Refused:
-    """A decision was asked for where the simulation cannot wait, as in a thread that it has started.
+    """A decision function was called where the simulation cannot wait, such as in a thread that it started.
 
     Attributes:
-        deliver, told: None: the simulation does not go on.
+        deliver, told: None, because the simulation does not continue.
     """
 
     deliver = told = None
 
     def arise(self, episode: Episode, args: Any, kwargs: Any) -> Any:
-        """Raise the error that says so."""
+        """Raise the error that describes this call."""
         episode.failed_in_model = True
         raise episode.driver.refusal()
 
 
 class Stalled:
-    """A callback has raised, and the C code that has called it does not come to its end: see ``CallbackGuard``.
+    """A callback has raised, and the C code that called it does not end: see ``CallbackGuard``.
 
     Attributes:
-        deliver, told: None: the simulation does not go on.
+        deliver, told: None, because the simulation does not continue.
     """
 
     deliver = told = None
 
     def arise(self, episode: Episode, box: list[Any], _: Any) -> Any:
-        """Raise the error, which the box holds. What is left in the simulation is still to unwind."""
+        """Raise the error in the box. The simulation is still suspended and must be unwound."""
         episode.failed_in_model = True
         raise box.pop()
 

@@ -1,8 +1,8 @@
-"""How a forked process goes on just as the one would from which it was split off.
+"""What makes a forked process continue exactly as its parent would.
 
-``fork`` copies the memory, but not what the system keeps for a process: both share the offsets of open files and what
-is written to them; Python seeds its global generator anew; directories for a while are deleted by both. ``Standing``
-puts that right in the forked process.
+``fork`` copies the memory, but not all of the state that the operating system and Python keep for a process. Parent and
+child share the offsets and contents of open files. Python reseeds its global generator in the child. Both processes
+delete the same temporary directories. ``Standing`` corrects this in the forked process.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ if hasattr(os, "fork"):
 
 DESCRIPTORS: Final = "/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"
 STANDARD: Final = 3
-"""How many descriptors are the standard streams, which stay what they are."""
+"""The number of standard streams. Their descriptors are left unchanged."""
 
 LASTING: Final = (
     sum(getattr(os, f"O_{name}", 0) for name in ("APPEND", "NONBLOCK", "DSYNC", "DIRECT", "NOATIME"))
     | os.O_WRONLY
     | os.O_RDWR
 )
-"""The flags of an open file that say how it is read and written, and not how it is found or made."""
+"""The flags of an open file that say how it is read and written, without those that say how it is opened or made."""
 
 LARGEST: Final = 1 << 24
-"""How many bytes a file has at most that is copied into memory: it takes a disk a millisecond to let go of a file."""
+"""The largest size, in bytes, of a file that is copied into memory. On a disk, deleting a file takes a millisecond."""
 
 Identity = tuple[int, int]
 """Device and inode."""
 
 
 def _open_now() -> dict[int, os.stat_result]:
-    """What this process has open, by descriptor."""
+    """The open files of this process, by descriptor."""
     found = {}
     for name in os.listdir(DESCRIPTORS):
-        with suppress(OSError):  # the one by which the list was read
+        with suppress(OSError):  # the descriptor by which ``listdir`` read the list is closed by now
             found[int(name)] = os.fstat(int(name))
     return found
 
@@ -58,8 +58,8 @@ def _identity(status: os.stat_result) -> Identity:
 
 
 def _path(number: int) -> str:
-    """A path by which an open file can be opened once more, be it deleted or not."""
-    if hasattr(fcntl, "F_GETPATH"):  # where /dev/fd gives the same description again
+    """A path by which an open file can be opened again, even if it was deleted."""
+    if hasattr(fcntl, "F_GETPATH"):  # on macOS, where opening /dev/fd would share the offset
         held = fcntl.fcntl(number, fcntl.F_GETPATH, bytes(1024))
         return os.fsdecode(held.partition(b"\0")[0])
     return f"{DESCRIPTORS}/{number}"
@@ -73,10 +73,10 @@ _prctl: Final[Any] = getattr(ctypes.CDLL(None), "prctl", None) if sys.platform =
 
 
 def end_with(parent: int) -> None:
-    """Have this forked process end when its parent does, however that ends; Linux alone knows how."""
+    """Let this forked process end when its parent ends, for whatever reason. Only Linux supports this."""
     if _prctl is not None:
         _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent:  # it has ended already
+        if os.getppid() != parent:  # the parent has already ended
             os._exit(1)
 
 
@@ -84,7 +84,7 @@ def end_with(parent: int) -> None:
 
 
 def loops_on(descriptors: Container[int]) -> list[Any]:
-    """The open event loops of asyncio whose own sockets are among some."""
+    """The open asyncio event loops whose wake-up sockets are among the given descriptors."""
     events = modules.get("asyncio.selector_events")
     if events is None:
         return []
@@ -93,12 +93,12 @@ def loops_on(descriptors: Container[int]) -> list[Any]:
 
 
 def sockets_of(loop: Any) -> set[int]:
-    """The descriptors of the pair of sockets by which a loop is woken."""
+    """The descriptors of the pair of sockets that wakes an event loop."""
     return {loop._ssock.fileno(), loop._csock.fileno()}
 
 
 def _rebuild(loop: Any) -> None:
-    """Give a loop a selector and a pair of sockets of this process's own."""
+    """Give an event loop a selector and a pair of sockets that belong to this process only."""
     before, selector = loop._selector, type(loop._selector)()
     woken_by = loop._csock.fileno()
     for key in before.get_map().values():
@@ -110,18 +110,18 @@ def _rebuild(loop: Any) -> None:
         end.close()
     loop._internal_fds -= 1
     loop._make_self_pipe()
-    with suppress(ValueError):  # only a main thread has one
+    with suppress(ValueError):  # only the main thread may set it
         signals = signal.set_wakeup_fd(-1)
         if signals != -1:
             signal.set_wakeup_fd(loop._csock.fileno() if signals == woken_by else signals)
 
 
-# -- what goes on ---------------------------------------------------------------------------------
+# -- open files -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Opened:
-    """A file as it was opened once; descriptors that were duplicated share it, and with it the offset."""
+    """One opening of a file. Duplicated descriptors share it, and so they share its offset."""
 
     numbers: tuple[int, ...]
     flags: int
@@ -130,28 +130,28 @@ class _Opened:
 
 @dataclass(frozen=True)
 class _File:
-    """A file, and all the ways in which it is open."""
+    """A file and all its openings."""
 
     identity: Identity
     opened: tuple[_Opened, ...]
 
     @property
     def modes(self) -> set[int]:
-        """For what: ``O_RDONLY``, ``O_WRONLY``, ``O_RDWR``."""
+        """The access modes: ``O_RDONLY``, ``O_WRONLY``, ``O_RDWR``."""
         return {opened.flags & os.O_ACCMODE for opened in self.opened}
 
 
 class Standing:
-    """How this process stands, for those that are going to be forked from it before it moves.
+    """The state of this process, for the children that are forked before the process continues.
 
-    In a forked process ``resume`` is called before anything else.
+    Each child must call ``resume`` before anything else.
     """
 
     def __init__(self, loops: Iterable[Any] = ()) -> None:
-        """Note what a fork does not take along.
+        """Note the state that a fork does not copy.
 
         Args:
-            loops: The event loops that are to go on, too.
+            loops: The event loops that must also continue in the child.
         """
         self._python, self._loops = random.getstate(), loops
         self._files = list(_files())
@@ -159,12 +159,12 @@ class Standing:
         self._folders = list(_temporary_folders())
 
     def resume(self) -> None:
-        """Have this forked process go on by itself.
+        """Separate this forked process from its parent.
 
         Raises:
-            OSError: A file cannot be opened once more, or not be copied.
+            OSError: A file cannot be opened again, or cannot be copied.
         """
-        random.setstate(self._python)  # a fork has seeded it
+        random.setstate(self._python)  # Python reseeds it after a fork
         for file in self._files:
             _reopen(file)
         for loop in self._loops:
@@ -181,13 +181,13 @@ def _numbers(files: list[_File]) -> Iterator[int]:
 
 
 def _files() -> Iterator[_File]:
-    """The open files and directories that a forked process is to have for itself."""
+    """The open files and directories of which a forked process gets its own openings."""
     by_identity: dict[Identity, list[int]] = {}
     for number, status in sorted(_open_now().items()):
         if stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode):
             by_identity.setdefault(_identity(status), []).append(number)
     for identity, numbers in by_identity.items():
-        if numbers[0] >= STANDARD:  # what is a standard stream, too, stays what it is
+        if numbers[0] >= STANDARD:  # a file that is also a standard stream is left unchanged
             left, opened = [number for number in numbers if _has_an_offset(number)], []
             while left:
                 alike = [number for number in left if number == left[0] or _share_an_offset(left[0], number)]
@@ -197,16 +197,16 @@ def _files() -> Iterator[_File]:
 
 
 def _has_an_offset(number: int) -> bool:
-    """Whether anything is read or written by a descriptor."""
+    """Whether a descriptor can be read or written."""
     try:
         os.lseek(number, 0, os.SEEK_CUR)
-    except OSError:  # it only stands for a path
+    except OSError:  # the descriptor only stands for a path (O_PATH)
         return False
     return True
 
 
 def _flags(number: int) -> int:
-    """How a file was opened, as far as that still matters."""
+    """The flags of an open file that still matter."""
     flags: int = fcntl.fcntl(number, fcntl.F_GETFL)
     return flags & LASTING
 
@@ -224,7 +224,7 @@ def _share_an_offset(one: int, other: int) -> bool:
 
 
 def _is_still(number: int, identity: Identity) -> bool:
-    """Whether a file is still open; one that only a thread has held is not, since no thread comes along."""
+    """Whether a file is still open. A file that only a lost thread held is closed, because threads do not survive."""
     try:
         return _identity(os.fstat(number)) == identity
     except OSError:
@@ -250,11 +250,11 @@ def _reopen(file: _File) -> None:
 
 
 def _copied(path: str, size: int, file: _File) -> Any:
-    """A copy of an open file, which is gone when it is closed."""
-    direct = any(opened.flags & getattr(os, "O_DIRECT", 0) for opened in file.opened)  # which memory may not know
+    """Copy an open file. The copy is deleted when it is closed."""
+    direct = any(opened.flags & getattr(os, "O_DIRECT", 0) for opened in file.opened)  # memory may not support it
     in_memory = size <= LARGEST and not direct and hasattr(os, "memfd_create")
     copy: Any = os.fdopen(os.memfd_create("branch"), "wb") if in_memory else tempfile.TemporaryFile()  # noqa: SIM115
-    if file.modes == {os.O_WRONLY}:  # what stands in it is read by none
+    if file.modes == {os.O_WRONLY}:  # the contents are never read
         os.truncate(copy.fileno(), size)
     else:
         shutil.copyfile(path, _path(copy.fileno()))
@@ -262,7 +262,7 @@ def _copied(path: str, size: int, file: _File) -> Any:
 
 
 def _temporary_folders() -> Iterator[tuple[Any, Any]]:
-    """Directories for a while, which a forked process must not delete, each with what deletes it at its end."""
+    """Temporary directories, which a forked process must not delete, each with its finalizer."""
     for end in list(finalize._registry):  # type: ignore[attr-defined]
         held = end.peek()
         if held is not None and isinstance(held[0], tempfile.TemporaryDirectory):
@@ -270,14 +270,14 @@ def _temporary_folders() -> Iterator[tuple[Any, Any]]:
 
 
 def _keep_temporary_files(paths: set[str]) -> None:
-    """Delete none of some named files for a while when it is closed."""
+    """Prevent the named temporary files with these paths from being deleted when they are closed."""
     closer: Any = tempfile._TemporaryFileCloser  # type: ignore[attr-defined]
     for name in {"close", "cleanup"} & vars(closer).keys():
         setattr(closer, name, _keeping(getattr(closer, name), paths))
 
 
 def _keeping(close: Callable[..., Any], paths: set[str]) -> Callable[..., Any]:
-    """Have what closes a temporary file not delete it, if it is one of some."""
+    """Wrap the function that closes a temporary file, so that it does not delete a file with one of these paths."""
 
     def close_only(closer: Any, *args: Any) -> Any:
         if os.path.realpath(closer.name) in paths:
@@ -288,4 +288,4 @@ def _keeping(close: Callable[..., Any], paths: set[str]) -> Callable[..., Any]:
 
 
 def _delete_nothing(*args: Any, **kwargs: Any) -> None:
-    """Stands for what deletes a directory that is another process's."""
+    """Do nothing, instead of deleting a directory of the parent process."""

@@ -1,4 +1,4 @@
-"""A driver that runs a simulation on a greenlet: a stack of its own in the thread of its user."""
+"""The driver that runs a simulation in a greenlet: a separate stack in the user's thread."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .switch import BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 
 class _Home:
-    """Stands for a thread; unlike the thread's number it is never given to another one."""
+    """The identity of a thread. Unlike the thread's number, it is never reused for another thread."""
 
 
 _homes = local()
@@ -36,7 +36,7 @@ def _home() -> _Home:
 
 
 class GreenletDriver(BaseDriver):
-    """Runs a simulation on a greenlet of the thread in which the first job is started."""
+    """A driver that runs a simulation in a greenlet of the thread that starts the first job."""
 
     __slots__ = (
         "_asker", "_body", "_direct", "_here", "_home", "_sides", "_switch_out", "_thread", "resume",
@@ -47,8 +47,8 @@ class GreenletDriver(BaseDriver):
 
         Args:
             plugins: The plugins of the simulation's environment.
-            before: The driver that the simulation had before.
-            direct: Whether ``resume`` may be called without anything else; no: ``caller`` stays None.
+            before: The simulation's previous driver.
+            direct: Whether ``resume`` may be called without ``enter``. If False, ``caller`` stays None.
         """
         super().__init__(plugins=plugins, before=before)
         self._direct = direct
@@ -56,7 +56,7 @@ class GreenletDriver(BaseDriver):
         self._home = ref(_home())
         self._sides = Sides()
         self._body: Any = greenlet(self._serve)
-        self._asker: greenlet | None = None  # the greenlet of the model's own that waits for an answer
+        self._asker: greenlet | None = None  # the model's own greenlet that waits for an answer
         self._here: Any = None
         self._switch_out: Any = None
         self.resume: Callable[[Any], Event] = self._body.switch
@@ -71,10 +71,10 @@ class GreenletDriver(BaseDriver):
                 try:
                     event = self._work()
                 finally:
-                    if not self._ended:  # else it unwinds without having been asked to
+                    if not self._ended:  # once the driver has ended, the stack unwinds by itself
                         self._sides.leave()
                 if self._ended:
-                    return  # it was let go of, and has unwound by itself
+                    return  # the driver was dropped, and the stack has unwound by itself
                 self._body.gr_context = None
                 self._idle = True
                 self._switch_out(*event)
@@ -97,7 +97,7 @@ class GreenletDriver(BaseDriver):
                     own = sides.leave()
                 reply = switch_out(event, args, kwargs)
             except BaseException:
-                if not driver._ended:  # else it unwinds without having been asked to
+                if not driver._ended:  # once the driver has ended, the stack unwinds by itself
                     if away:
                         driver._ask_from(None)
                     sides.enter()
@@ -114,28 +114,28 @@ class GreenletDriver(BaseDriver):
         return decide
 
     def _ask_from(self, asker: greenlet | None) -> None:
-        """A model may switch stacks of its own: remember the one that asks for as long as it does."""
+        """Remember the model's own greenlet that asks for a decision, so that ``resume`` switches to it."""
         self._asker = asker
         self.resume = (self._body if asker is None else asker).switch
 
-    # -- on its user's ----------------------------------------------------------------------------
+    # -- on the user's side -----------------------------------------------------------------------
 
     def prepare(
         self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
     ) -> None:
-        """Have the next ``resume`` begin to run something on the stack."""
+        """Prepare a job. The next ``resume`` begins to run it on the stack."""
         self.enter()
         if "gevent" in modules:
             _share_hub(modules["gevent"].get_hub())
         self._prepare(job, decisions, None)
-        # A new greenlet has an empty context; a model expects the one that its user has set up.
+        # A new greenlet has an empty context, but the model expects the user's context variables.
         self._body.gr_context = copy_context() if context is None else context
 
     def enter(self) -> None:
-        """Make ready to be resumed from here.
+        """Prepare to resume the simulation from the current greenlet.
 
         Raises:
-            WrongThreadError: The simulation lives in another thread.
+            WrongThreadError: The simulation belongs to another thread.
         """
         here = getcurrent()
         if here is self._here:
@@ -146,12 +146,12 @@ class GreenletDriver(BaseDriver):
                 ' can be stepped, closed and reset; made with driver="thread", an environment can be used from any'
             )
         self._here, self._switch_out = here, here.switch
-        self._body.parent = here  # where the stack's end arrives
-        # Inside another environment's simulation, that is to be masked before each step.
+        self._body.parent = here  # control returns here when the stack ends
+        # Inside another environment's simulation, ``enter`` is needed before each step, to hide that simulation.
         self.caller = here if self._direct and here not in STACKS else None
 
     def throw(self) -> Event:
-        """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
+        """Raise ``SimulationExit`` in the suspended simulation; return its next event."""
         self.enter()
         if self._idle or not self._body:  # the job has ended, or was interrupted before it began
             self._job = None
@@ -161,16 +161,16 @@ class GreenletDriver(BaseDriver):
         return event
 
     def reachable(self) -> bool:
-        """Whether the simulation can be resumed from here."""
+        """Whether the simulation can be resumed from the current thread."""
         return self._home() is _home()
 
     def lost(self) -> bool:
-        """Whether the thread has ended in which alone the simulation could be resumed."""
+        """Whether the simulation's thread has ended, so that nothing can resume the simulation."""
         return self._home() is None
 
     @property
     def usable(self) -> bool:
-        """Whether a job can be started from here."""
+        """Whether the current thread can start a job."""
         return super().usable and not self._body.dead
 
     def end(self) -> None:
@@ -185,18 +185,18 @@ class GreenletDriver(BaseDriver):
             body.throw()
 
     def give_up(self) -> None:
-        """Leave a job that does not unwind where it is."""
+        """Abandon a job that does not unwind, and leave it suspended."""
         self._forget_stack()
         _given_up.append(self)
 
     def forked(self) -> None:
-        """The process was forked, and this is the child, in which only one thread is left."""
+        """Handle a fork in the child process, in which only one thread is left."""
         if self._thread != get_ident():
             self._stay_behind()
 
 
 def _share_hub(hub: Any) -> None:
-    """Have gevent's hub belong to the thread that it serves, and not to a simulation that was the first to use it."""
+    """Attach gevent's hub to its thread's main greenlet, even if a simulation was the first to use the hub."""
     root = getcurrent()
     while root.parent is not None:
         root = root.parent
@@ -205,4 +205,4 @@ def _share_hub(hub: Any) -> None:
 
 
 _given_up: list[GreenletDriver] = []
-"""Simulations that refused to unwind: dropping them would resume them at some random moment."""
+"""Simulations that did not unwind. They are kept, because freeing a greenlet resumes it, at an arbitrary moment."""

@@ -1,4 +1,4 @@
-"""Event loops of asyncio: what they set for a whole thread is kept apart for the two stacks that share it."""
+"""The state that asyncio event loops set for a whole thread, kept separate for the two stacks that share the thread."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import Any, Final
 from .switch import is_exit
 
 _signal: Final[Any] = import_module("_signal")
-"""What ``signal`` wraps to make enums of handlers, which takes longer than all that is done here."""
+"""The C module behind ``signal``. The latter turns handlers into enums, which is slower than all code of this module."""
 
 LOOPS: Final = "asyncio.events"
-"""What knows the event loop that runs in a thread, whichever stack it runs on. Where it was not imported, none runs."""
+"""The module that knows a thread's running event loop, whatever its stack. If it is not imported, no loop runs."""
 
 Surroundings = tuple[Any, Any, int]
-"""What an event loop sets for its thread: that it runs, the hooks of asynchronous generators, and how much of their
-origin coroutines remember."""
+"""The state that an event loop sets for its thread: the running loop, the hooks of asynchronous generators, and the
+depth of coroutine origin tracking."""
 
 NO_LOOP: Final = (None, (None, None), 0)
 
 
 def running_loop() -> Any:
-    """The event loop that runs in this thread; None if none does."""
+    """The event loop that runs in this thread; None if there is none."""
     events = modules.get(LOOPS)
     return None if events is None else events._get_running_loop()
 
@@ -42,11 +42,11 @@ def _surround(surroundings: Surroundings) -> None:
 
 
 class Sides:
-    """A simulation's event loop and its user's, in one thread.
+    """The event loops of a simulation and of its user, in one thread.
 
     Attributes:
-        find: Tells which loop runs; None as long as it is not known that asyncio was imported.
-        users: What the user's loop had set when the simulation went on; None: the simulation had none then either.
+        find: Returns the running loop. None until it is known that asyncio is imported.
+        users: The surroundings of the user when the simulation was resumed. None if neither had a loop then.
     """
 
     __slots__ = ("_before", "_interrupt", "_own", "find", "users")
@@ -54,35 +54,35 @@ class Sides:
     def __init__(self) -> None:
         self.find: Any = None
         self.users: Surroundings | None = None
-        self._before = NO_LOOP  # the user's, where the simulation begins a loop later
-        self._own: Surroundings | None = None  # the simulation's, while its user goes on
-        self._interrupt: Any = None  # what the simulation's loop does at Ctrl-C
+        self._before = NO_LOOP  # the user's surroundings, for a simulation that begins a loop later
+        self._own: Surroundings | None = None  # the simulation's surroundings, while the user runs
+        self._interrupt: Any = None  # the Ctrl-C handler of the simulation's loop
 
     def begin(self) -> None:
-        """The simulation begins a job, without a loop."""
+        """Switch to the simulation for a new job, which begins without a loop."""
         before = _surroundings()
-        self._before = NO_LOOP if before[0] is not None or before == NO_LOOP else before  # one object for many
+        self._before = NO_LOOP if before[0] is not None or before == NO_LOOP else before  # share one object
         self._own = self._interrupt = None
         self.enter()
 
     def look(self) -> Any:
-        """The user goes on, and asyncio has been imported meanwhile."""
+        """Switch to the user for the first time after asyncio was imported."""
         self.find = modules[LOOPS]._get_running_loop
         return self.leave()
 
     def leave(self) -> Surroundings | None:
-        """The user goes on, in its own surroundings; return those of the simulation, if they are to be put back."""
+        """Switch to the user's surroundings; return the simulation's, if they must be restored later."""
         loop = running_loop()
         if loop is None and self.users is None:
             return None
         self._own = own = _surroundings()
         users, self.users = self.users or self._before, None
         _surround(users)
-        self._interrupt = _take_interrupt(loop)  # last: a Ctrl-C is raised here from now on
+        self._interrupt = _take_interrupt(loop)  # last, because from now on a Ctrl-C is raised here
         return own
 
     def enter(self) -> None:
-        """The simulation goes on, in the surroundings in which it was."""
+        """Switch to the simulation's surroundings."""
         interrupt, self._interrupt = self._interrupt, None
         if interrupt is not None and _signal.getsignal(SIGINT) is default_int_handler:
             _signal.signal(SIGINT, interrupt)
@@ -94,10 +94,10 @@ class Sides:
 
 
 def _take_interrupt(loop: Any) -> Any:
-    """Put back the handler of Ctrl-C in whose place ``asyncio.run`` has set one for a loop: it does so for one alone.
+    """Restore Python's default Ctrl-C handler if ``asyncio.run`` has replaced it for a given loop.
 
     Returns:
-        What it had set; None where it had set nothing.
+        The handler that ``asyncio.run`` had set. None if it had set none.
     """
     if loop is None or get_ident() != main_thread().ident:
         return None
@@ -110,7 +110,7 @@ def _take_interrupt(loop: Any) -> Any:
 
 
 def hush() -> None:
-    """Have the loop that runs here say nothing of tasks that are unwound, which nothing may await any more."""
+    """Stop the running loop from reporting tasks that are unwound, because no code can await them any more."""
     loop = running_loop()
     if loop is not None:
         before = loop.get_exception_handler()
@@ -119,7 +119,7 @@ def hush() -> None:
 
 
 class _Hushed:
-    """An exception handler of a loop, to which tasks that were unwound, or left when it was closed, are no news."""
+    """A loop's exception handler that ignores tasks that were unwound, or left over when the loop was closed."""
 
     def __init__(self, handler: Any) -> None:
         self._handler = handler

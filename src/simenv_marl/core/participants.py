@@ -1,4 +1,4 @@
-"""The agents that take part in an episode: those that live, those that have ended, those that policies answer for."""
+"""The agents of an episode: live agents, ended agents, and agents for which policies answer."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Participants:
     Attributes:
         agents: The live agents of the environment, by name, in the order in which they joined.
         answered: The agents for which policies answer, by name.
-        ended: The agents of the environment whose episode has ended before the simulation's, by name.
-        just_ended: Those of them whose end no view has entered yet.
-        done: Whether the one agent of the environment has ended, and so nothing is left to ask for.
-        script: The answers of another episode's tape that are yet to be given again; None where none are, or no more.
-        consulted: The agent whose policy is asked just now, and is given the environment; None while none is.
-        latest: The agent whose decision was the latest, for those who read an error's notes.
-        clock: Returns the simulation's time; None where it has none.
+        ended: The agents of the environment whose episodes ended before the simulation's, by name.
+        just_ended: The ended agents whose end no view has reported yet.
+        done: Whether the only agent of the environment has ended, so that nothing is left to ask the user.
+        script: During a replay, the answers on the other episode's tape that are still to be given. Else None.
+        consulted: The agent whose policy is being asked and gets the environment. None if there is none.
+        latest: The agent that decided last, for the notes of errors.
+        clock: Returns the simulation's time. None if the simulation has no time.
     """
 
     __slots__ = (
@@ -46,7 +46,7 @@ class Participants:
     )
 
     def __init__(self, plan: Plan, simulation: Any, clock: Callable[[], float] | None) -> None:
-        """Have the agents take part that are known beforehand."""
+        """Make the agents that the plan knows beforehand."""
         self._plan, self._simulation, self.clock = plan, simulation, clock
         self.agents: dict[str, Agent] = {
             name: self._agent_of(name, point, plan.policy_of(name, point)) for name, point in plan.roster.items()
@@ -61,20 +61,20 @@ class Participants:
         self._entities: dict[tuple[BoundPoint, int], Agent] = {}
 
     def remember(self, agent: Agent, entity: Any) -> None:
-        """Note which agent an entity is at its point, for ``named_before``."""
+        """Note the agent of an entity at its decision point, for ``named_before``."""
         self._entities[agent.point, id(entity)] = agent
 
     def named_before(self, point: BoundPoint, entity: Any) -> str | None:
-        """The name of the agent that an entity was when it decided last at a point; None where it was none."""
+        """The name of the agent as which an entity last decided at a point; None if it was no agent."""
         agent = self._entities.get((point, id(entity)))
-        args = None if agent is None else agent.arguments()  # of another one, whose memory this one has, it is gone
+        args = None if agent is None else agent.arguments()  # to exclude a freed entity that had the same id
         return agent.name if agent is not None and args and args[0] is entity else None
 
     def agent_for(self, point: BoundPoint, name: Any) -> Agent:
-        """Find the agent of a name that decides at a point, or let it join.
+        """Find the agent with a name that decides at a point, or let it join.
 
         Raises:
-            AgentError: The name is none, or belongs to another point, or to an agent that has ended.
+            AgentError: The name is not a string, or belongs to another point, or to an agent that has ended.
         """
         if not isinstance(name, str):
             raise AgentError(f"agent= of {point.point.name} must name a string or None, not {shown(name)}")
@@ -99,11 +99,11 @@ class Participants:
         return Agent(name, point, policy, self.clock, self._plan.plugins)
 
     def agent(self, name: str) -> Agent | None:
-        """An agent of the environment, whether it lives or has ended; None where there is no such agent."""
+        """An agent of the environment, live or ended; None if there is no such agent."""
         return self.agents.get(name) or self.ended.get(name)
 
     def announced(self) -> list[tuple[Agent, tuple[Any, ...]]]:
-        """The live agents that the simulation says are going to decide, with the arguments of their calls."""
+        """The live agents that ``expected_calls`` announces, with the arguments of their calls."""
         expected = getattr(self._simulation, "expected_calls", None)
         announced: list[tuple[Agent, tuple[Any, ...]]] = []  # a generator could not pass on a StopIteration
         if expected is None:
@@ -123,13 +123,13 @@ class Participants:
         return announced
 
     def ask(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Ask a policy that is to be given the environment, or answers many at once; or find what it has answered.
+        """Ask a policy that gets the environment, or that answers many decisions at once. In a replay, use the script.
 
         Returns:
-            ``WAIT`` where it is asked later, and where a replay has come to where the other episode stands.
+            The action. ``WAIT`` if the policy is asked later, or if a replay has reached the other episode's decision.
 
         Raises:
-            BaseException: What the policy raises.
+            BaseException: Any error that the policy raises.
         """
         if agent.deferred and not self.alone:
             return WAIT
@@ -150,9 +150,9 @@ class Participants:
             self.consulted = None
 
     def single_out(self, agent: Agent) -> None:
-        """Have one agent be the only one of the environment, in a branch.
+        """In a branch, make one agent the only agent of the environment.
 
-        All others are left to their policies; those without one to their rule.
+        Policies answer for all other agents, or the rule where there is no policy.
         """
         plan = self._plan = self._plan.for_one(agent.name)
         for name, other in self.agents.items():
@@ -164,7 +164,7 @@ class Participants:
         agent.follow(None)
 
     def leave_to(self, others: Mapping[str, Any]) -> None:
-        """In a branch: have policies, by agent, answer for agents that are not its user's and have none."""
+        """In a branch, let policies, given by agent, answer for agents that neither the user nor a policy answers."""
         led = {name: self.answered.get(name) for name, policy in others.items() if policy is not RULE}
         led = {name: agent for name, agent in led.items() if agent is None or agent.policy is RULE}
         self._plan = self._plan.led_by({name: two_arguments(others[name]) for name in led if name not in self.agents})
@@ -173,7 +173,7 @@ class Participants:
                 agent.follow(self._plan.policies[name])
 
     def may_be(self, name: Any) -> bool:
-        """Whether there is an agent of that name, or may be one."""
+        """Whether there is an agent with that name, or could be one later."""
         plan = self._plan
         declared = plan.options.possible_agents
         open_to_all = declared is None and any(point.agent is None for point in plan.points)
@@ -182,13 +182,14 @@ class Participants:
 
     @property
     def alone(self) -> bool:
-        """Whether one agent is singled out."""
+        """Whether this is a branch with one agent singled out."""
         return self._plan.alone
 
     def crossing(self) -> Mapping[Hook, Any]:
-        """What crosses from the simulation, by hook; where a point has one agent, that agent itself.
+        """The events that the simulation sends, by hook.
 
-        Of points that name an agent at each call it is the point, which finds the agent.
+        The event of a point with one agent is that agent. The event of a point that names an agent at each call is the
+        bound point, which finds the agent.
         """
         agents, decisions = self.agents, self._plan.decisions
         alone = {
@@ -197,14 +198,14 @@ class Participants:
         return {**decisions, **alone} if alone else decisions
 
     def names(self) -> str:
-        """The names of the live agents, for messages."""
+        """List the names of the live agents, for messages."""
         return listed(self.agents)
 
     def finish_agent(self, agent: Agent) -> None:
-        """End the episode of one agent, in the midst of the simulation's."""
+        """End the episode of one agent while the simulation's goes on."""
         latest = self.latest
         self.conclude(agent)
-        self.latest = latest  # after whose decision the model goes on
+        self.latest = latest  # the model continues after this agent's decision
         agent.ended = agent.led = True
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
@@ -214,7 +215,7 @@ class Participants:
         """Give an agent its last reward and its last observation."""
         self.latest = agent
         args = agent.arguments()
-        if args is None:  # it never decided, or the model has let it go
+        if args is None:  # the agent never decided, or the model has freed its entity
             agent.unsee()
         else:
             agent.settle(agent, args, agent.kwargs, last=True)
@@ -223,6 +224,6 @@ class Participants:
 
 
 def listed(names: Collection[str]) -> str:
-    """The first of some names, and how many more there are, for messages."""
+    """List the first ten of some names, and the number of the others, for messages."""
     first = ", ".join(list(names)[:10])
     return f"{first} and {len(names) - 10} more" if len(names) > 10 else first

@@ -1,7 +1,7 @@
-"""What an environment is made of, all of it known and checked before anything runs.
+"""The plan of an environment: a complete description that is checked before anything runs.
 
-A plan says which decision points an environment decides, under which agents' names, with which policies and
-options. It holds no state of any episode, so that one plan serves any number of environments.
+A plan names the decision points of an environment, the names of their agents, the policies and the options. It holds no
+state of any episode, so that one plan serves any number of environments.
 """
 
 from __future__ import annotations
@@ -48,42 +48,41 @@ from .roster import assign, call_the_roll, declared_agents, name_agents, names_a
 from .variant import Variant
 
 RENDER_MODES = ("ansi", "human", "rgb_array")
-"""What a simulation with a method ``render`` is taken to render, unless it has ``render_modes``."""
+"""The render modes of a simulation with a method ``render`` that does not define ``render_modes``."""
 
 END_AGENT = f"{SimulationInterface.__module__}.{SimulationInterface.end_agent.__qualname__}"
-"""Where a simulation says that an agent's episode ends."""
+"""The dotted name of the method by which a simulation ends an agent's episode."""
 
 RENDER_FPS = 4
-"""How many pictures make a second, unless it has ``render_fps``."""
+"""The frames per second of a simulation that does not define ``render_fps``."""
 
 
 class Plan:
-    """What an environment is made of.
+    """The plan of an environment.
 
     Attributes:
-        source: Of what its simulation is made.
-        variant: The variant that it is made of; None if it is of none.
-        options: Its options.
-        render_modes: What its simulation can be rendered as.
-        render_fps: How many of its pictures make a second of a film.
+        source: The simulation, class or factory from which the environment makes its simulation.
+        variant: The variant from which the environment is made. None if it is not made from a variant.
+        options: The options.
+        render_modes: The render modes of the simulation.
+        render_fps: The frames per second of its rendering.
         points: The decision points that do not run their rule.
-        active: Those of them that the environment's user answers.
-        events: By decision point, what crosses from the simulation when it is called.
-        decisions: The same by the point's hook, for drivers.
-        policies: By name: the policies of agents that are no agents of the environment.
-        asks: Whether some mapping asks for the simulation, or some policy for the environment.
-        looked_into: Whether some policy asks for the environment, and may branch it.
-        alone: Whether it is the plan of a branch that waits for one agent alone.
-        wanted: The agents that ``policies`` and ``possible_agents`` name. Those that do not appear in an episode are
-            warned of, once, and taken out.
-        one_agent: The name of the one agent that the environment's user answers for; None where there may be more.
-        roster: By name: the points of the agents that are known beforehand, in the order of the points.
-        complete: Whether no others may join.
-        unanswered: Whether there is no environment's user, and what no policy answers is left to its rule.
-        rewarded: Whether agents that deferred policies answer are agents of the environment all the same, with rewards
-            and ends.
-        plugins: The handlers for its simulation alone; None if it has none.
-        hooks: Of what must be set in the model while the environment is in use.
+        active: The decision points that the environment's user answers.
+        events: For each decision point, the event that the simulation sends when the point is called.
+        decisions: The same events by the point's hook, for drivers.
+        policies: By agent name, the policies of agents that are not agents of the environment.
+        asks: Whether a mapping asks for the simulation, or a policy asks for the environment.
+        looked_into: Whether a policy asks for the environment, and so may branch it.
+        alone: Whether this is the plan of a branch that waits for one agent only.
+        wanted: The agents that ``policies`` and ``possible_agents`` name. Agents that do not appear in an episode are
+            removed from this set, with one warning.
+        one_agent: The name of the only agent that the environment's user answers for. None if there may be several.
+        roster: By agent name, the decision points of the agents that are known beforehand, in the order of the points.
+        complete: Whether ``roster`` contains all possible agents.
+        unanswered: Whether the environment has no user, so that the rule decides wherever no policy answers.
+        rewarded: Whether agents with deferred policies are agents of the environment, with rewards and ends.
+        plugins: The handlers for this environment's simulation only. None if there are none.
+        hooks: The hooks that must be set in the model while the environment is in use.
     """
 
     def __init__(
@@ -104,7 +103,7 @@ class Plan:
     ) -> None:
         self.source, self.options, self._named, self._own = source, options, named, own
         self.variant = variant
-        self._spare = [] if spare is None else spare  # the simulation that was looked at, until an environment takes it
+        self._spare = [] if spare is None else spare  # a simulation for inspection, until an environment takes it
         self.render_modes, self.render_fps = render_modes, render_fps
         if options.render_mode is not None and options.render_mode not in render_modes:
             raise OptionValueError(
@@ -131,7 +130,7 @@ class Plan:
         self._bind_points(first=True)
 
     def _bind_points(self, *, first: bool) -> None:
-        """Make the decision points ready to be called, and find out who decides there."""
+        """Bind the decision points, and find out who decides at each."""
         options, unanswered = self.options, self.unanswered
         agents = name_agents(self._everything)
         known = agents[: len(self._named)]
@@ -142,7 +141,7 @@ class Plan:
             if options.agent is not None and agent != (options.agent if options.agent in known else None):
                 policy = policy or RULE
             excepted = self.policies if agent is None else self.policies.get(agent, RULE) is not RULE
-            if policy is not RULE or excepted:  # else its rule decides
+            if policy is not RULE or excepted:  # otherwise the rule decides
                 self._bind(point, agent, policy)
             else:
                 self.wanted.discard(agent)
@@ -171,7 +170,7 @@ class Plan:
         self.one_agent = self.active[0].agent or options.agent if len(self.active) == 1 else None
 
     def with_simulation(self, simulation: Any, session: Any) -> Plan:
-        """The same plan, with a simulation, and its session, given to those mappings and policies that ask for it."""
+        """Copy the plan, and give the simulation and its session to the mappings and policies that ask for them."""
         made = self._copied()
         made._everything = [
             replace(point, definition=given_simulation(point.definition, simulation)) for point in self._everything
@@ -182,25 +181,25 @@ class Plan:
         return made
 
     def with_source(self, source: Any, variant: Variant | None, spare: Spare) -> Plan:
-        """The same plan, of simulations that are made of something else, and of which there is one already."""
+        """Copy the plan for simulations from another source, of which one is already made."""
         made = self._copied()
         made.source, made.variant, made._spare = source, variant, [spare]
         return made
 
     @property
     def looked_at(self) -> Any:
-        """The simulation that was made to be looked at, unless an environment has taken it."""
+        """The simulation that was made for inspection; None if there is none, or if an environment has taken it."""
         return self._spare[-1].simulation if self._spare else None
 
     def for_one(self, agent: str) -> Plan:
-        """The same plan, for a branch that waits for one agent alone: who has no policy is left to its rule."""
+        """Copy the plan for a branch that waits for one agent only. The rule decides for agents without a policy."""
         made = self._copied()
         made.unanswered, made.rewarded, made.alone = True, False, True
         made.one_agent, made.wanted = agent, set()
         return made
 
     def led_by(self, policies: Mapping[str, Any]) -> Plan:
-        """The same plan, for a branch in which policies, by agent, answer for agents that have none."""
+        """Copy the plan for a branch in which policies, given by agent, answer for agents that have none."""
         made = self._copied()
         made.policies = {**policies, **self.policies}
         return made
@@ -226,11 +225,11 @@ class Plan:
             self.active.append(bound)
 
     def _single_out(self, agent: str) -> None:
-        """Leave all agents but one to their policies or their rule.
+        """Let policies or the rule answer for all agents except one.
 
         Raises:
             AgentError: The agent is not declared, or its decision point is not known.
-            OptionValueError: A policy answers for it.
+            OptionValueError: A policy answers for the agent.
         """
         if agent in self.policies:
             raise OptionValueError(
@@ -250,10 +249,10 @@ class Plan:
         self.active, self.roster, self.complete = points, {agent: points[0]}, True
 
     def policy_of(self, agent: str, point: BoundPoint) -> Any:
-        """The policy of an agent; None: the environment's user.
+        """The policy that answers for an agent; None if the environment's user answers.
 
         Raises:
-            AgentError: The agent is not declared, and the environment asks for that.
+            AgentError: The agent is not declared, although the environment's options require it.
         """
         policy = self.policies.get(agent) or point.policy
         if policy is not None:
@@ -270,17 +269,17 @@ class Plan:
         )
 
     def is_active(self, policy: Any) -> bool:
-        """Whether an agent with that policy is an agent of the environment."""
+        """Whether an agent with this policy is an agent of the environment."""
         return policy is None or (self.rewarded and isinstance(policy, DeferredPolicy))
 
     @property
     def possible_agents(self) -> list[str] | None:
-        """The names of all agents that there may be; None where they are only known when they decide."""
+        """The names of all possible agents; None if an agent becomes known only when it decides."""
         return list(self.roster) if self.complete else None
 
     @property
     def patches(self) -> list[Hook | Plugins]:
-        """What must be set in the model while an environment is in use."""
+        """The hooks and plugins that must be set in the model while an environment is in use."""
         return [*self.hooks] if self.plugins is None else [*self.hooks, self.plugins]
 
     def _find_removals(self, *, warns: bool) -> None:
@@ -300,7 +299,7 @@ class Plan:
                 removal.of.append((binding, agent, owner))
 
     def _cross(self, point: DecisionPoint, event: Any) -> Any:
-        """Have an event cross where a function is called, unless one does already; return the one that does."""
+        """Set the event that the simulation sends when a function is called, unless there is one; return the event."""
         if point.hook not in self.hooks:
             self.hooks.append(point.hook)
         return self.events.setdefault(point, event)
@@ -316,18 +315,18 @@ class Plan:
         rewarded: bool = False,
         others: Any = None,
     ) -> Plan:
-        """Make a plan of what users say.
+        """Make a plan from the arguments that a user gives.
 
         Args:
             source: A simulation, its class, a factory, or a variant.
             points: The active decision points, as ``generate_env`` takes them.
             options: The options, by name.
-            unanswered: Whether there is no environment's user.
-            rewarded: Whether agents that deferred policies answer are agents of the environment all the same.
-            others: The policy of all for whom none is given; all decision points are meant where none is named.
+            unanswered: Whether the environment has no user.
+            rewarded: Whether agents with deferred policies are agents of the environment.
+            others: The policy of all agents without one. With it, ``points=None`` means all decision points.
 
         Raises:
-            SimEnvError: Something in them cannot work; the leaf says what.
+            SimEnvError: The arguments do not work. The subclass of the error says why.
         """
         variant = source if isinstance(source, Variant) else None
         if variant is not None:
@@ -354,7 +353,7 @@ class Plan:
         )  # fmt: skip
 
     def __deepcopy__(self, memory: Any) -> Plan:
-        return self  # it holds nothing of any environment
+        return self  # a plan holds no state of any environment
 
     def __reduce__(self) -> Any:
         points = {point.key: point.own_definition for point in self._named}
@@ -366,38 +365,38 @@ class Plan:
         return _remade, (self.source, points, options, self.variant, self.unanswered)
 
     def spare(self) -> Spare | None:
-        """The simulation that was made to be looked at, with its stack, if it serves an environment of this plan."""
-        if self.plugins or self.options.global_rng:  # which it was made without
+        """Take the simulation that was made for inspection, with its stack; None if there is none that fits."""
+        if self.plugins or self.options.global_rng:  # the simulation was made without them
             return None
         try:
             spare = self._spare.pop()
-        except IndexError:  # there is none, or another thread was faster
+        except IndexError:  # there is none, or another thread has just taken it
             return None
         return spare if spare.kind == self.options.driver else None
 
     def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
-        """The same plan, with another definition of a point."""
+        """Make the same plan with another definition of a point."""
         named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
         return self._like(named, self.options)
 
     def declared(self, roster: Mapping[str, BoundPoint]) -> Plan:
-        """The same plan, with a roster of agents that has been found out."""
+        """Make the same plan with a roster of agents that was found out."""
         names: dict[str, list[str]] = {b.point.name: [] for b in self.active if b.agent is None}
         for agent, binding in roster.items():
             if binding.agent is None:
                 names[binding.point.name].append(agent)
         plan = self.amended({"possible_agents": names})
-        plan.wanted = self.wanted  # what was found out was named by no user
+        plan.wanted = self.wanted  # the user has not named the agents that were found out
         return plan
 
     @property
     def stale(self) -> bool:
-        """Whether a function that it patches has been replaced by another one since it was made."""
+        """Whether other code has replaced a function that the plan patches since the plan was made."""
         return any(hook.stale for hook in self.hooks) or (self.plugins is not None and self.plugins.stale)
 
     @property
     def name(self) -> str:
-        """What the simulation is called: the name of its class or factory."""
+        """The name of the simulation's class or factory."""
         return str(self.maker.__name__)
 
     @property
@@ -409,7 +408,7 @@ class Plan:
         return source if hasattr(source, "__qualname__") else type(source)
 
     def amended(self, options: Mapping[str, Any]) -> Plan:
-        """The same plan, but for the options that are given."""
+        """Make the same plan with other values of the given options."""
         if not options:
             return self
         return self._like(self._named, self.options.amended(options))

@@ -1,8 +1,8 @@
-"""What crosses from one process to another: simulations, points, policies, results, errors.
+"""Pickling for other processes: simulations, decision points, policies, results and errors.
 
-They cross by reference where they can be imported, and by value where not, as in a script or a notebook. Functions are
-a matter of their own: others may stand in their places for as long as an environment is in use, and decision
-functions have to ask the environments of the process in which they are called.
+Things that can be imported are pickled by reference, all others by value, such as those of a script or a notebook.
+Functions need special care: a patch may take the place of a function while an environment is in use, and a decision
+function must ask the environments of the process in which it is called.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from ..hooks.hook import Hook, hook_of, made_with
 
 
 def pack(thing: Any) -> bytes:
-    """Pickle something for another process.
+    """Pickle an object for another process.
 
     Raises:
-        Exception: What pickling it raises.
+        Exception: Any error of pickling.
     """
     buffer = io.BytesIO()
     _Pickler(buffer, 5).dump(thing)
@@ -38,21 +38,21 @@ def pack(thing: Any) -> bytes:
 
 
 def pack_plainly(thing: Any) -> bytes:
-    """The same, and faster, for a process that ``multiprocessing`` has started from the same script.
+    """Pickle an object, faster than ``pack``, for a process that ``multiprocessing`` started from the same script.
 
     Raises:
-        Exception: What pickling it raises.
+        Exception: Any error of pickling.
     """
-    with suppress(Exception):  # what is wrong will be said below
+    with suppress(Exception):  # ``pack`` raises the error below
         plain = pickle.dumps(thing, 5)
-        # What stands in a notebook or in an interactive session is found in no other process.
+        # Other processes cannot import what is defined in a notebook or an interactive session.
         if b"__main__" not in plain or hasattr(sys.modules["__main__"], "__file__"):
             return plain
     return pack(thing)
 
 
 def unpack(parcel: bytes) -> Any:
-    """What was packed."""
+    """Unpickle an object that ``pack`` or ``pack_plainly`` has pickled."""
     return pickle.loads(parcel)
 
 
@@ -61,22 +61,22 @@ def unpack(parcel: bytes) -> Any:
 _PICKLED_BY: Final = {"__reduce__", "__reduce_ex__", "__getstate__", "__setstate__"}
 
 _LEFT_OUT: Final = vars(AttributeError)["obj"]
-"""Which may lead to all of the model; ``pickle`` leaves it out, too."""
+"""An attribute that may refer to the whole model. ``pickle`` leaves it out, too."""
 
 _IN_PYTHON: Final = 1 << 9
-"""The flag of types that are made at run time, as all that are written in Python."""
+"""The flag of types that are created at run time, as all classes written in Python are."""
 
 
 class _Packed(NamedTuple):
-    """What crosses of an error.
+    """The packed parts of one error.
 
     Attributes:
-        parts: Of what it is made again; None where that cannot cross.
-        message: What it says.
-        notes: Its notes.
-        members: The numbers of the errors of which it is a group.
-        cause: The number of what is told of as its cause; None if there is nothing.
-        direct: Whether it was raised from that.
+        parts: The pickled parts from which the error is rebuilt. None if they cannot be pickled.
+        message: The message.
+        notes: The notes.
+        members: The numbers of the errors in an exception group.
+        cause: The number of the error that a traceback shows as the cause. None if there is none.
+        direct: Whether the error was raised ``from`` that cause.
     """
 
     parts: bytes | None
@@ -88,20 +88,20 @@ class _Packed(NamedTuple):
 
 
 class RemoteTraceback(Exception):
-    """The first cause of an error that was raised in another process: its traceback there, as text."""
+    """The first cause of an error from another process. Its message is the traceback in that process."""
 
     def __str__(self) -> str:
         return f"\n\n{self.args[0]}"
 
 
 def pack_error(error: BaseException) -> bytes:
-    """Pickle an error for another process, with its causes, so that it can be rebuilt there, or at least be told of."""
+    """Pickle an error and its causes for another process, so that they can be rebuilt or at least described there."""
     try:
         text = "".join(traceback.format_exception(error))
-    except Exception:  # whatever its parts do when they are looked at
+    except Exception:  # formatting runs code of the error's class, which may fail
         text = told(error)
     errors, numbers = [error], {id(error): 0}
-    for known in errors:  # which grows meanwhile
+    for known in errors:  # the loop appends to the list
         for other in (_cause_of(known), *_members_of(known)):
             if other is not None and id(other) not in numbers:
                 numbers[id(other)] = len(errors)
@@ -121,9 +121,9 @@ def pack_error(error: BaseException) -> bytes:
 
 
 def unpack_error(parcel: bytes) -> BaseException:
-    """The error that was packed, with its causes and, as the first of them, its traceback.
+    """Rebuild a packed error with its causes. Its remote traceback becomes the first cause.
 
-    What cannot be rebuilt is a ``WorkerError``.
+    An error that cannot be rebuilt becomes a ``WorkerError``.
     """
     packed, text = pickle.loads(parcel)
     errors: dict[int, BaseException] = {}
@@ -131,11 +131,11 @@ def unpack_error(parcel: bytes) -> BaseException:
         _rebuild(number, packed, errors)
     for number, known in enumerate(packed):
         if known.cause is not None:
-            # It may be frozen.
+            # The error's class may be a frozen dataclass.
             name = "__cause__" if known.direct else "__context__"
             BaseException.__setattr__(errors[number], name, errors[known.cause])
     first, seen = 0, {0}
-    while (cause := packed[first].cause) is not None and cause not in seen:  # they may go in circles
+    while (cause := packed[first].cause) is not None and cause not in seen:  # causes may be cyclic
         first = cause
         seen.add(cause)
     BaseException.__setattr__(errors[first], "__cause__", RemoteTraceback(text))
@@ -143,7 +143,7 @@ def unpack_error(parcel: bytes) -> BaseException:
 
 
 def _cause_of(error: BaseException) -> BaseException | None:
-    """What is told of as the cause of an error."""
+    """The error that a traceback shows as the cause of an error."""
     return error.__cause__ if error.__cause__ is not None or error.__suppress_context__ else error.__context__
 
 
@@ -152,7 +152,7 @@ def _members_of(error: BaseException) -> tuple[BaseException, ...]:
 
 
 def _packed(error: BaseException) -> bytes | None:
-    """The parts of an error, or itself where it says how it is pickled; None where neither can be."""
+    """Pickle an error's parts, or the error itself if its class defines pickling; None if neither can be pickled."""
     kinds = [kind for kind in type(error).__mro__ if kind.__flags__ & _IN_PYTHON]
     itself = any(_PICKLED_BY & vars(kind).keys() for kind in kinds)
     for whole in (itself, not itself):
@@ -164,13 +164,13 @@ def _packed(error: BaseException) -> bytes | None:
 
 
 def _parts(error: BaseException) -> tuple[Any, ...]:
-    """What an error is made of, but for the members of a group."""
+    """The parts of an error, without the members of an exception group."""
     state = {name: value for name, value in vars(error).items() if name != "__notes__"}
     slots = {}
     for kind in set(type(error).__mro__) - {BaseException, BaseExceptionGroup, object}:
         for name, slot in vars(kind).items():
             if isinstance(slot, (MemberDescriptorType, GetSetDescriptorType)) and slot is not _LEFT_OUT:
-                with suppress(AttributeError):  # it was never set
+                with suppress(AttributeError):  # the slot was never set
                     slots[name] = slot.__get__(error)
     for name in slots.keys() & {"__dict__", "__weakref__"}:
         del slots[name]
@@ -179,12 +179,12 @@ def _parts(error: BaseException) -> tuple[Any, ...]:
 
 
 def _made_again(parcel: bytes, members: Sequence[BaseException]) -> BaseException:
-    """An error of what was packed of it."""
+    """Rebuild an error from its pickled parts and the members of its group."""
     thing = pickle.loads(parcel)
     if isinstance(thing, BaseException):
         return thing
     kind, args, slots, state = thing
-    # Neither its ``__init__`` nor its ``__new__`` is called: they may take other arguments than its ``args``.
+    # The class's own ``__init__`` and ``__new__`` are not called, because their arguments may differ from ``args``.
     native = next(base for base in kind.__mro__ if not base.__flags__ & _IN_PYTHON)
     if members:
         args = *args, list(members)
@@ -197,7 +197,7 @@ def _made_again(parcel: bytes, members: Sequence[BaseException]) -> BaseExceptio
 
 
 def _rebuild(number: int, packed: list[_Packed], errors: dict[int, BaseException]) -> BaseException:
-    """Rebuild an error unless it is there already, after the members of a group."""
+    """Rebuild an error, after the members of its group, unless it is already rebuilt."""
     if number not in errors:
         parts, message, notes, numbers, *_ = packed[number]
         error: BaseException = WorkerError(f"another process has raised what cannot be pickled: {message}")
@@ -216,7 +216,7 @@ def _rebuild(number: int, packed: list[_Packed], errors: dict[int, BaseException
 
 
 class _Pickler(cloudpickle.Pickler):
-    """Packs functions so that they are found or made anew where they arrive."""
+    """A pickler that lets the receiving process find functions, or make them anew."""
 
     def reducer_override(self, obj: Any) -> Any:
         reduced = _reduced(obj)
@@ -224,7 +224,7 @@ class _Pickler(cloudpickle.Pickler):
 
 
 def _reduced(thing: Any) -> tuple[Any, ...] | None:
-    """How a thing crosses that would not be itself on the other side; None for all others."""
+    """The reduction of an object for which the default pickling is wrong; None for all other objects."""
     if isinstance(thing, DecisionPoint):
         there = _found_at(thing.rule.__module__, thing.rule.__qualname__)
         known = point_of(there)
@@ -246,7 +246,7 @@ def _reduced(thing: Any) -> tuple[Any, ...] | None:
 
 
 def _found_at(module: str, path: str, *, bound: bool = False) -> Any:
-    """What a module has under a dotted name, without its binding unless told otherwise; None where that is nothing."""
+    """Import the object with a dotted name from a module; None if there is none. A method comes unbound by default."""
     if module == "__main__" or module is None:
         return None
     try:
@@ -268,7 +268,7 @@ def _point_at(module: str, path: str) -> Any:
 
 _tokens: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
 _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
-"""What has crossed, in either direction: coming back, it is what it was."""
+"""Objects that were sent or received, by token. An object that comes back is identical to the one that was sent."""
 
 
 def _token(thing: Any) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Final
 from .switch import is_exit
 
 _signal: Final[Any] = import_module("_signal")
-"""The C module behind ``signal``. The latter turns handlers into enums, which is slower than all code of this module."""
+"""The C module. ``signal`` makes enums of handlers, which takes longer than everything else in this module."""
 
 LOOPS: Final = "asyncio.events"
 """The module that knows a thread's running event loop, whatever its stack. If it is not imported, no loop runs."""

@@ -1,7 +1,7 @@
-"""Finding decision points: what ``points=`` names.
+"""The search for the decision points that ``points=`` names.
 
-Where an environment names an undecorated function, the hook of that place is held for as long as the environment
-needs it: for all others the function stays what it was.
+If an environment names an undecorated function, the hook of that function exists only as long as the environment needs
+it. For all other callers the function does not change.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from ..hooks.places import (
 )
 
 Points = str | Callable[..., Any] | Iterable[str | Callable[..., Any]] | Mapping[Any, Definition | None] | None
-"""What names decision points: see ``generate_env``."""
+"""The ways to name decision points: see ``generate_env``."""
 
 POINT: Final = Purpose("decision point", UnknownPointError, decision_points)
 
 
 @dataclass(frozen=True)
 class NamedPoint:
-    """A decision point as an environment was told to use it.
+    """A decision point together with the definition that an environment uses for it.
 
     Attributes:
-        point: What is asked.
-        definition: How the environment decides it.
+        point: The decision point.
+        definition: The definition.
     """
 
     point: DecisionPoint
@@ -50,21 +50,24 @@ class NamedPoint:
 
     @property
     def key(self) -> Any:
-        """What names it in another process."""
+        """The key that names the point in another process."""
         return portable(self.point.rule, self.point.name)
 
     @property
     def own_definition(self) -> Definition | None:
-        """Its definition; None where that is the one which it was decorated with, and which comes along with it."""
+        """The definition; None if it is the one of the point's decorator, which needs no separate pickling."""
         return None if self.definition is self.point.definition else self.definition
 
 
 def portable(key: Any, name: str | None = None) -> Any:
-    """What names a function in another process: its dotted name, if that is sure to lead to it there.
+    """Find a key that names a function in another process: its dotted name, if that surely leads to the function there.
 
     Args:
-        key: A function, or what a user has named.
-        name: Its dotted name, if that is known.
+        key: A function, or another key that a user has given.
+        name: The function's dotted name, if it is known.
+
+    Returns:
+        The dotted name, a ``Member``, the function, or ``key`` itself if it is not a function.
     """
     function = unwrapped(key)
     if not isinstance(function, FunctionType):
@@ -80,9 +83,9 @@ def portable(key: Any, name: str | None = None) -> Any:
 
 
 class Member:
-    """Stands for a function of a class of the main module where that is pickled: by the class, in whatever way that is.
+    """The stand-in by which a function of a class in the main module is pickled: the class and the function's name.
 
-    A decision function cannot be pickled for its rule, which is not what is found under its name.
+    The rule of a decision function cannot be pickled by name, because the name leads to the decision function.
     """
 
     def __init__(self, owner: type, name: str) -> None:
@@ -93,9 +96,9 @@ class Member:
 
 
 def own_points(simulation: Any) -> dict[DecisionPoint, Definition]:
-    """The definitions that a simulation gives to its own points, in its attribute ``points``.
+    """The definitions in a simulation's attribute ``points``.
 
-    What is not to be found is left out: it is told of where it is asked for.
+    Names that lead to nothing are left out. Code that looks such a name up raises an error for it.
     """
     given = getattr(simulation, "points", None)
     own: dict[DecisionPoint, Definition] = {}
@@ -113,24 +116,24 @@ def find_points(
     required: bool = True,
     empty: bool = False,
 ) -> list[NamedPoint]:
-    """Find all that ``points=`` names.
+    """Find all decision points that ``points=`` names.
 
     Args:
         points: A dotted name, a function, a list of these, or a dict from these to definitions. None: the
-            attribute ``points`` of the simulation, else all decorated points. What is named without a definition has
-            the one that the simulation's ``points`` gives it, if they do.
+            simulation's attribute ``points``, or all decorated points if there is no such attribute. A point that is
+            named without a definition gets the definition in the simulation's ``points``, if there is one.
         simulation: The simulation.
-        own: Its ``own_points``, if they are known.
-        required: Whether all decorated points are meant where none is named, and not none.
-        empty: Whether ``points`` may name none.
+        own: The result of ``own_points``, if it is known.
+        required: Whether all decorated points are used if none is named. If False, none is used.
+        empty: Whether ``points`` may be empty.
 
     Returns:
         The points, in the order in which they were named.
 
     Raises:
-        UnknownPointError: A name leads to nothing, or nothing is named.
-        DefinitionError: A function has no definition, or a dict's value is none.
-        PatchError: A function was named that cannot be made a decision point.
+        UnknownPointError: A name leads to nothing, or no point is named.
+        DefinitionError: A function has no definition, or a value of the dict is not a definition.
+        PatchError: A function that was named cannot become a decision point.
     """
     if own is None:
         own = own_points(simulation)
@@ -161,14 +164,14 @@ def find_point(
 
     Args:
         key: A dotted name, or a function.
-        definition: The definition to use it with. None: the one that it was decorated with.
-        own: Those that a simulation gives to its own points.
+        definition: The definition to use. None: the simulation's own definition, or that of the point's decorator.
+        own: The definitions in the simulation's ``points``.
 
     Returns:
-        The point, with the definition.
+        The point with its definition.
 
     Raises:
-        UnknownPointError, DefinitionError, PatchError: As ``find_points``.
+        UnknownPointError, DefinitionError, PatchError: See ``find_points``.
     """
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {shown(definition)}")
@@ -183,7 +186,7 @@ def find_point(
 
 
 def by_name(own: Mapping[DecisionPoint, Definition]) -> dict[str, DecisionPoint]:
-    """Those of a simulation's own points that are found by a name, and not in a module."""
+    """The simulation's own points that have a name of their own and do not exist in a module."""
     return {point.name: point for point in own if hasattr(point.rule, BY_NAME)}
 
 
@@ -197,11 +200,11 @@ def locate(
         own: The simulation's own points.
 
     Returns:
-        The point; the definition that the function itself was decorated with.
+        The point, and the definition of the function's own decorator, if there is one.
 
     Raises:
         UnknownPointError: The name leads to nothing.
-        PatchError: It leads to something that cannot be patched.
+        PatchError: The name leads to something that cannot be patched.
     """
     if isinstance(key, str):
         point = by_name(own).get(key)
@@ -209,7 +212,7 @@ def locate(
     function, _ = unbind(key)
     hook = hook_of(function)
     if hook is not None:
-        if not hook.for_good and hook.stale:  # fetched while it was set for a while
+        if not hook.for_good and hook.stale:  # the user has kept a temporary decision function
             return _locate_name(hook.name)
         return point_of(function) or _point_at(hook)
     name = f"{function.__module__}.{function.__qualname__}"
@@ -219,7 +222,7 @@ def locate(
         found = beneath(plain(held_at(owner, attribute))) is function
     except (UnknownPointError, PatchError):
         found = False
-    if not found:  # the function is at hand, though not by its name
+    if not found:  # the function exists, but not under its own name
         owner, attribute = owner_at_hand(function), function.__name__
     return _look_at(name, owner, attribute)
 
@@ -231,7 +234,7 @@ def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None]:
     except (UnknownPointError, PatchError):
         if point is None:
             raise
-        return point, None  # decorated inside a function, or not yet where it will be found
+        return point, None  # decorated inside a function, or not yet assigned to its name
     if point is not None and point_of(plain(held_at(owner, attribute))) is None:
         return point, None
     found, own = _look_at(name, owner, attribute)
@@ -257,10 +260,10 @@ def _point_at(hook: Hook) -> tuple[DecisionPoint, None]:
 
 
 def stand_ins(point: DecisionPoint) -> list[DecisionPoint]:
-    """The points whose calls are this one's, too: other decorations of the same function in the same place.
+    """The other decision points that stand for the same function in the same class or module.
 
-    A function that is decorated twice is one decision point with two definitions, whichever of its decision
-    functions the model calls. Inherited by two classes, and decorated for each, it is two.
+    A function that is decorated twice is one decision point with two definitions, whichever decision function the model
+    calls. A method that two classes inherit, and that is decorated for each of them, is two decision points.
     """
     family = point.family()
     places = _decorated_places(point) if family else set()
@@ -272,7 +275,7 @@ def stand_ins(point: DecisionPoint) -> list[DecisionPoint]:
 
 
 def _decorated_places(point: DecisionPoint) -> set[Any]:
-    """The classes and modules that have a decision function of the point under the function's own name."""
+    """The classes and modules that contain a decision function of the point under the function's own name."""
     name, wrappers = point.rule.__name__, point.wrappers
     owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
     found = ((owner, plain(vars(owner).get(name))) for owner in owners)
@@ -280,12 +283,12 @@ def _decorated_places(point: DecisionPoint) -> set[Any]:
 
 
 def have_instances(one: type, other: type) -> bool:
-    """Whether some object can be an instance of both classes, of all classes that there are now."""
+    """Whether any existing class is a subclass of both classes."""
     return any(issubclass(owner, other) for owner in all_classes(one))
 
 
 def owner_class(point: DecisionPoint) -> type | None:
-    """The class that a point is a method of; None where it is none, or is not to be found by its name."""
+    """The class of which a point is a method; None if it is not a method, or if its name leads to nothing."""
     try:
         owner, _ = resolve(point.name, POINT)
     except (UnknownPointError, PatchError):

@@ -1,8 +1,8 @@
-"""A state of Python's and NumPy's global generators for each environment that asks for one.
+"""Separate states of Python's and NumPy's global random generators, for environments that ask for them.
 
-Models that draw from ``random`` and ``numpy.random`` share one state with all else in the process. With
-``global_rng=True`` an environment's simulation finds a state of its own there whenever it is at work, and its user
-finds theirs again afterwards. The one whose state is in place *owns* the generators; there is always one owner.
+Models that draw from ``random`` and ``numpy.random`` share one state with the whole process. With ``global_rng=True``
+an environment has a state of its own, which is in place while the environment runs; afterwards the user's state is
+restored. The *owner* of the generators is the one whose state is in place. There always is exactly one owner.
 """
 
 from __future__ import annotations
@@ -20,78 +20,78 @@ import numpy as np
 from ..errors import WrongThreadError
 
 _HEADER: Final = object.__basicsize__
-_WORDS: Final = 4 * 625  # of both generators: 624 words of a Mersenne twister, and how many of them are used up
+_WORDS: Final = 4 * 625  # bytes: the 624 words of a Mersenne twister, and the number of words that are used up
 
 _KEY: Final = 4 * 624
-"""Bytes of a Mersenne twister, before the number that tells how many of its words are used up."""
+"""The size, in bytes, of the words of a Mersenne twister. The number of used words follows them in memory."""
 
 _UNKNOWN: Final = (c_char * 4)()
 
 _python: Any = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
 _numpy: Any = np.random.mtrand._rand
-_legacy: Any = np.random  # some of whose functions its stubs leave out
+_legacy: Any = np.random  # NumPy's type stubs lack some of its functions
 
 
 class State(Protocol):
-    """A state of the global generators, while it is not in place."""
+    """A saved state of the global generators."""
 
     def save(self) -> None:
-        """Take it from there."""
+        """Save the state that is in place."""
 
     def load(self) -> None:
-        """Put it in place."""
+        """Put the saved state in place."""
 
     def separate(self) -> None:
-        """Share it with nothing that might go on drawing from it."""
+        """Copy the bit generator, so that other code that draws from it does not change the saved state."""
 
 
 class PortableState:
-    """A state that is saved and loaded by the generators' own functions; takes some 150 microseconds."""
+    """A state that the generators' own functions save and load. This takes about 150 microseconds."""
 
     def save(self) -> None:
-        """Take it from there."""
+        """Save the state that is in place."""
         self._python, self._generator = random.getstate(), _legacy.get_bit_generator()
         self._numpy = np.random.get_state(legacy=False)
 
     def load(self) -> None:
-        """Put it in place."""
+        """Put the saved state in place."""
         random.setstate(self._python)
         _legacy.set_bit_generator(self._generator)
         np.random.set_state(self._numpy)
 
     def separate(self) -> None:
-        """Share it no more."""
+        """Copy the bit generator."""
         self._generator = _copied(self._generator)
-        self._numpy |= self._generator.state  # which is another one where the user has set a generator of another kind
+        self._numpy |= self._generator.state  # a new state if the user has set a bit generator of another type
 
 
 class SwiftState:
-    """The same by copying memory; takes about a microsecond. Used where ``_is_swift`` has seen it work."""
+    """A state that is saved and loaded by copying memory. This takes about a microsecond; ``_is_swift`` tests it."""
 
     gauss_at = 0
-    """Where, in NumPy's generator, its second normally distributed number is kept until it is asked for."""
+    """The offset in NumPy's generator of the second normally distributed number, which it keeps for the next call."""
 
     def save(self) -> None:
-        """Take it from there."""
+        """Save the state that is in place."""
         self._python = string_at(id(_python) + _HEADER, _WORDS)
         self._next = _python.gauss_next
         self._generator = _legacy.get_bit_generator()
         self._gauss = string_at(id(_numpy) + self.gauss_at, 16)
 
     def load(self) -> None:
-        """Put it in place."""
+        """Put the saved state in place."""
         memmove(id(_python) + _HEADER, self._python, _WORDS)
         _python.gauss_next = self._next
-        _legacy.set_bit_generator(self._generator)  # which forgets the number that is kept
+        _legacy.set_bit_generator(self._generator)  # this drops the number that NumPy keeps
         memmove(id(_numpy) + self.gauss_at, self._gauss, 16)
 
     def separate(self) -> None:
-        """Share it no more."""
+        """Copy the bit generator."""
         self._generator = _copied(self._generator)
 
 
 def _is_swift() -> bool:
-    """Whether the memory of the generators is what it is thought to be. Leaves them as they were."""
+    """Test whether the generators have the expected memory layout. Leave their state unchanged."""
     before, swift = PortableState(), SwiftState()
     before.save()
     try:
@@ -101,19 +101,19 @@ def _is_swift() -> bool:
         place = string_at(id(_numpy), type(_numpy).__basicsize__).find(kept.tobytes())
         if place < 8 + _HEADER or Twister.__basicsize__ not in range(_WORDS, _WORDS + 64):
             return False
-        SwiftState.gauss_at = place - 8  # before it, whether it is there
+        SwiftState.gauss_at = place - 8  # the flag before it says whether a number is kept
         random.gauss(0, 1)
         found = _draws(swift)
         swift.load()
         return found == _draws(None)
-    except Exception:  # whatever it is, it is not what was thought
+    except Exception:  # any error means that the layout differs
         return False
     finally:
         before.load()
 
 
 def _draws(saved: State | None) -> list[float]:
-    """Draw from everything that there is, after a state was saved; then make everything different."""
+    """Save a state and draw from both generators; then seed them differently."""
     if saved is not None:
         saved.save()
         saved.separate()
@@ -126,7 +126,10 @@ def _draws(saved: State | None) -> list[float]:
 
 
 def _copied(generator: Any) -> Any:
-    """A Mersenne twister, which alone can be seeded by ``numpy.random.seed``: the same, or a new one."""
+    """Copy a Mersenne twister, or make a new one if the generator is of another type.
+
+    ``numpy.random.seed`` can seed a Mersenne twister only.
+    """
     twister = np.random.MT19937()
     if type(generator) is np.random.MT19937:
         twister.state = generator.state
@@ -137,7 +140,7 @@ _State: Final[Callable[[], State]] = SwiftState if _is_swift() else PortableStat
 
 
 class _Used:
-    """Reads how much of the numbers that the generators have made in advance is used up."""
+    """A reader of how many of the numbers that the generators have made in advance are used up."""
 
     def __init__(self) -> None:
         self._python = (c_char * 4).from_address(id(_python) + _HEADER) if _State is SwiftState else _UNKNOWN
@@ -154,15 +157,15 @@ class _Used:
 
 
 used_up: Final = _Used()
-"""Called, returns four bytes each of Python's and of NumPy's global generator, which change when that is drawn from."""
+"""Returns four bytes for Python's global generator and four for NumPy's. They change when a number is drawn."""
 
 
 class _Owner:
-    """An owner of the global generators, whose state is kept apart from all others'.
+    """An owner of the global generators, with a state of its own.
 
     Attributes:
-        state: It, while it is not in place.
-        threads: In which threads the owner may be at work.
+        state: The owner's state, while it is not in place.
+        threads: The identifiers of the threads in which the owner's code may run.
     """
 
     def __init__(self) -> None:
@@ -171,32 +174,32 @@ class _Owner:
 
 
 _owners: Final = [_Owner()]
-"""Who owns the generators, last; before it those whose work lies around that. The first is the user."""
+"""The stack of owners. The first is the user; the last is the present owner."""
 
 
 class GlobalRandom:
-    """The surrounding in which a simulation finds global generators of its own."""
+    """The context in which a simulation has its own state of the global generators."""
 
     def __init__(self) -> None:
-        """Make a state that is the present one, until ``begin`` says otherwise."""
+        """Copy the present state, which is used until ``begin`` seeds it."""
         self._owner = _Owner()
         self._owner.state.save()
         self._owner.state.separate()
 
     def begin(self, seed: int) -> None:
-        """Seed the generators, which are in place, for an episode: both with its seed."""
+        """Seed both generators, whose state must be in place, with the seed of an episode."""
         random.seed(seed)
         np.random.seed(seed % 2**32)
 
     def begin_anew(self, seed: int) -> None:
-        """Seed the generators, which are in place, for another future."""
+        """Seed the generators, whose state must be in place, for another future."""
         _seed_globals(seed, _OWN)
 
     def enter(self) -> None:
-        """Put the own state in place.
+        """Put this state in place.
 
         Raises:
-            WrongThreadError: Another environment's is, and that is at work in another thread.
+            WrongThreadError: The state of another environment, which runs in another thread, is in place.
         """
         thread, now = get_ident(), _owners[-1]
         if len(_owners) > 1 and thread not in now.threads:
@@ -209,19 +212,22 @@ class GlobalRandom:
         self._hand_over(now, self._owner)
 
     def leave(self) -> None:
-        """Put back the state that was in place before."""
+        """Restore the state that was in place before."""
         _owners.pop()
         self._hand_over(self._owner, _owners[-1])
         if self._owner not in _owners:
             self._owner.threads.clear()
 
     def step_out(self) -> None:
-        """Put back the state that was in place before all that is under way."""
+        """Leave as often as this state was entered in a row."""
         while _owners[-1] is self._owner:
             self.leave()
 
     def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
-        """What the simulation's stack runs. The state is in place, whatever thread that is, while its user waits."""
+        """Wrap a job of the simulation's stack, so that the job's thread is known as one of this owner's.
+
+        While the job runs the user waits, and so this state is in place.
+        """
         threads = self._owner.threads
 
         def run_and_tell() -> Any:
@@ -240,12 +246,13 @@ class GlobalRandom:
 # -- other futures --------------------------------------------------------------------------------
 
 _FUTURES: Final = 2**32 - 1
-"""The key of their streams, which spawning never gives. A model may seed with the bare seed, or spawn from it."""
+"""The spawn key of the seeds of futures. A model that uses the same seed, or spawns from it, never gets this key."""
 
 _OWN: Final = 0
 _PROCESS: Final = 1
 HELD: Final = 2
-"""Whose generators are seeded. A base that draws from those of the process is not to meet the simulation's numbers."""
+"""Whose generators are seeded: the three have separate streams. A base policy that draws from the generators of the
+process must not get the same numbers as the simulation."""
 
 SHARED: Final = (_python, _numpy)
 """The generators behind the functions of ``random`` and ``numpy.random``."""
@@ -257,25 +264,25 @@ def is_seed(value: Any) -> bool:
 
 
 def streams(seed: int, whose: int, number: int) -> list[np.random.SeedSequence]:
-    """What so many generators are seeded with for a future."""
+    """Make the seeds of some number of generators for a future."""
     return np.random.SeedSequence(int(seed), spawn_key=(_FUTURES, whose)).spawn(number)
 
 
 def reseed_one(generator: Any, stream: np.random.SeedSequence) -> None:
-    """Seed a generator where it is, for all that refer to it.
+    """Seed a generator in place, so that all references to it see the new state.
 
     Args:
         generator: A ``random.Random``, or NumPy's ``Generator``, ``RandomState`` or ``BitGenerator``.
-        stream: With what.
+        stream: The seed.
     """
     if isinstance(generator, random.Random):
         generator.seed(_integer(stream))
         return
     legacy = isinstance(generator, np.random.RandomState)
     bits = getattr(generator, "_bit_generator" if legacy else "bit_generator", generator)
-    bits.__setstate__(type(bits)(stream).__getstate__())  # with what it spawns from, where NumPy is new enough
+    bits.__setstate__(type(bits)(stream).__getstate__())  # new NumPy: the seed sequence for ``spawn``, too
     if legacy:
-        generator.set_state(bits.state)  # which forgets the second normally distributed number
+        generator.set_state(bits.state)  # this drops the second normally distributed number
 
 
 def _integer(stream: np.random.SeedSequence) -> int:
@@ -283,24 +290,25 @@ def _integer(stream: np.random.SeedSequence) -> int:
 
 
 def _seed_globals(seed: int, whose: int) -> np.random.SeedSequence:
-    """Seed Python's and NumPy's global generators for a future, each with a stream of its own; return one more."""
+    """Seed Python's and NumPy's global generators for a future from separate streams; return a third stream."""
     python, numpy, another = streams(seed, whose, 3)
     reseed_one(_python, python)
-    _legacy.set_bit_generator(type(_legacy.get_bit_generator())(numpy))  # the one that is there is left as it is
+    _legacy.set_bit_generator(type(_legacy.get_bit_generator())(numpy))  # leaves the old bit generator as it is
     return another
 
 
 def seed_process(seed: int) -> None:
-    """Seed the global generators of the process for a future: Python's, NumPy's, and torch's if it is there."""
+    """Seed the global generators of the process for a future: Python's, NumPy's, and torch's if it is imported."""
     another, torchs = _seed_globals(seed, _PROCESS), _generator_of_torch()
     if torchs is not None:
         torchs.manual_seed(_integer(another))
 
 
 class process_kept:  # noqa: N801 - it is used like a function
-    """Put the global generators of the process back to where they were.
+    """Restore the global generators of the process on exit.
 
-    It is a class, as ``outside_simulation`` is, since some errors cannot pass a context manager made of a generator.
+    This is a class, as ``outside_simulation`` is, because some errors cannot pass through a generator-based context
+    manager.
     """
 
     def __enter__(self) -> None:

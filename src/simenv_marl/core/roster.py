@@ -1,4 +1,4 @@
-"""Which agents decide at which points, as far as that is known beforehand, and which policies answer for them."""
+"""The agents of each decision point, as far as they are known beforehand, and the policies that answer for them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .points import NamedPoint, find_point
 
 
 def names_agents(policies: Mapping[Any, Any] | None) -> bool:
-    """Whether some policy's key names no point by itself, so that the agents of all points are to be known."""
+    """Whether a key of ``policies`` may name an agent, so that the agents of all points must be known."""
     return any(isinstance(key, str) and "." not in key for key in policies or {})
 
 
 def name_agents(named: list[NamedPoint]) -> list[str | None]:
-    """Name the agent of each point; None where a callable does it."""
+    """Name the agent of each point; None if a callable names it."""
     given = [point.definition.agent for point in named]
     owners: dict[str, str] = {}
     for point, agent in zip(named, given, strict=True):
@@ -49,7 +49,7 @@ def declared_agents(declared: Any) -> list[str]:
 def call_the_roll(
     active: list[BoundPoint], declared: Any, known: Collection[str | None]
 ) -> tuple[dict[str, BoundPoint], bool]:
-    """Find out which agents are known beforehand, and whether these are all."""
+    """Find out which agents are known beforehand, and whether there can be no others."""
     named = [binding for binding in active if binding.agent is None]
     names: dict[BoundPoint, list[Any]] = {}
     if isinstance(declared, Mapping):
@@ -84,13 +84,16 @@ def assign(
     agents: list[str | None],
     own: Mapping[DecisionPoint, Definition],
 ) -> tuple[dict[DecisionPoint, Any], dict[str, Any], list[NamedPoint]]:
-    """Find out whom each policy answers for: a point (maybe one that was not named yet) or an agent.
+    """Find out for which point or agent each policy answers.
 
     Args:
-        policies: By agent or point.
-        named: The points that were named.
-        agents: The agent of each; None where a callable names them.
+        policies: The policies, by agent or point. A point need not be among the named ones.
+        named: The named points.
+        agents: The agent of each named point. None if a callable names it.
         own: The simulation's own points.
+
+    Returns:
+        The policies by point, the policies by agent, and the points that only ``policies`` names.
     """
     by_point: dict[DecisionPoint, Any] = {}
     by_agent: dict[str, Any] = {}
@@ -106,9 +109,9 @@ def assign(
                 point = find_point(key, own=own)
             except SimEnvError as error:
                 if policy is RULE and isinstance(error, DefinitionError):
-                    continue  # its rule decides there anyway
+                    continue  # the rule decides there anyway
                 if isinstance(error, UnknownPointError) and None in agents and not _is_path(key):
-                    by_agent[key] = policy  # an agent that a callable may name
+                    by_agent[key] = policy  # a callable may name this agent later
                     continue
                 names = sorted([a for a in agents if a] + [p.point.name for p in named])
                 raise UnknownPointError(
@@ -130,7 +133,7 @@ def _is_path(key: Any) -> bool:
 
 
 def two_arguments(policy: Callable[..., Any]) -> Policy:
-    """Let a policy be called with observation and info, whether it takes the info or not, or the environment."""
+    """Make a policy callable with observation and info, even if it takes no info or asks for the environment."""
     if asks_for_environment(policy):
         return AskingPolicy(policy)
     return policy if takes_info(policy) else lambda observation, info: policy(observation)

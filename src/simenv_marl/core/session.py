@@ -1,7 +1,7 @@
-"""An environment's simulation over all its episodes: made once, reset for each, closed.
+"""The simulation of one environment over all its episodes: made once, reset for each episode, closed at the end.
 
-The session is what outlives an episode. It holds nothing of the environment, so that an environment which
-is abandoned in mid-episode goes at once and takes its session along.
+The session has no reference to its environment. So an environment that is dropped in mid-episode is freed at once,
+together with its session.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from .switch import BaseDriver
 
 
 class Session:
-    """A simulation of one environment's own.
+    """The simulation of one environment, and its episodes.
 
     Attributes:
-        plan: What the environment is made of.
+        plan: The plan of the environment.
         simulation: The simulation.
         seed: The seed of the latest episode.
-        options: What the latest ``reset`` of the environment was given.
-        episode: The episode that goes on, or was the latest; None before the first one, and once it was closed.
-        np_random_seed: What ``np_random`` was seeded with; -1 where it was set.
-        claim: What keeps other threads away while one uses it; None where only one thread can.
+        options: The options that the latest ``reset`` of the environment got.
+        episode: The current or latest episode. None before the first one, and after it was closed.
+        np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
+        claim: The lock that lets one thread at a time use the environment. None if only one thread can use it.
     """
 
     __slots__ = (
@@ -51,10 +51,10 @@ class Session:
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:
-        """Make the simulation, and set the decision functions that the plan asks for.
+        """Make the simulation, and set the plan's decision functions in the model.
 
         Raises:
-            SimulationError: There is no simulation in the plan.
+            SimulationError: The plan's source does not make a simulation.
             PatchError: A function cannot be patched.
         """
         self.plan = plan
@@ -66,8 +66,8 @@ class Session:
         self._closed = self._copied = False
         self._starting = False
         self._open = False  # whether the simulation was reset and not closed since
-        self._worn = False  # whether it was given up: what then may still use it is to meet no other episode
-        self._bound: tuple[Any, Any, Plan] | None = None  # where mappings ask for the simulation
+        self._worn = False  # whether it was given up: code that still uses it must not meet another episode
+        self._bound: tuple[Any, Any, Plan] | None = None  # the plan whose mappings have the simulation they ask for
         self._held: Held | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.claim = Claim() if plan.options.driver == "thread" else None
@@ -93,41 +93,41 @@ class Session:
         self._reset = resetter(self.simulation)
 
     def _run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
-        """Run something on the simulation's stack, in which nothing is decided."""
+        """Run a job on the simulation's stack, where decision functions run their rule."""
         return run_job(self._usable_driver(), job if self._rng is None else self._rng.around(job), context)
 
     def _usable_driver(self) -> BaseDriver:
-        """The simulation's stack, or a new one where that has ended or is another thread's."""
+        """The driver of the simulation's stack. It is replaced if the stack has ended or belongs to another thread."""
         before = self._driver
         if before is None or not before.usable:
             if before is not None:
                 self._worn = self._worn or before.given_up is not None
-                before.end()  # first, so that an interrupt leaves no stack that is not known here
+                before.end()  # first, so that an interrupt cannot leave an unknown stack behind
             make = DRIVERS[self.plan.options.driver]
-            # Generators of the simulation's own must be put in place around each step.
+            # With ``global_rng`` each step must enter the simulation's own generators, and so is never direct.
             self._driver = make(plugins=self.plan.plugins, before=before, direct=self._rng is None)
         assert self._driver is not None
         return self._driver
 
     def _put_away(self) -> None:
-        """End the stack, and put back what was patched."""
+        """End the stack and remove the patches."""
         if self._driver is not None:
             self._driver.end()
         self._let_go_of_patches()
 
     def at_work(self) -> AbstractContextManager[None]:
-        """Keep what runs for the environment apart from what runs around it."""
+        """The context in which the environment's code must run."""
         return at_work(self.plan.plugins, self._rng, self.claim)
 
     def claimed(self) -> AbstractContextManager[None]:
-        """Keep other threads away."""
+        """The context in which no other thread can use the environment."""
         return nullcontext() if self.claim is None else self.claim
 
     # -- episodes ---------------------------------------------------------------------------------
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The generator that the last given seed has seeded, and from which other seeds are drawn."""
+        """The generator that was seeded with the last given seed. Seeds of other episodes are drawn from it."""
         if self._np_random is None:
             self._np_random, self.np_random_seed = seeding.np_random(self.np_random_seed)
         return self._np_random
@@ -143,17 +143,17 @@ class Session:
         when: When,
         script: Iterable[Any] | None = None,
     ) -> Episode:
-        """End the episode that runs, reset the simulation, and run it to its first decision.
+        """End the current episode, reset the simulation, and run it to its first decision.
 
         Args:
-            seed: The seed to reset it with; None: one is drawn.
-            options: What the environment's ``reset`` was given.
+            seed: The seed of the reset. None: a seed is drawn.
+            options: The options that the environment's ``reset`` got.
             when: When agents are settled.
-            script: The tape of another episode, which is to be replayed; None: it is an episode of its own.
+            script: The tape of another episode to replay. None: this is an ordinary episode.
 
         Raises:
-            NoDecisionError: The simulation ended without one.
-            BaseException: What the model raises.
+            NoDecisionError: The simulation ended without a decision.
+            BaseException: Any error of the model.
         """
         with self.claimed():
             self.end()
@@ -165,7 +165,7 @@ class Session:
                 self._starting = False
 
     def _close_simulation(self, *, last: bool = False) -> None:
-        """Call the simulation's ``close`` on its stack, once for each reset that has succeeded; maybe the last."""
+        """Call the simulation's ``close`` on its stack, once for each successful reset. ``last``: no reset follows."""
         close = closer(self.simulation) if self._open else None
         if close is None:
             return
@@ -177,7 +177,7 @@ class Session:
             self._starting = False
 
     def _plan_of_simulation(self) -> Plan:
-        """The plan, with the simulation given to those mappings and policies that ask for it."""
+        """The plan in which mappings and policies that ask for the simulation or the session have it."""
         if not self.plan.asks:
             return self.plan
         if self._bound is None or self._bound[0] is not self.plan or self._bound[1] is not self.simulation:
@@ -196,7 +196,7 @@ class Session:
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         else:
-            self._np_random, self.np_random_seed = None, seed  # made when a seed is drawn from it
+            self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
         self.seed = seed
         if self._worn or (self._driver is not None and self._driver.given_up is not None):
             self._make_simulation()
@@ -221,24 +221,24 @@ class Session:
         episode = Episode(plan, self.simulation, seen, seed, when, (self._rng, self.claim), script)
         driver.prepare(run, episode.crossing(), context)
         try:
-            self.episode = episode  # whenever an interrupt comes from now on, its end is seen to
+            self.episode = episode  # from now on the episode will be ended, even after an interrupt
             episode.begin()
         except BaseException:
-            episode.over = True  # it may have been interrupted before it could say so
+            episode.over = True  # an interrupt may have come before the episode could set this
             if episode.unwound:
                 self.episode = None
             raise
         return episode
 
     def replay(self, other: Session) -> Episode:
-        """Bring the simulation to where another session's, of the same plan, stands in mid-episode.
+        """Bring the simulation to the current decision of another session with the same plan.
 
         Returns:
             The episode.
 
         Raises:
-            BranchError: It cannot be brought there.
-            BaseException: What the model raises.
+            BranchError: The replay does not reach the same decision.
+            BaseException: Any error of the model.
         """
         episode = other.episode
         if episode is None or (episode.pending or episode.consulted) is None:
@@ -250,7 +250,7 @@ class Session:
             )
         generator = self.kept()
         again = self.start(other.seed, other.options, episode.when, episode.tape)
-        self.take_over(generator)  # the seed of the episode was given to the other long ago
+        self.take_over(generator)  # undo the seeding by ``start``: the other session may have drawn seeds since
         answer = again.play if again.when is When.RETURN else again.step
         while again.script:
             answer(again.script.popleft())
@@ -265,10 +265,11 @@ class Session:
         return again
 
     def opened(self) -> tuple[list[str], list[Any]]:
-        """What the simulation has opened that a forked process would share.
+        """Find the things that the simulation has opened and that a forked process would share.
 
         Returns:
-            What cannot go on there, in some words each; and the event loops of asyncio, which can.
+            A short description of each thing that cannot continue in a forked process; and the asyncio event loops,
+            which can.
         """
         found = {} if self._driver is None else self._driver.children.alive()
         loops = loops_on(found) if found else []
@@ -278,15 +279,15 @@ class Session:
         return list(found.values()), loops
 
     def step_out(self) -> None:
-        """In a branch that was forked from within: have its user's global generators in place."""
+        """Restore the user's global generators in a branch that was forked from inside a policy."""
         if self._rng is not None:
             self._rng.step_out()
 
     def check_reseed(self) -> None:
-        """Make sure that the chance that lies ahead can be drawn anew.
+        """Make sure that the simulation's future random numbers can be drawn anew.
 
         Raises:
-            BranchError: It cannot.
+            BranchError: They cannot.
         """
         if self._rng is None and not callable(getattr(self.simulation, "reseed", None)):
             raise BranchError(
@@ -297,13 +298,13 @@ class Session:
             )
 
     def reseed(self, seed: int) -> None:
-        """Draw the chance that lies ahead anew.
+        """Draw the simulation's future random numbers anew.
 
         Args:
-            seed: For the simulation's ``reseed``, and for the global generators of its own, if it has them.
+            seed: The seed for the simulation's ``reseed``, and for its own global generators if it has them.
 
         Raises:
-            BaseException: What the simulation's ``reseed`` raises.
+            BaseException: Any error of the simulation's ``reseed``.
         """
         reseed = getattr(self.simulation, "reseed", None)
         with self.at_work():
@@ -317,7 +318,7 @@ class Session:
                     raise
 
     def kept(self) -> dict[str, Any]:
-        """What a copy takes over: the latest seed, the generator, and whether the copy is one in mid-episode."""
+        """The state that a copy takes over: the latest seed, the generator, and whether an episode is under way."""
         return {
             "seed": self.seed,
             "np_random_seed": self.np_random_seed,
@@ -326,12 +327,12 @@ class Session:
         }
 
     def take_over(self, kept: Mapping[str, Any]) -> None:
-        """Take over what another session has ``kept``."""
+        """Take over the state that ``kept`` of another session returned."""
         for name, value in kept.items():
             setattr(self, name, value)
 
     def refusal(self) -> Exception:
-        """The error that says why no action can be taken now."""
+        """Make the error that says why no action can be taken now."""
         if self.episode is not None:
             return self.episode.refusal()
         if self._starting:
@@ -339,11 +340,11 @@ class Session:
         return refusal("closed" if self._closed else "copied" if self._copied else "new")
 
     def end(self) -> None:
-        """End the episode that runs, if one does.
+        """End the current episode, if there is one.
 
         Raises:
-            ReentrancyError, WrongThreadError: It cannot be ended from here; it goes on.
-            BaseException: What the simulation raises while it unwinds.
+            ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
+            BaseException: Any error that the simulation raises while it unwinds.
         """
         if self._starting:
             raise refusal("resetting")
@@ -357,11 +358,11 @@ class Session:
 
     @property
     def idle(self) -> bool:
-        """Whether there is nothing to end, and nothing to put back."""
+        """Whether there is no episode to end and no patch to remove."""
         return self.episode is None and self._held is None
 
     def render(self) -> Any:
-        """Render the simulation in the environment's render mode; None, with a warning, where it has none."""
+        """Render the simulation in the environment's render mode; without a render mode, warn and return None."""
         mode = self.plan.options.render_mode
         if mode is None:
             warn_user(f"render() without a render_mode shows nothing; the simulation's are {self.plan.render_modes}")
@@ -370,11 +371,11 @@ class Session:
             return self.simulation.render(mode)
 
     def close(self) -> None:
-        """Unwind the simulation and put back what was patched.
+        """Unwind the simulation and remove the patches.
 
         Raises:
-            ReentrancyError, WrongThreadError: The episode cannot be ended from here; it goes on.
-            BaseException: What the simulation raises while it unwinds.
+            ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
+            BaseException: Any error that the simulation raises while it unwinds.
         """
         try:
             self.end()
@@ -387,12 +388,12 @@ class Session:
                     self._put_away()
 
     def abandon(self) -> None:
-        """The same, from a finalizer: raises nothing."""
+        """Unwind the simulation and remove the patches, from a finalizer. Warn of errors instead of raising them."""
         try:
             left = self.episode is not None and self.episode.running and not self._reachable()
             if self.episode is not None:
                 self.episode.abandon()
-            if not left:  # else it is still to unwind, in another thread
+            if not left:  # otherwise the simulation has still to unwind, in another thread
                 self._close_abandoned()
         finally:
             self._put_away()
@@ -418,7 +419,7 @@ class Session:
 
 
 def _stand_alike(one: Episode, other: Episode) -> bool:
-    """Whether the pending decisions of two episodes look just the same."""
+    """Whether the pending decisions of two episodes look the same."""
     mine, theirs = one.pending, other.pending or other.consulted
     return (
         mine is not None
@@ -431,10 +432,10 @@ def _stand_alike(one: Episode, other: Episode) -> bool:
 
 
 def checked_seed(seed: Any) -> int | None:
-    """The seed of a ``reset`` as a python integer.
+    """Convert the seed of a ``reset`` to a Python integer, unless it is None.
 
     Raises:
-        OptionValueError: It is none.
+        OptionValueError: The seed is not a non-negative integer.
     """
     if seed is None:
         return None
@@ -444,5 +445,5 @@ def checked_seed(seed: Any) -> int | None:
 
 
 def seed_space(space: spaces.Space[Any], seed: int, agent: str) -> None:
-    """Seed a space of an agent: for every agent differently, and for every order of joining alike."""
+    """Seed a space of an agent. The seed depends on the agent's name, and not on the order in which agents join."""
     space.seed(int(np.random.SeedSequence([seed, crc32(agent.encode(errors="surrogatepass"))]).generate_state(1)[0]))

@@ -1,7 +1,7 @@
-"""What is observed: cast to its space, copied, compared, and made up where nothing is known yet.
+"""Observations: casts to their space, copies, comparisons, and blank observations.
 
-Everything that can be known of a space is found out once, when an environment is made; what runs at
-each decision are closures over it.
+Each space is analysed once, when an environment is made. The functions that run at each decision are closures over the
+result.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..errors import ObservationError, shown
 from ..simulation import Sentinel
 
 Cast = Callable[[Any], Any]
-"""Takes an observation, returns it cast to its space's dtype and not shared."""
+"""Takes an observation. Returns it cast to its space's dtype, with no memory shared."""
 
 # -- observations ---------------------------------------------------------------------------------
 
@@ -32,7 +32,7 @@ def observation_cast(space: spaces.Space[Any]) -> Cast:
         space: The observation space, of any kind.
 
     Returns:
-        A function that raises ``ObservationError`` for what does not fit.
+        A function that raises ``ObservationError`` for an observation that does not fit the space.
     """
     if isinstance(space, (spaces.Box, spaces.MultiBinary, spaces.MultiDiscrete)):
         return _array_cast(space)
@@ -57,7 +57,7 @@ def _array_cast(space: spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete) -
 
     def cast(value: Any) -> NDArray[Any]:
         if type(value) is ndarray and value.dtype is dtype and value.shape == shape:
-            # An array that is held only here needs no copy in order not to be shared.
+            # An array without any other reference needs no copy.
             if value.base is None and getrefcount(value) <= fresh:
                 return value
             return value.copy()
@@ -134,13 +134,13 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
 
 
 def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
-    """Make the function that makes sure that an observation is finite where its space is bounded.
+    """Make the function that checks that an observation is finite where its space is bounded.
 
     Args:
         space: The observation space.
 
     Returns:
-        A function that raises ``ObservationError`` for NaN and for infinities; None where the space has no such bounds.
+        A function that raises ``ObservationError`` for NaN and for infinities; None if no bound of the space is finite.
     """
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         parts: Any = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
@@ -158,7 +158,7 @@ def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
         return None
 
     def check_numbers(observation: NDArray[Any]) -> None:
-        # As a rule all numbers are finite, which looking through bytes tells sooner than asking numpy.
+        # Usually all numbers are finite, and searching bytes finds that out faster than NumPy's ``all``.
         if 0 in np.isfinite(observation).tobytes() and not np.isfinite(observation[bounded]).all():
             raise ObservationError(
                 f"the observation {shown(observation)} is not finite, where its space {shown(space)} is bounded"
@@ -171,7 +171,7 @@ _UNCHANGING: Final = (np.generic, int, float, str, Sentinel)
 
 
 def duplicate(observation: Any) -> Any:
-    """Copy an observation, so that its receiver may change it."""
+    """Copy an observation, so that the receiver may change it."""
     if type(observation) is np.ndarray:
         return observation.copy()
     if isinstance(observation, _UNCHANGING):
@@ -195,13 +195,13 @@ def same(one: Any, other: Any) -> bool:
 
 
 def blank(space: spaces.Space[Any]) -> Any:
-    """Make the observation of an agent of which nothing is known yet: zero, clipped into its space.
+    """Make the blank observation of an agent that was not observed yet: zero, clipped into the space.
 
     Args:
         space: The observation space.
 
     Returns:
-        An observation in the space; for kinds without a zero (text, graphs, ...) a fixed sample.
+        An observation in the space. For spaces without a zero (text, graphs, ...) it is a fixed sample.
     """
     if isinstance(space, spaces.Box):
         return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high).astype(space.dtype)
@@ -228,8 +228,8 @@ def blank(space: spaces.Space[Any]) -> Any:
 def _calibrate() -> int:
     """Count the references to an array that only the running ``cast`` holds.
 
-    The number differs between versions of Python, so it is measured on a function of the same shape.
-    Without a global lock another thread may take a reference at any time: then nothing is ever fresh.
+    The number differs between versions of Python, so it is measured with a function of the same form. Without the
+    global interpreter lock another thread may take a reference at any time, and so every array is copied.
     """
     if not getattr(sys, "_is_gil_enabled", lambda: True)():
         return -1

@@ -1,8 +1,7 @@
-"""What is of many: observations, actions and masks of many decisions, stacked to arrays.
+"""Stacks: observations, actions and masks of many decisions as arrays.
 
-A *stack* of what lies in a space is an array whose first axis counts the decisions; of what lies in a ``Dict`` or a
-``Tuple``, a dict or a tuple of stacks. Of what lies in a space without a shape (text, graphs, ...) it is an array of
-objects.
+A *stack* of elements of a space is an array whose first axis counts the decisions. For a ``Dict`` or a ``Tuple`` it is
+a dict or a tuple of stacks. For a space without a shape (text, graphs, ...) it is an array of objects.
 """
 
 from __future__ import annotations
@@ -16,22 +15,22 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 Stacker = Callable[..., Any]
-"""``stack(items, out=None)`` stacks what lies in a space, into a stack of that size where one is given."""
+"""``stack(items, out=None)`` stacks elements of a space. ``out`` is an existing stack of that size to write into."""
 
 SMALL: Final = 1024
-"""How many bytes an observation may have to be copied once more, which takes less time than it saves."""
+"""The size in bytes up to which an additional copy of an observation takes less time than it saves."""
 
 
 def stacker(space: spaces.Space[Any], *, cast: bool = False, other: Stacker | None = None) -> Stacker:
-    """Make the function that stacks what lies in a space.
+    """Make the function that stacks elements of a space.
 
     Args:
         space: The space.
-        cast: Whether all that is stacked has the space's dtype and shape, as observations have; else it is cast.
-        other: Stacks what lies in spaces without a shape; None: arrays of objects.
+        cast: Whether the items already have the space's dtype and shape, as observations have. If False, they are cast.
+        other: A function that stacks elements of a space without a shape. None: they become an array of objects.
 
     Returns:
-        A function of the items, and of the stack to write them into. The stack shares nothing with the items.
+        A function that takes the items, and the stack to write them into. The stack shares no memory with the items.
     """
     if isinstance(space, spaces.Dict):
         parts = {key: stacker(part, cast=cast, other=other) for key, part in space.spaces.items()}
@@ -75,10 +74,10 @@ def _array_stacker(dtype: Any, shape: tuple[int, ...], *, cast: bool) -> Stacker
         else:
             if small:
                 try:
-                    # A third of what concatenate costs, which costs a third of stack.
+                    # This takes a third of the time of ``concatenate``, which takes a third of that of ``stack``.
                     memoryview(out.reshape(-1).view(np.uint8))[:] = b"".join(items)
                     return out
-                except TypeError:  # one of them is laid out otherwise in memory
+                except TypeError:  # an item has another memory layout
                     pass
             np.concatenate(items, out=out.reshape(-1, *shape[1:]))
         return out
@@ -94,7 +93,7 @@ def _stack_objects(items: Sequence[Any], out: Any = None) -> NDArray[Any]:
 
 
 def empty(space: spaces.Space[Any]) -> Any:
-    """A stack of nothing that lies in a space, or in its masks."""
+    """Make an empty stack of a space."""
     return stacker(space)([])
 
 
@@ -106,12 +105,12 @@ def stack_masks(masks: Sequence[Any]) -> Any:
 
 
 def taken(stack: Any, index: NDArray[Any]) -> Any:
-    """The rows of a stack that an index names, in its order."""
+    """Take the rows of a stack with the given indices, in that order."""
     return _each(lambda array: array[index], stack)
 
 
 def joined(stacks: Sequence[Any]) -> Any:
-    """Stacks of the same space, one behind the other."""
+    """Concatenate stacks of the same space."""
     if len(stacks) == 1:
         return stacks[0]
     first = stacks[0]
@@ -131,14 +130,14 @@ def _each(function: Callable[[NDArray[Any]], NDArray[Any]], stack: Any) -> Any:
 
 
 def rows(stack: Any, *, integers: bool) -> list[Any] | None:
-    """Take what a policy has returned apart, into what it has returned for each decision.
+    """Split the return value of a batched policy into one action for each decision.
 
     Args:
-        stack: An array or anything that becomes one (a tensor), a sequence of any kind, or a dict of these.
-        integers: Whether integers are to come as python's own.
+        stack: An array, an object that converts to one (a tensor), a sequence, or a dict of these.
+        integers: Whether to return integers as Python integers.
 
     Returns:
-        The rows; None where there are none to be told apart.
+        The rows; None if the value cannot be split into rows.
     """
     if isinstance(stack, Mapping):
         parts = [rows(part, integers=False) for part in stack.values()]
@@ -157,6 +156,6 @@ def rows(stack: Any, *, integers: bool) -> list[Any] | None:
         if stack.ndim == 0:
             return None
         if integers and stack.ndim == 1 and stack.dtype.kind in "iu":
-            integral: list[int] = stack.tolist()  # which are checked fastest
+            integral: list[int] = stack.tolist()  # the check of Python integers is the fastest
             return integral
     return list(stack)

@@ -1,15 +1,15 @@
-"""Between a simulation's stack and its user's: who runs, and how a decision crosses over.
+"""The switch between a simulation's stack and its user's stack.
 
-A *driver* keeps one stack for a simulation, on which *jobs* run one after the other: the making of the simulation, its
-``reset`` and its ``run``, episode after episode. On the user's side ``prepare`` readies a job, ``resume`` begins it,
-and then hands replies to the simulation; ``throw`` raises ``SimulationExit`` in it. Each returns the *event* that comes
-from the simulation next, a tuple of three: a decision (what the plan has for it, and the call's args and kwargs), or
-the end of the job: ``FINISHED`` or ``FAILED``, with a list that holds the result or the error, and None. The list is
-to be emptied: the stack waits for the next job with it in its hands. ``STALLED``, with such a list and a number of
-seconds, is a job that has failed and does not come to its end for so long.
+A *driver* keeps one stack for a simulation. *Jobs* run on it one after the other: the making of the simulation, then
+its ``reset`` and its ``run`` for each episode. On the user's side ``prepare`` prepares a job. ``resume`` begins it, and
+later hands replies to the simulation. ``throw`` raises ``SimulationExit`` in it. ``resume`` and ``throw`` return the
+simulation's next *event*, a tuple of three. A decision is the plan's event object with the call's args and kwargs. The
+end of a job is ``FINISHED`` or ``FAILED``, a list with the result or the error, and None. The receiver must empty this
+list, because the waiting stack still refers to it. ``STALLED``, such a list and a number of seconds mean that a job has
+failed and has not ended for that time.
 
-On the simulation's side a driver enters its stack in the hooks of the functions that are decided, with a function that
-hands a call over and carries out the reply.
+On the simulation's side a driver registers its stack with the hooks of the decided functions, together with a function
+that hands a call over and carries out the reply.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ from .events import FAILED, FINISHED, REFUSED, STALLED
 
 
 class SimulationExit(SystemExit):
-    """Raised in a suspended simulation to unwind it. Neither an error nor anything to be caught.
+    """Raised in a suspended simulation to unwind it. It is not an error, and models should not catch it.
 
-    A ``SystemExit``, because event loops pass that on at once, where they would keep any other exception for
-    what awaits the task and let the other tasks go on.
+    It is a ``SystemExit``, because event loops pass that on at once. They would keep any other exception for the code
+    that awaits the task, and let the other tasks continue.
     """
 
 
 class Crossing(Protocol):
-    """What a driver needs of what the plan has for a decided function."""
+    """The part of an event that a driver needs."""
 
     @property
     def deliver(self) -> Callable[..., Any] | None:
-        """Turns a reply and the call's arguments into what the call returns; None: the reply is that."""
+        """Turns a reply and the call's arguments into the call's return value. None: the reply is that value."""
 
     @property
     def told(self) -> Crossing | None:
-        """What crosses, with the decision, args and kwargs, once the rule has decided a call; None: nothing."""
+        """The event that reports the rule's decision, with the call's args and kwargs. None: it is not reported."""
 
 
 Event = tuple[Any, Any, Any]
 
 NO_DECISIONS: Final[Mapping[Hook, Crossing]] = MappingProxyType({})
-"""What crosses while a simulation is made, reset or closed: nothing."""
+"""The events while a simulation is made, reset or closed: none."""
 
 SECONDS_TO_UNWIND: Final = 5.0
-"""How long a simulation that is to be unwound may take to its next decision or to its end."""
+"""The seconds that a simulation may take, while it is unwound, to its next decision or its end."""
 
 UNWINDING_TRIES: Final = 1000
-"""How often a simulation that is to be unwound may decide or swallow before it is given up. A SimPy model loses one of
-its processes at each try."""
+"""How often ``SimulationExit`` is raised in a simulation before it is given up. It may decide again, or swallow the
+exit. A SimPy model loses one of its processes at each try."""
 
 
 def is_exit(error: BaseException | None) -> bool:
-    """Whether an error is the exit that was raised in a simulation, passed on in whatever guise."""
-    seen = set()  # causes may go in circles
+    """Whether an error is a ``SimulationExit``, was caused by one, or is an exception group of only such errors."""
+    seen = set()  # causes may be cyclic
     while error is not None and not isinstance(error, SimulationExit) and id(error) not in seen:
         if isinstance(error, BaseExceptionGroup) and all(is_exit(member) for member in error.exceptions):
             return True
@@ -73,7 +73,7 @@ def is_exit(error: BaseException | None) -> bool:
 
 
 def _stray(error: SimulationExit) -> SimulationError:
-    """The error in place of an exit that was not raised in this episode."""
+    """Make the error that replaces an exit from an earlier episode."""
     stray = SimulationError(
         "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of that"
         " episode has kept; let nothing that belongs to an episode outlive it (cancel it in stop or in a finally)"
@@ -83,20 +83,20 @@ def _stray(error: SimulationExit) -> SimulationError:
 
 
 def nothing_to_end() -> Event:
-    """What ``throw`` returns where no job is under way."""
+    """Make the event that ``throw`` returns if no job is under way."""
     return FINISHED, [None], None
 
 
 class BaseDriver:
-    """What all drivers have in common.
+    """The base class of drivers.
 
     Attributes:
-        stack: The simulation's stack; None before the first job, and after the end.
-        caller: The greenlet from which ``resume`` may be called directly; None: ``enter`` is to be called before.
-        resume: Lets the simulation go on with a reply; returns the event that comes from it next. To be fetched anew
-            before each call.
-        plugins: The plugins of the simulation's environment; None if it has none.
-        given_up: Why a job was left where it is; None as long as none was.
+        stack: The simulation's stack. None before the first job, and after the end.
+        caller: The greenlet from which ``resume`` may be called directly. None: ``enter`` must be called before.
+        resume: Resumes the simulation with a reply and returns its next event. The attribute may change, so it must be
+            read again before each call.
+        plugins: The plugins of the simulation's environment. None if it has none.
+        given_up: The reason why a job was given up. None if no job was.
     """
 
     __slots__ = (
@@ -107,11 +107,11 @@ class BaseDriver:
     resume: Any
 
     def __init__(self, *, plugins: Any = None, before: BaseDriver | None = None) -> None:
-        """Prepare a stack; the first ``start`` makes it.
+        """Prepare a driver. The first job begins the stack.
 
         Args:
-            plugins: The plugins of the simulation's environment, which take part in all that runs on the stack.
-            before: The driver that the simulation had before, whose threads it may still have.
+            plugins: The plugins of the simulation's environment. They apply to all code that runs on the stack.
+            before: The simulation's previous driver. Threads that ran under it may still run.
         """
         self.plugins = plugins
         self.stack: greenlet | None = None
@@ -122,23 +122,23 @@ class BaseDriver:
         self._context: Context | None = None
         self._events: Mapping[Hook, Crossing] = NO_DECISIONS
         self._refused: WrongThreadError | None = None
-        self._astray: str | None = None  # where the stack has been taken without its user, by a fork
+        self._astray: str | None = None  # after a fork that left the user behind: a description of the place
         self._children: Children | None = None
         if before is not None and before._children is not None:
             self._children = before._children
             self._children.driver = self
 
-    # -- the user's side, for each kind of driver to see to ---------------------------------------
+    # -- the user's side, which each kind of driver implements ------------------------------------
 
     def prepare(
         self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
     ) -> None:
-        """Have the next ``resume`` begin to run something on the stack.
+        """Prepare a job. The next ``resume`` begins to run it on the stack.
 
         Args:
-            job: What is run.
-            decisions: By hook: what crosses where it is called. All others run their rule. Never changed here.
-            context: The context variables that it sees; None: a copy of the user's.
+            job: The function to run.
+            decisions: The events to send, by hook. All other hooks run their rule. The driver does not change this.
+            context: The context variables of the job. None: a copy of the user's.
 
         Raises:
             WrongThreadError: The stack cannot be resumed from here.
@@ -146,7 +146,7 @@ class BaseDriver:
         raise NotImplementedError
 
     def enter(self) -> None:
-        """Make ready to be resumed from here.
+        """Prepare to resume the simulation from the current thread and greenlet.
 
         Raises:
             WrongThreadError: The simulation cannot be resumed from here.
@@ -154,7 +154,7 @@ class BaseDriver:
         raise NotImplementedError
 
     def throw(self) -> Event:
-        """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next."""
+        """Raise ``SimulationExit`` in the suspended simulation; return its next event."""
         raise NotImplementedError
 
     def reachable(self) -> bool:
@@ -162,21 +162,21 @@ class BaseDriver:
         raise NotImplementedError
 
     def lost(self) -> bool:
-        """Whether the simulation cannot be resumed from anywhere any more."""
+        """Whether nothing can resume the simulation any more."""
         raise NotImplementedError
 
     def give_up(self) -> None:
-        """Leave a job that does not unwind where it is; nothing else can be started."""
+        """Abandon a job that does not unwind. The driver can start no other job."""
         raise NotImplementedError
 
     def end(self) -> None:
-        """End the stack. Should a job be under way that cannot be reached from here, it unwinds by itself."""
+        """End the stack. A job that cannot be reached from here unwinds by itself."""
         raise NotImplementedError
 
     def unwind(self) -> list[BaseException]:
-        """Raise ``SimulationExit`` in the job that is under way until it has ended. Returns what else it raised.
+        """Raise ``SimulationExit`` in the current job until it ends. Return the other errors that it raised.
 
-        Where it does not end it is given up.
+        A job that does not end is given up.
         """
         problems: list[BaseException] = []
         for _ in range(UNWINDING_TRIES):
@@ -206,7 +206,7 @@ class BaseDriver:
 
     @property
     def children(self) -> Children:
-        """The threads that the simulation has started, over all its episodes."""
+        """The threads and other resources that the simulation has opened, over all its episodes."""
         if self._children is None:
             self._children = Children(self)
         return self._children
@@ -221,15 +221,15 @@ class BaseDriver:
         self._context, self._job = context, job
 
     def _begin(self) -> None:
-        """On the stack: it is one of a simulation's from now on."""
+        """On the stack: register it as a simulation's stack."""
         self.stack = stack = getcurrent()
         STACKS[stack] = self
         watch()
         self.show()
 
     def _work(self) -> Event:
-        """On the stack: do a job; return the event that its end is."""
-        # No frame here holds the stack, which would refer to itself then, and could not be collected.
+        """On the stack: run a job; return the event for its end."""
+        # No frame here may refer to the stack: it would then refer to itself, and could not be collected.
         self._idle = self._exiting = False
         job, self._job = self._job, None
         try:
@@ -256,7 +256,7 @@ class BaseDriver:
         return (FINISHED, [result], None) if self._refused is None else (FAILED, [self.refusal()], None)
 
     def _forget_stack(self) -> None:
-        """Take no part in anything any more."""
+        """Unregister the stack. From now on it takes no part in decisions."""
         self._ended = True
         self.hide()
         self._events = NO_DECISIONS
@@ -270,47 +270,47 @@ class BaseDriver:
     # -- decisions --------------------------------------------------------------------------------
 
     def _decider(self, hook: Hook, event: Crossing, away: bool = False) -> Taker:
-        """Make what decides the calls of a hook.
+        """Make the function that hands over the calls of a hook and carries out the replies.
 
         Args:
             hook: The hook.
-            event: What crosses.
-            away: Whether the calls arise in greenlets of the model's own, and not on the stack itself.
+            event: The event to send.
+            away: Whether the calls come from the model's own greenlets, and not from the stack itself.
         """
         raise NotImplementedError
 
     def _rule_of(self, hook: Hook, event: Crossing, away: bool) -> Callable[..., Any]:
-        """The rule of a hook, which tells the user's side what it has decided if that is to be told."""
+        """The rule of a hook, wrapped to report its decision to the user's side if the event asks for that."""
         if event.told is None:
             rule: Callable[..., Any] = hook.rule
             return rule
         tell, events = self._decider(hook, event.told, away), self._events
 
         def told(decision: Any, args: Any, kwargs: Any) -> Any:
-            if self._events is events:  # else the job is over
+            if self._events is events:  # otherwise the job is over
                 tell((decision, args, kwargs), {})
             return decision
 
         return _TELLING[hook.kind](hook.rule, told)
 
     def stall(self, error: BaseException, seconds: float) -> None:
-        """On the stack: tell the user of an error that cannot surface, since something does not come to its end.
+        """On the stack: report an error that cannot surface, because the code that called a callback does not end.
 
         Args:
             error: The error.
-            seconds: For how long it has been waited.
+            seconds: How long the callback has waited for that end.
 
         Raises:
-            SimulationExit: The answer to it.
+            SimulationExit: The user unwinds the simulation in reply.
         """
         self._decider(_NO_HOOK, STALLED, away=True)([error], seconds)  # type: ignore[arg-type]
 
     def decides(self, hook: Hook) -> bool:
-        """Whether calls of a hook are handed over by the job that is under way."""
+        """Whether the current job hands over the calls of a hook."""
         return hook in self._events
 
     def taker(self, hook: Hook, here: greenlet) -> Taker | None:
-        """Who decides a call in a greenlet of the simulation's; None: the rule."""
+        """The function that decides calls of a hook in the simulation's own greenlets. None: the rule decides."""
         return self._taker(hook, away=True)
 
     def _taker(self, hook: Hook, away: bool = False) -> Taker | None:
@@ -320,13 +320,13 @@ class BaseDriver:
         return self._decider(hook, event, away) if self._astray is None else self.refusal_of(hook, self._astray)
 
     def hide(self) -> None:
-        """Take no part in calls on the stack until ``show``."""
+        """Leave all hooks, so that the driver takes no part in calls on the stack until ``show``."""
         if self.stack is not None:
             for hook in self._hooks():
                 hook.leave(self.stack)
 
     def show(self) -> None:
-        """Take part again."""
+        """Enter all hooks, so that the driver takes part in calls on the stack."""
         stack = self.stack
         if stack is not None:
             for hook in self._hooks():
@@ -338,7 +338,7 @@ class BaseDriver:
     # -- refusals ---------------------------------------------------------------------------------
 
     def refusal_of(self, hook: Hook, where: str) -> Taker | None:
-        """What refuses a decision that was asked for where the simulation cannot wait; None where it is none."""
+        """The function that refuses decisions where the simulation cannot wait; None for a hook without decisions."""
         if not self.decides(hook):
             return None
 
@@ -348,9 +348,9 @@ class BaseDriver:
         return refuse
 
     def _refuse(self, hook: Hook, where: str) -> WrongThreadError:
-        """Refuse a decision, for the user to be told at the simulation's next event; return the error for the caller.
+        """Refuse a decision. Return the error for the caller; the user gets one at the simulation's next event.
 
-        Called wherever that has been asked for, in other threads too.
+        This is called in the thread that has asked for the decision.
         """
         error = WrongThreadError(
             f"{hook.name} was called in {where}, where no user can be asked. Call it where run() runs, and have others"
@@ -363,12 +363,12 @@ class BaseDriver:
         return error
 
     def _go_astray(self, where: str) -> None:
-        """Refuse all decisions of the simulation, for the model alone to be told."""
+        """Refuse all decisions of the simulation. Only the model gets the errors."""
         self._astray = where
         self.show()
 
     def _stay_behind(self) -> None:
-        """Take no part in this forked process; a thread of the simulation's that has forked it is refused as before."""
+        """Drop the stack in this forked process. A thread of the simulation that forked it is still refused."""
         events = self._events
         self._forget_stack()
         here = getcurrent()
@@ -378,18 +378,18 @@ class BaseDriver:
             self._go_astray("a process that a thread of the simulation has forked")
 
     def refusal(self) -> WrongThreadError:
-        """The error that tells the user of a decision that was refused."""
+        """Make the error that tells the user of a refused decision."""
         refused, self._refused = self._refused, None
         error = WrongThreadError(*(() if refused is None else refused.args))
         error.__cause__ = refused
         return error
 
     def forked(self) -> None:
-        """The process was forked, and this is the child."""
+        """Handle a fork in the child process."""
         raise NotImplementedError
 
     def forked_worker(self) -> None:
-        """The simulation has begun a worker of ``multiprocessing`` by a fork, and this is the worker."""
+        """Handle a fork in a ``multiprocessing`` worker that the simulation has started."""
         self._go_astray("a process that the simulation has forked as a worker")
 
 

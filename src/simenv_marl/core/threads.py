@@ -1,4 +1,4 @@
-"""A driver that runs a simulation in a thread of its own, for what cannot live on a greenlet."""
+"""The driver that runs a simulation in a thread of its own, for models that cannot run in a greenlet."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from .loops import hush
 from .switch import SECONDS_TO_UNWIND, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 _A_WHILE: Final = 1.0
-"""For how many seconds the user waits before it looks around: a Ctrl-C just before a wait does not wake from it."""
+"""The seconds after which a wait of the user is interrupted. A Ctrl-C just before a wait would not interrupt it."""
 
 SIMULATION: Final = "simulation"
-"""The name of a simulation's thread."""
+"""The name of the threads of simulations."""
 
 _NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
@@ -30,12 +30,11 @@ _END: Final = Sentinel("END")
 
 
 class ThreadDriver(BaseDriver):
-    """Runs a simulation in a thread of its own, which the first ``start`` starts and ``end`` joins.
+    """A driver that runs a simulation in a thread of its own. The first ``prepare`` starts it, and ``end`` joins it.
 
-    Only one of the two threads runs at a time: what one hands over to the other lies in ``_reply`` and
-    ``_event``, and a lock for each wakes the thread that waits for it. What counts is what lies there, and not how
-    often a lock was released, so that a wait may be interrupted anywhere (by Ctrl-C, for instance) and nothing gets
-    out of step.
+    Only one of the two threads runs at a time. They hand over values in ``_reply`` and ``_event``. Each of these has a
+    lock that wakes the waiting thread. Only the values count, and not how often a lock was released. So a wait may be
+    interrupted anywhere (by Ctrl-C, for instance), and the threads stay in step.
     """
 
     __slots__ = ("_arrived", "_end", "_event", "_ident", "_process", "_reply", "_resumed", "_thread")
@@ -69,17 +68,17 @@ class ThreadDriver(BaseDriver):
         self._context = None
         try:
             end: Event = context.run(self._work)
-        except BaseException as error:  # thrown into this thread from elsewhere; without an end its user would wait on
+        except BaseException as error:  # raised from another thread; without an event the user would wait for ever
             end = FAILED, [error], None
         context = None
         if isinstance(end[1][0], SimulationExit):
-            # It is not going to be read, and what its frames hold must go while this thread is there: greenlets of
-            # the model's own can unwind nowhere else.
+            # Nothing reads this traceback. Its frames must be freed while this thread runs, because the model's own
+            # greenlets can unwind in no other thread.
             end[1][0].__traceback__ = end[1][0].__context__ = None
         if self.lost():
             self._ended = True
             if end[0] is FAILED:
-                raise end[1].pop()  # the model has forked, and in this process its user is not there to be told
+                raise end[1].pop()  # the model has forked, and this process has no user to tell
             return
         self._idle = True
         self._event = self._end = end
@@ -108,12 +107,12 @@ class ThreadDriver(BaseDriver):
 
         return decide
 
-    # -- in its user's ----------------------------------------------------------------------------
+    # -- in the user's thread ---------------------------------------------------------------------
 
     def prepare(
         self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
     ) -> None:
-        """Have the next ``resume`` begin to run something on the stack."""
+        """Prepare a job. The next ``resume`` begins to run it on the stack."""
         self.enter()
         self._prepare(job, decisions, copy_context() if context is None else context)
         self._event = self._end = None
@@ -133,7 +132,7 @@ class ThreadDriver(BaseDriver):
             raise
 
     def resume(self, reply: Any) -> Event:
-        """Let the simulation go on with a reply; return the event that comes from it next."""
+        """Resume the simulation with a reply; return its next event."""
         self._reply = reply if self._job is None else _JOB
         _wake(self._resumed)
         arrived = self._arrived
@@ -143,10 +142,9 @@ class ThreadDriver(BaseDriver):
         return event
 
     def throw(self) -> Event:
-        """Raise ``SimulationExit`` in the suspended simulation; return the event that comes from it next.
+        """Raise ``SimulationExit`` in the suspended simulation; return its next event.
 
-        Where it is not suspended, because its user was interrupted while waiting for it, it is raised at its next
-        decision.
+        If the simulation still runs, because the user's wait was interrupted, the exit is raised at its next decision.
         """
         self.enter()
         if self._thread is None or (self._idle and self._end is None and self._reply is not _JOB):
@@ -154,10 +152,10 @@ class ThreadDriver(BaseDriver):
         patience = monotonic() + SECONDS_TO_UNWIND
         self._exiting = True
         self._event = None
-        if not (self._idle and self._reply is _JOB):  # else the job begins, and is told at its first decision
+        if not (self._idle and self._reply is _JOB):  # otherwise the job begins, and gets the exit at its first decision
             self._reply = _EXIT
             _wake(self._resumed)
-        # An end is looked for where it stays, whenever it came.
+        # ``_end`` keeps the end of the job, even if it came before this call.
         while (event := self._end or self._event) is None:
             left = patience - monotonic()
             if left <= 0:
@@ -167,7 +165,7 @@ class ThreadDriver(BaseDriver):
         return event
 
     def enter(self) -> None:
-        """Make ready to be resumed from here.
+        """Check that the simulation can be resumed from the current process.
 
         Raises:
             WrongThreadError: This process was forked, and the simulation's thread stayed behind.
@@ -179,17 +177,17 @@ class ThreadDriver(BaseDriver):
             )
 
     def reachable(self) -> bool:
-        """Whether the simulation can be resumed from here."""
+        """Whether the simulation can be resumed from the current process."""
         return not self.lost()
 
     def lost(self) -> bool:
-        """Whether this process was forked, which no other thread survives."""
+        """Whether this process is a fork, in which the simulation's thread does not exist."""
         return getpid() != self._process
 
     def end(self) -> None:
-        """End the stack, whose job has ended or is lost; wait for its thread to be gone.
+        """End the stack, whose job has ended or is lost, and wait for the end of its thread.
 
-        Where this is interrupted, it can be called again.
+        After an interrupt this can be called again.
         """
         if self._ended and not self._idle:
             return
@@ -198,7 +196,7 @@ class ThreadDriver(BaseDriver):
         if self._idle and thread is not None and thread is not current_thread() and not self.lost():
             self._reply = _END
             _wake(self._resumed)
-            if thread.ident is not None:  # else it was interrupted before it started
+            if thread.ident is not None:  # otherwise an interrupt came before the thread started
                 thread.join(SECONDS_TO_UNWIND)
             if thread.is_alive():
                 warn_user(
@@ -209,12 +207,12 @@ class ThreadDriver(BaseDriver):
         self._thread = None
 
     def give_up(self) -> None:
-        """Leave a job that does not unwind where it is; at its next decision it gets another chance."""
+        """Abandon a job that does not unwind. If it decides again, it gets another chance to unwind."""
         self._ended = True
-        self.children.driver = None  # threads that it has started run their rule
+        self.children.driver = None  # decisions in threads that it has started run their rule
 
     def forked(self) -> None:
-        """The process was forked, and this is the child: in the simulation's own thread, or without it."""
+        """Handle a fork in the child process, which runs in the simulation's own thread or lacks it."""
         if self._ident == get_ident():
             self._go_astray(
                 "a process that the simulation has forked, while the environment's user is in another thread and has"
@@ -225,6 +223,6 @@ class ThreadDriver(BaseDriver):
 
 
 def _wake(lock: Any) -> None:
-    """Have the thread that waits for a lock, or is going to, look again."""
+    """Wake the thread that waits for a lock, or let its next wait return at once."""
     if lock.locked():
         lock.release()

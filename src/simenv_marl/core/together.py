@@ -1,4 +1,4 @@
-"""Many episodes of one thread that are moved together."""
+"""Steps of many episodes in one thread."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from .episode import Episode
 
 
 def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callable[[int, BaseException], None]) -> None:
-    """Answer the pending decisions of many episodes, and run each to its next one.
+    """Answer the pending decisions of many episodes, and run each episode to its next decision.
 
-    All of them move before any is settled: what one loop needs so stays in the processor's caches.
+    All simulations move before any agent is settled, so that the data of each loop stays in the processor's caches.
 
     Args:
-        episodes: The episodes, of one plan; in each a decision is pending.
-        actions: An action for each, checked.
-        blame: Called where something raises: with the number of the episode, and the error.
+        episodes: The episodes, of one plan. In each a decision is pending.
+        actions: A checked action for each episode.
+        blame: A function that is called with the number of the episode and the error if an episode raises.
 
     Raises:
-        BaseException: As ``Episode.step``. The other episodes have moved or not, and can be closed.
+        BaseException: See ``Episode.step``. The other episodes may have moved or not. They can be closed.
     """
     agents: list[Any] = [episode.pending for episode in episodes]
     for number, agent in enumerate(agents) if None in agents else ():
@@ -47,20 +47,20 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
             resume = episode.driver.resume
             events.append(resume(replies[number]))
         del replies
-        events.reverse()  # taken out one by one: nothing is to keep alive what a model lets go
-        for number, episode in enumerate(episodes):  # noqa: B007 - it tells which one has raised
+        events.reverse()  # popped one by one, so that the list keeps nothing alive that a model frees
+        for number, episode in enumerate(episodes):  # noqa: B007 - the handler below needs the number
             event, args, kwargs = events.pop()
             reply = event.arise(episode, args, kwargs)
             if reply is not WAIT:
                 event = args = kwargs = None
                 episode.go_on(reply)
     except BaseException as error:
-        events = event = args = kwargs = resume = None  # else the error would keep them alive
+        events = event = args = kwargs = resume = None  # so that the error's traceback does not keep them alive
         for place, episode in enumerate(episodes):
             if place == number:
                 if episode.pending is None and not episode.over:
                     episode.fail(error)
-                elif together:  # else ``step`` has done that
+                elif together:  # otherwise ``step`` has already done this
                     episode.annotate(error)
             elif episode.pending is None and not episode.over:
                 episode.pending = episode.latest  # so that it can be closed

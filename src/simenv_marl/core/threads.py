@@ -152,7 +152,7 @@ class ThreadDriver(BaseDriver):
         patience = monotonic() + SECONDS_TO_UNWIND
         self._exiting = True
         self._event = None
-        if not (self._idle and self._reply is _JOB):  # otherwise the job begins, and gets the exit at its first decision
+        if not (self._idle and self._reply is _JOB):  # else the job begins, and gets the exit at its first decision
             self._reply = _EXIT
             _wake(self._resumed)
         # ``_end`` keeps the end of the job, even if it came before this call.

@@ -1,4 +1,4 @@
-"""The environment that a policy is given which asks for it: the single view of the agent for which it decides."""
+"""The environment for policies that ask for one: the single view of the agent for which the policy decides."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from .single import SimulationEnv
 
 
 class AskedEnv(SimulationEnv):
-    """The single view of an agent while its policy is asked. It is for ``branch``, and what is made of that.
+    """The single view of an agent while its policy is asked. It serves for ``branch`` and the functions built on it.
 
-    Its decision is pending, and is answered by what the policy returns. In a branch it is an environment like any
-    other: it can be stepped, and tells the agent's observations and rewards. All other agents are left to their
-    policies there, and to their rule where they have none.
+    The agent's decision is pending, and the return value of the policy answers it. A branch of it is an ordinary
+    environment: it can be stepped, and returns the agent's observations and rewards. In a branch, policies answer for
+    all other agents, or the rule where there is no policy.
     """
 
     def __init__(self, session: Session) -> None:
         """Make the view.
 
         Args:
-            session: A session in whose episode a policy is asked that is given the environment.
+            session: A session in whose episode such a policy is being asked.
         """
         self._plan = self._made_of = session.plan
         self._session = session
@@ -42,7 +42,7 @@ class AskedEnv(SimulationEnv):
         return copy.deepcopy((definition.observation_space, definition.action_space))
 
     def begin_branch(self) -> None:
-        """Wait for the agent alone, now that this is a branch."""
+        """Turn this environment into a branch that waits for the agent only."""
         if not self._branched:
             self._branched = True
             self._session.step_out()
@@ -52,17 +52,17 @@ class AskedEnv(SimulationEnv):
         """Make sure that the decision is pending.
 
         Raises:
-            ResetNeededError, ReentrancyError: It was answered.
+            ResetNeededError, ReentrancyError: The decision was already answered.
         """
         episode = self._running()
         if (episode.pending or episode.consulted) is not self._own:
             raise episode.refusal()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """In a branch: answer the pending decision and run to the agent's next one, as in every single view.
+        """In a branch, answer the pending decision and run to the agent's next one, as in every single view.
 
         Raises:
-            ReentrancyError: This is no branch.
+            ReentrancyError: This environment is not a branch.
         """
         if not self._branched:
             raise ReentrancyError(
@@ -71,7 +71,7 @@ class AskedEnv(SimulationEnv):
         return super().step(action)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
-        """Refuse: it is the environment of one decision.
+        """Refuse the reset: this is the environment of one decision.
 
         Raises:
             ReentrancyError: Always.
@@ -79,10 +79,10 @@ class AskedEnv(SimulationEnv):
         raise ReentrancyError("the environment that a policy is given stands at its decision, and is not to be reset")
 
     def close(self) -> None:
-        """In a branch: end it.
+        """End a branch.
 
         Raises:
-            ReentrancyError: This is no branch.
+            ReentrancyError: This environment is not a branch.
         """
         if not self._branched:
             raise ReentrancyError(
@@ -91,10 +91,10 @@ class AskedEnv(SimulationEnv):
         super().close()
 
     def replayed(self) -> AskedEnv:
-        """Make an environment that stands just where this one stands: a copy for ``branch``.
+        """Make a copy for ``branch`` that stands at the same decision, by a replay.
 
         Raises:
-            BranchError: It cannot be brought there.
+            BranchError: The replay does not reach the same decision.
         """
         if self._running().alone:
             raise BranchError(

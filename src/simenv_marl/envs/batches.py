@@ -1,4 +1,4 @@
-"""What goes to and comes from many simulations at once: batches of observations, rewards, flags and actions."""
+"""Batches of observations, rewards, flags and actions of many simulations."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ..errors import InvalidActionError, shown
 from ..simulation import RULE
 
 IGNORED: Final = None
-"""Stands for an action that is not used; no space has it."""
+"""The placeholder for an action that is not used. It is in no space."""
 
 
 class Batch:
-    """What many simulations tell at once.
+    """The results of one step of many simulations.
 
     Attributes:
-        observations: Of the single space, batched.
-        rewards: Shape ``(n,)``, float64.
-        terminations, truncations: Shape ``(n,)``, bool.
+        observations: A batch of observations, each of the single observation space.
+        rewards: An array of shape ``(n,)`` and dtype float64.
+        terminations, truncations: Arrays of shape ``(n,)`` and dtype bool.
     """
 
     def __init__(self, observations: Any, number: int) -> None:
@@ -33,36 +33,36 @@ class Batch:
 
 
 class Actions:
-    """Takes batches of actions apart, and checks them as far as that needs no simulation.
+    """Splits batches of actions, and checks them as far as this is possible without the simulations.
 
     Attributes:
-        complete: Whether nothing is left to be checked with the simulations.
+        complete: Whether this check is complete, so that the simulations need not check the actions.
     """
 
     def __init__(self, space: spaces.Space[Any], number: int, point: BoundPoint | None) -> None:
-        """Make ready for batches of a space.
+        """Prepare for batches of a space.
 
         Args:
             space: The action space of one simulation.
-            number: How many simulations there are.
-            point: The decision point that takes the actions; None where several do.
+            number: The number of simulations.
+            point: The decision point that takes the actions. None if there are several.
         """
         self._number, self._point = number, point
         self._space, self._batch = space, batch_space(space, number)
         self.complete = point is not None and point.legal is None
 
     def split(self, actions: Any, unused: Any = ()) -> list[Any]:
-        """Take a batch apart.
+        """Split a batch into actions.
 
         Args:
-            actions: A batch of the action space; for spaces whose batches are arrays, a sequence serves.
-            unused: The numbers of the actions that are not used, and so not checked.
+            actions: A batch of the action space. If batches of the space are arrays, it may be a sequence.
+            unused: The numbers of the simulations whose actions are not used, and so not checked.
 
         Returns:
-            An action for each simulation; ``IGNORED`` in place of those that are not used.
+            A list with an action for each simulation, and ``IGNORED`` for each unused action.
 
         Raises:
-            InvalidActionError: There is not an action for each, or one is not legal. It says which.
+            InvalidActionError: The number of actions is wrong, or an action is not legal. The message says which.
         """
         space = self._space
         if actions is RULE:
@@ -77,7 +77,7 @@ class Actions:
             and actions.dtype is space.dtype
             and ((actions >= space.low) & (actions <= space.high)).all()
         ):
-            return list(actions.copy())  # which the caller cannot change
+            return list(actions.copy())  # so that the caller cannot change them
         apart = self._apart(actions)
         for number in range(self._number):
             if number in unused:
@@ -102,5 +102,5 @@ class Actions:
 
 
 def of_one(number: int, error: Any) -> str:
-    """The message of an error about the action of one of many."""
+    """Make the message of an error about the action of one sub-environment."""
     return f"sub-environment {number}: {error}"

@@ -1,4 +1,4 @@
-"""What the views with one agent have in common: they are Gymnasium environments."""
+"""The base class of the views with one agent, which are Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .base import View
 
 
 class OneAgentView(View, gym.Env[Any, Any]):
-    """A view with one agent, and so a Gymnasium environment."""
+    """A view with one agent: a Gymnasium environment."""
 
     _agent: str
     _own_spaces: tuple[spaces.Space[Any], spaces.Space[Any]] | None = None
 
     def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        """Make spaces for this environment alone: of observations and of actions."""
+        """Make the observation space and the action space of this environment, which it shares with no other."""
         raise NotImplementedError
 
     @property
     def _spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        if self._own_spaces is None:  # made when they are asked for: many simulations side by side share what they can
+        if self._own_spaces is None:  # made on demand, because many simulations side by side may never need them
             self._own_spaces = self._make_spaces()
             seed = self._session.np_random_seed
             if seed is not None and seed >= 0:
@@ -36,7 +36,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     @property
     def observation_space(self) -> spaces.Space[Any]:
-        """The observation space, of this environment alone."""
+        """The observation space. No other environment shares it."""
         return self._spaces[0]
 
     @observation_space.setter
@@ -45,7 +45,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     @property
     def action_space(self) -> spaces.Space[Any]:
-        """The action space, of this environment alone."""
+        """The action space. No other environment shares it."""
         return self._spaces[1]
 
     @action_space.setter
@@ -62,14 +62,14 @@ class OneAgentView(View, gym.Env[Any, Any]):
         return [self.observation_space]
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Which actions are legal now, in the shape in which sb3-contrib's ``MaskablePPO`` asks for it.
+        """The mask of the legal actions, in the form that ``MaskablePPO`` of sb3-contrib expects.
 
         Returns:
-            Shape ``(n,)`` for a ``Discrete``; for a ``MultiDiscrete`` the masks of its parts, one behind the other.
-            True throughout where the decision point does not restrict its actions.
+            A bool array. For a ``Discrete`` it has shape ``(n,)``. For a ``MultiDiscrete`` it is the concatenation of
+            the masks of the parts. If the decision point does not restrict its actions, all entries are True.
 
         Raises:
-            ViewError: The action space is neither, and so there are no masks of it.
+            ViewError: The action space is neither ``Discrete`` nor ``MultiDiscrete``, and so has no masks.
             ResetNeededError: There is no episode.
         """
         if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
@@ -82,11 +82,11 @@ class OneAgentView(View, gym.Env[Any, Any]):
         return np.concatenate(parts).astype(np.bool_)
 
     def _legal(self, episode: Episode) -> list[Any]:
-        """The masks of all that is decided in a step."""
+        """The masks of all decisions that one step answers."""
         raise NotImplementedError
 
     def _begin(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
-        """End the episode that runs, begin another, and seed the generator and the spaces."""
+        """End the current episode, begin another, and seed the generator and the spaces."""
         seed = checked_seed(seed)
         self._make_way()
         if seed is not None and self._own_spaces is not None:

@@ -1,7 +1,7 @@
-"""``padded=True``: all of ``possible_agents`` are there from the reset to the end of an episode.
+"""``padded=True``: all ``possible_agents`` are in ``agents`` from the reset to the end of an episode.
 
-Agents that are yet to be born, or that the model has removed, do not decide: their observations are blank, their infos
-tell that they are not ``"present"``, and actions for them are not used.
+Agents that are not born yet, or that the model has removed, do not decide. Their observations are blank, the entry
+``"present"`` of their infos is False, and actions for them are ignored.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from ..core.bound import BoundPoint
 from ..core.episode import Episode
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
-"""What a parallel step returns: observations, rewards, terminations, truncations and infos, by agent."""
+"""The results of a parallel step: observations, rewards, terminations, truncations and infos, by agent."""
 
 
 def is_present(agent: Agent) -> bool:
-    """Whether an agent lives and was observed."""
+    """Whether an agent is live and was observed."""
     return agent.present and not agent.ended
 
 
 def presence(agent: Agent) -> dict[str, Any]:
-    """The info of an agent, which tells whether it is present."""
+    """The info of an agent, with the entry ``"present"``."""
     if agent.ended:
         agent.unsee()
     info = agent.info
@@ -32,7 +32,7 @@ def presence(agent: Agent) -> dict[str, Any]:
 
 
 def of_present_agents(episode: Episode, roster: Mapping[str, BoundPoint], actions: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out the actions of agents of the roster that are not present."""
+    """Remove the actions of possible agents that are not present."""
     agents = episode.agents
     return {
         name: action
@@ -42,7 +42,7 @@ def of_present_agents(episode: Episode, roster: Mapping[str, BoundPoint], action
 
 
 def pad(episode: Episode, possible_agents: Iterable[str], results: Results) -> None:
-    """Add the agents that are not present to what a round has brought, and have all agents end together."""
+    """Add the agents that are not present to the results of a round, and let all agents end together."""
     observations, rewards, terminations, truncations, infos = results
     for name in possible_agents:
         agent = episode.agent(name)
@@ -63,5 +63,5 @@ def pad(episode: Episode, possible_agents: Iterable[str], results: Results) -> N
         terminations[name], truncations[name] = episode.terminated, episode.truncated
         part: Any
         for part in results:
-            if name in part:  # to stand in the order of the roster
+            if name in part:  # moved to the end, so that the dict has the order of ``possible_agents``
                 part[name] = part.pop(name)

@@ -1,4 +1,4 @@
-"""What the views with several agents have in common: they are PettingZoo environments."""
+"""The base class of the views with several agents, which are PettingZoo environments."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from .base import View
 
 
 class AgentsView(View):
-    """A view in which agents are told apart. ``possible_agents`` exists only where all are known beforehand.
+    """A view with several agents. ``possible_agents`` exists only if all agents are known beforehand.
 
     Attributes:
-        agents: The agents that are there now.
+        agents: The names of the current agents.
     """
 
     agents: list[str]
@@ -29,7 +29,7 @@ class AgentsView(View):
         """Make the view of a plan.
 
         Raises:
-            SimEnvError: Something in the plan cannot work.
+            SimEnvError: The plan does not work in this view.
         """
         if plan.options.padded and not plan.complete:
             raise OptionValueError("padded=True needs a roster: say in possible_agents= who there may be")
@@ -41,11 +41,11 @@ class AgentsView(View):
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
 
     def _start(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
-        """End the episode that runs, begin another, and seed the agents' spaces."""
+        """End the current episode, begin another, and seed the agents' spaces."""
         seed = checked_seed(seed)
         self._make_way()
         episode = self._session.start(seed, options, when)
-        if not self._plan.complete:  # names that may never come again
+        if not self._plan.complete:  # the agents of the last episode may never appear again
             self._observation_spaces, self._action_spaces = {}, {}
         elif seed is not None:
             for agent in self._action_spaces:
@@ -57,7 +57,7 @@ class AgentsView(View):
         """Make sure that a plan allows this view.
 
         Raises:
-            ViewError: It does not.
+            ViewError: The plan does not allow it.
         """
         super().check(plan)
         if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
@@ -72,7 +72,7 @@ class AgentsView(View):
         return tuple(self._observation(episode, agent) for agent in self.possible_agents)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The observation space of an agent: of this environment alone, and always the same object.
+        """The observation space of an agent. It is always the same object, and no other environment shares it.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -81,7 +81,7 @@ class AgentsView(View):
         return space if space is not None else self._make_spaces(agent)[0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The action space of an agent: of this environment alone, and always the same object.
+        """The action space of an agent. It is always the same object, and no other environment shares it.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -91,7 +91,7 @@ class AgentsView(View):
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """By possible agent, its observation space: for learners that ask for all at once.
+        """The observation spaces of all possible agents, by name, for learners that read all at once.
 
         Raises:
             AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
@@ -100,7 +100,7 @@ class AgentsView(View):
 
     @property
     def action_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """By possible agent, its action space: for learners that ask for all at once.
+        """The action spaces of all possible agents, by name, for learners that read all at once.
 
         Raises:
             AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
@@ -133,7 +133,7 @@ class AgentsView(View):
             seed_space(space, seed, agent)
 
     def _observation(self, episode: Episode, agent: str) -> Any:
-        """The latest observation of an agent, as a copy of the caller's own."""
+        """A copy of the latest observation of an agent."""
         found = episode.agent(agent)
         if found is None or found.observation is None or (self._padded and found.ended):
             return self._point(agent).blank()

@@ -1,7 +1,7 @@
-"""Many simulations of one plan, suspended side by side in one process and moved together.
+"""Rows: many simulations of one plan, suspended side by side in one process and stepped together.
 
-A *row* holds the sessions of its sub-environments, resets and moves their simulations, and leaves what comes of it in
-arrays. The Gymnasium view of one of them is made when it is asked for.
+A *row* holds the sessions of its sub-environments. It resets and steps their simulations, and writes the results into
+arrays. It makes their Gymnasium views on demand.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from .joint import Joint, SimulationJointEnv
 from .single import single_view, with_goals
 
 Told = list[tuple[int, dict[str, Any]]]
-"""Infos, each with the number of its sub-environment, in the order in which they are to be merged."""
+"""Infos, each with the number of its sub-environment, in the order in which they must be merged."""
 
 
 class SubEnvironments:
-    """What all sub-environments of a plan have in common.
+    """The properties that all sub-environments of a plan share.
 
     Attributes:
-        plan: What they are made of.
-        joint: What they are as joint views; None where they are single views.
-        metadata: What they say about themselves.
-        single_observation_space, single_action_space: The spaces of one of them.
+        plan: The plan from which they are made.
+        joint: The common part of their joint views. None if they are single views.
+        metadata: The ``metadata`` of their view.
+        single_observation_space, single_action_space: The spaces of one sub-environment.
     """
 
     def __init__(self, plan: Plan, view: str | None) -> None:
-        """Find out what a plan asks for; where agents are yet unknown, reset a simulation to ask.
+        """Determine the view and its spaces. For a joint view this may take the reset of a simulation.
 
         Args:
-            plan: What they are to be made of.
-            view: "single", "joint", or None: single where one point with one string agent is active.
+            plan: The plan from which the sub-environments will be made.
+            view: "single" or "joint". None: single if one point with one string agent is active, else joint.
 
         Raises:
             SimEnvError: The plan does not allow the view.
@@ -73,7 +73,7 @@ class SubEnvironments:
 
     @property
     def single(self) -> bool:
-        """Whether they are single views."""
+        """Whether the sub-environments are single views."""
         return self.joint is None
 
     def view(self, session: Session) -> OneAgentView:
@@ -88,10 +88,10 @@ class Row:
     """Sub-environments side by side.
 
     Attributes:
-        sessions: Their simulations.
-        batch: What they write into.
-        ended: The numbers of those whose episode has ended and has not begun anew.
-        failed: Whether an error has left some of them where the others are not, and all are to be reset.
+        sessions: The sessions of the sub-environments.
+        batch: The arrays into which their results are written.
+        ended: The numbers of the sub-environments whose episode has ended, with no new one begun.
+        failed: Whether an error has left the sub-environments out of step, so that all must be reset.
     """
 
     def __init__(
@@ -100,14 +100,14 @@ class Row:
         """Make the simulations.
 
         Args:
-            common: What they have in common.
-            batch: What they are to write into.
-            mode: When episodes that have ended begin anew.
-            number: How many there are to be.
-            offset: How many there are before the row, for those who are told of an error.
+            common: The shared properties of the sub-environments.
+            batch: The arrays for their results.
+            mode: When a new episode follows one that has ended.
+            number: The number of sub-environments in the row.
+            offset: The number of sub-environments before the row, for error messages.
 
         Raises:
-            BaseException: What making a simulation raises.
+            BaseException: Any error of making a simulation.
         """
         self.batch, self._mode, self._offset, self._common = batch, mode, offset, common
         self._stack = stacker(common.single_observation_space, cast=True, other=concatenate)
@@ -115,7 +115,7 @@ class Row:
         self._shows = common.plan.options.render_mode == "human"
         self._observed: list[Any] = [None] * number
         self._views: list[OneAgentView] = []
-        self._episodes: list[Any] = []  # of which these are the agents, in the single view
+        self._episodes: list[Any] = []  # the episodes to which ``_agents`` belong, in the single view
         self._agents: list[Any] = []
         self.ended: set[int] = set()
         self.failed = False
@@ -129,18 +129,18 @@ class Row:
             raise
 
     def reset(self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: Sequence[int]) -> Told:
-        """Begin the episodes of some sub-environments anew.
+        """Begin new episodes of some sub-environments.
 
         Args:
-            seeds: For all of them.
-            options: For all that are reset.
-            chosen: The numbers of those.
+            seeds: A seed for each sub-environment of the row.
+            options: The options for all sub-environments that are reset.
+            chosen: The numbers of the sub-environments to reset.
 
         Returns:
-            Their infos.
+            The infos of the sub-environments that were reset.
 
         Raises:
-            BaseException: Whatever a simulation or a mapping raises. Unless nothing has moved, the row has ``failed``.
+            BaseException: Any error of a simulation or a mapping. The row has ``failed`` unless nothing has moved.
         """
         told: Told = []
         number = 0
@@ -159,10 +159,10 @@ class Row:
         return told
 
     def check(self, actions: Sequence[Any]) -> None:
-        """Check actions against what only the simulations know. Nothing moves.
+        """Check actions against the pending decisions. Nothing moves.
 
         Raises:
-            InvalidActionError: One is not legal. It says which.
+            InvalidActionError: An action is not legal. The message says which.
         """
         joint = self._common.joint
         for number, action in enumerate(actions):
@@ -180,16 +180,16 @@ class Row:
                 raise InvalidActionError(of_one(self._offset + number, error)) from None
 
     def step(self, actions: Sequence[Any]) -> Told:
-        """Answer all pending decisions, each with its action, and run each simulation to its next one.
+        """Answer all pending decisions, and run each simulation to its next decision.
 
         Args:
-            actions: An action for each sub-environment, checked.
+            actions: A checked action for each sub-environment.
 
         Returns:
-            Their infos, as far as there is something in them.
+            The infos that are not empty.
 
         Raises:
-            BaseException: Whatever a simulation or a mapping raises. Unless nothing has moved, the row has ``failed``.
+            BaseException: Any error of a simulation or a mapping. The row has ``failed`` unless nothing has moved.
         """
         told: Told = []
         begun = {number: self._again(number) for number in sorted(self.ended)}
@@ -197,7 +197,7 @@ class Row:
         if begun:
             moving = [number for number in moving if number not in begun]
         episodes: list[Any] = [self.sessions[number].episode for number in moving]
-        if None in episodes:  # its view was closed
+        if None in episodes:  # the view of a sub-environment was closed
             raise self.sessions[moving[episodes.index(None)]].refusal()
         self._move(moving, episodes, actions, first=-1 if begun else 0)
         rewards: Any = [0.0] * len(self.sessions)
@@ -250,7 +250,7 @@ class Row:
         return told
 
     def _end_of(self, episode: Episode) -> tuple[bool, bool] | None:
-        """Whether an episode has terminated, and was truncated, as its view tells it; None if it goes on."""
+        """The flags terminated and truncated of an episode, as its view reports them; None if it continues."""
         if self._agent in episode.ended and self._common.single:
             return True, False
         return (episode.terminated, episode.truncated) if episode.over else None
@@ -269,7 +269,7 @@ class Row:
                 raise
 
     def _begin(self, number: int, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode. Returns its first observation and info."""
+        """Begin an episode. Return its first observation and info."""
         joint, session = self._common.joint, self.sessions[number]
         episode = session.start(seed, options, When.DECISION if joint is None else When.RETURN)
         if self._shows:
@@ -288,12 +288,15 @@ class Row:
             raise
 
     def _fail(self, number: int, error: BaseException, first: int = -1) -> None:
-        """Tell which sub-environment an error is of; if anything has moved, all are to be reset.
+        """Add the number of the sub-environment to an error. Set ``failed`` if any simulation has moved.
 
-        ``first`` is the number of the one that was to move first.
+        Args:
+            number: The number of the sub-environment that has raised.
+            error: The error.
+            first: The number of the sub-environment that moves first.
         """
         annotate(error, f"simenv_marl: in sub-environment {self._offset + number}")
-        if number != first or not self._waits(self.sessions[number]):  # else nothing has moved
+        if number != first or not self._waits(self.sessions[number]):  # otherwise nothing has moved
             self.failed = True
 
     # -- views ------------------------------------------------------------------------------------
@@ -306,10 +309,10 @@ class Row:
         return self._views
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
-        """Call a method of each view, or get its attribute.
+        """Call a method of each view, or get an attribute of each.
 
         Raises:
-            BaseException: What a view raises.
+            BaseException: Any error of a view.
         """
         results = []
         for view in self.views:
@@ -328,8 +331,8 @@ class Row:
         """Unwind all simulations.
 
         Raises:
-            ReentrancyError, WrongThreadError: They cannot be ended from here, and go on.
-            BaseException: What the first simulation raises that raises anything; the others are unwound all the same.
+            ReentrancyError, WrongThreadError: The simulations cannot be ended from here, and continue.
+            BaseException: The first error that a simulation raises. The others are unwound nevertheless.
         """
         raised: BaseException | None = None
         for number, session in enumerate(self.sessions):
@@ -351,7 +354,7 @@ class Row:
 
     @property
     def suspended(self) -> bool:
-        """Whether a simulation still waits for an action, or something is still to be put back."""
+        """Whether an episode has not been ended, or patches have not been removed."""
         return not all(session.idle for session in self.sessions)
 
     @staticmethod
@@ -359,6 +362,6 @@ class Row:
         return session.episode is not None and session.episode.pending is not None
 
     def abandon(self) -> None:
-        """Unwind all simulations, from a finalizer: raises nothing."""
+        """Unwind all simulations, from a finalizer. Warn of errors instead of raising them."""
         for session in self.sessions:
             session.abandon()

@@ -1,7 +1,7 @@
-"""A process with some of the simulations of a vector environment: what it is made of, and its main loop.
+"""A worker process with some of the simulations of a vector environment: its recipe and its main loop.
 
-Between a worker and its user goes one message for all of its simulations, and one back. Observations, rewards and flags
-lie in memory that both see; observations of a kind that has no array go along with the message.
+The user sends one message for all simulations of a worker, and the worker sends one back. Observations, rewards and
+flags are in shared memory. Observations that do not form arrays are sent with the message.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ EXIT: Final = b""
 
 
 class _Unlocked:
-    """An array in shared memory without a lock, and so without a semaphore that a killed process could leave behind."""
+    """An array in shared memory without a lock. It needs no semaphore, which a killed process would leave behind."""
 
     def __init__(self, array: Any) -> None:
         self._array = array
 
     def get_obj(self) -> Any:
-        """The array, as Gymnasium asks for it."""
+        """Return the array. Gymnasium calls this method."""
         return self._array
 
 
 class _UnlockedContext:
-    """Makes such arrays, as a context of ``multiprocessing`` makes those with locks."""
+    """The part of a ``multiprocessing`` context that makes shared arrays, here without locks."""
 
     def __init__(self, context: Any) -> None:
         self._context = context
@@ -54,7 +54,7 @@ class _UnlockedContext:
 
 
 def is_shareable(space: spaces.Space[Any]) -> bool:
-    """Whether batches of a space are arrays of one size, and nothing else."""
+    """Whether batches of a space consist only of arrays of a fixed size."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         parts = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
         return all(map(is_shareable, parts))
@@ -62,7 +62,7 @@ def is_shareable(space: spaces.Space[Any]) -> bool:
 
 
 def _record_space(space: spaces.Space[Any]) -> spaces.Dict:
-    """The space of all that a simulation tells in a step."""
+    """Make the space of the results of one step of a simulation."""
     flag: Any = spaces.Box(0, 1, (), np.bool_)
     told: dict[str, Any] = {
         "rewards": spaces.Box(-np.inf, np.inf, (), np.float64), "terminations": flag, "truncations": flag,
@@ -71,12 +71,12 @@ def _record_space(space: spaces.Space[Any]) -> spaces.Dict:
 
 
 def share_memory(space: spaces.Space[Any], number: int, context: Any) -> Any:
-    """Make memory for what many simulations tell in a step.
+    """Make shared memory for the results of one step of many simulations.
 
     Args:
-        space: The observation space of one of them.
-        number: How many there are.
-        context: The context of ``multiprocessing`` whose processes share it.
+        space: The observation space of one simulation.
+        number: The number of simulations.
+        context: The ``multiprocessing`` context whose processes share the memory.
     """
     return create_shared_memory(_record_space(space), number, _UnlockedContext(context))  # type: ignore[arg-type]
 
@@ -86,9 +86,9 @@ def shared_batch(space: spaces.Space[Any], number: int, memory: Any, share: slic
 
     Args:
         space: The observation space of one simulation.
-        number: How many simulations there are.
-        memory: What ``share_memory`` has made.
-        share: The simulations of the batch; None: all.
+        number: The number of simulations.
+        memory: The memory that ``share_memory`` returned.
+        share: The simulations of the batch. None: all.
     """
     told: Any = read_from_shared_memory(_record_space(space), memory, number)
     share = slice(0, number) if share is None else share
@@ -101,7 +101,7 @@ def shared_batch(space: spaces.Space[Any], number: int, memory: Any, share: slic
 
 
 def _part(batch: Any, share: slice) -> Any:
-    """Some of the rows of batched observations, as views."""
+    """A part of the rows of batched observations, as array views."""
     if isinstance(batch, dict):
         return {key: _part(value, share) for key, value in batch.items()}
     if isinstance(batch, tuple):
@@ -109,12 +109,12 @@ def _part(batch: Any, share: slice) -> Any:
     return batch[share]
 
 
-# -- what goes to a worker ------------------------------------------------------------------------
+# -- the recipe of a worker -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What the simulations of a worker are made of, as it was given to ``vector_env``."""
+    """The arguments of ``vector_env`` from which a worker makes its simulations."""
 
     simulation: Any
     points: Any
@@ -122,11 +122,11 @@ class Recipe:
     view: str | None
 
     def plan(self) -> Plan:
-        """Draw up a plan of it."""
+        """Draw up a plan from the arguments."""
         return Plan.draw_up(self.simulation, self.points, self.options)
 
     def spelt_out(self, common: SubEnvironments) -> Recipe:
-        """The same, with what only this process could find out: which points are registered, which agents there are."""
+        """Add to the arguments what only this process can find out: the registered points and the agents."""
         points, options = self.points, self.options
         named = [named.point for named in common.plan._named]
         if points is None and [point.name for point in named] == decision_points():
@@ -153,17 +153,17 @@ def work(
     """The main function of a worker.
 
     Args:
-        pipe: To its user.
-        others: Ends of pipes that it has inherited and that are not its own.
+        pipe: The pipe to the user.
+        others: Ends of pipes that the worker has inherited and that belong to other processes.
         recipe: A pickled recipe.
-        memory: What both share.
-        number: How many simulations there are in all.
+        memory: The memory that the worker and the user share.
+        number: The number of simulations of all workers.
         first: The number of the worker's first simulation.
-        end: The number after that of its last one.
-        mode: When episodes that have ended begin anew.
+        end: The number after that of the worker's last simulation.
+        mode: When a new episode follows one that has ended.
     """
-    with suppress(ValueError):  # not in a main thread
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for its user, who then says what to do
+    with suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the user's process handles Ctrl-C, and ends the workers
     for other in others:
         other.close()
     row: Row | None = None
@@ -180,7 +180,7 @@ def work(
         _send(pipe, 0)
         while (message := pipe.recv_bytes()) != EXIT:
             _serve(pipe, row, message, sends_rows=not is_shareable(space))
-    except (EOFError, OSError):  # its user is gone
+    except (EOFError, OSError):  # the user's process has ended
         pass
     finally:
         if row is not None:

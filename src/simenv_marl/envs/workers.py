@@ -1,8 +1,8 @@
-"""Rows of simulations in processes of their own: how their user starts them, asks them, and brings them to an end.
+"""Rows of simulations in worker processes: how the user starts, asks and ends them.
 
-Nothing here can wait for ever: a wait for a worker also is one for its death, and a worker whose user is gone finds its
-pipe closed. The memory has no name and there are no semaphores, so that nothing is left behind even by a process that
-is killed.
+No wait here lasts for ever. A wait for a worker's answer also ends when the worker dies, and the pipe of a worker closes
+when its user ends. The shared memory has no name, and there are no semaphores. So even a killed process leaves nothing
+behind.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from .rows import SubEnvironments, Told
 from .worker import EXIT, Recipe, is_shareable, share_memory, shared_batch, work
 
 SECONDS_TO_CLOSE: Final = 10.0
-"""How long a worker may take to unwind its simulations and to end."""
+"""The seconds that a worker may take to unwind its simulations and to end."""
 
 
 class Worker:
     """A process with some of the simulations.
 
     Attributes:
-        first, end: The numbers of its simulations: from the first to before the end.
-        name: What it is called in messages.
+        first, end: The number of its first simulation, and the number after that of its last one.
+        name: Its name in messages.
     """
 
     def __init__(self, number: int, first: int, end: int) -> None:
@@ -45,13 +45,13 @@ class Worker:
 
     @property
     def there(self) -> bool:
-        """Whether it can be asked."""
+        """Whether the process was started and has not been ended."""
         return self._pipe is not None
 
     def start(
         self, context: Any, inherited: list[Connection], recipe: bytes, memory: Any, setup: dict[str, Any]
     ) -> None:
-        """Start the process. It tells when it is ready, or why it will not be."""
+        """Start the process. It sends a message when it is ready, or when it has failed."""
         ours, theirs = context.Pipe()
         setup = {**setup, "first": self.first, "end": self.end}
         forked = context.get_start_method() == "fork"
@@ -74,10 +74,10 @@ class Worker:
 
     @property
     def pipe(self) -> Connection:
-        """The pipe to it.
+        """The pipe to the worker.
 
         Raises:
-            WorkerError: It is dead.
+            WorkerError: The worker is dead.
         """
         if self._pipe is None:
             raise WorkerError(f"{self.name} is dead; reset() puts another one in its place")
@@ -85,28 +85,28 @@ class Worker:
 
     @property
     def sentinel(self) -> int:
-        """Becomes ready when the process ends."""
+        """The handle that becomes ready when the process ends."""
         return int(self._process.sentinel)
 
     def send(self, message: bytes) -> None:
-        """Send it a message.
+        """Send a message to the worker.
 
         Raises:
-            WorkerError: It is dead.
+            WorkerError: The worker is dead.
         """
         try:
             self.pipe.send_bytes(message)
         except OSError:
             raise self.died() from None
-        except BaseException:  # the message may be there in part
+        except BaseException:  # a part of the message may have been sent
             self.end_now()
             raise
 
     def receive(self) -> Any:
-        """Receive what it has sent.
+        """Receive a message from the worker.
 
         Raises:
-            WorkerError: It is dead.
+            WorkerError: The worker is dead.
         """
         try:
             return pickle.loads(self.pipe.recv_bytes())
@@ -117,16 +117,16 @@ class Worker:
             raise
 
     def died(self) -> WorkerError:
-        """Bury it; the error that says how it died."""
+        """Clean up after a dead worker. Return the error that says how it died."""
         process = self._process
-        process.join(1.0)  # its pipe closes a moment before it ends
+        process.join(1.0)  # the pipe closes a moment before the process ends
         code = process.exitcode
         self.end_now()
         how = "closed its pipe" if code is None else f"died with exit code {code}"
         script = (
             '. In a script, environments with workers are made under `if __name__ == "__main__":`, because each worker'
             " runs the script once more"
-            if code == 1  # of an error, before it could tell of one
+            if code == 1  # an error has ended it before it could send a message
             else ""
         )
         return WorkerError(
@@ -135,7 +135,7 @@ class Worker:
         )
 
     def end_now(self, seconds: float = 0.0) -> None:
-        """End the process, by force unless it ends by itself within some seconds."""
+        """End the process. Use force if it does not end by itself within some seconds."""
         process, pipe = self._process, self._pipe
         self._process = self._pipe = None
         if pipe is not None:
@@ -152,11 +152,11 @@ class Worker:
 
 
 class Workers:
-    """Rows in processes: used like a ``Row``.
+    """Rows in worker processes, with the interface of a ``Row``.
 
     Attributes:
-        failed: Whether an error has left some simulations where the others are not, and all are to be reset.
-        batch: What they write into.
+        failed: Whether an error has left the sub-environments out of step, so that all must be reset.
+        batch: The arrays into which the workers write their results.
     """
 
     def __init__(
@@ -165,9 +165,9 @@ class Workers:
         """Start the workers.
 
         Raises:
-            OptionValueError: There is no such context, or what the environment is made of cannot be pickled.
+            OptionValueError: There is no such context, or the arguments of the environment cannot be pickled.
             WorkerError: A worker died.
-            BaseException: What making a simulation raises.
+            BaseException: Any error of making a simulation.
         """
         self._context = _context(context)
         self._space, self._mode, self._number = common.single_observation_space, mode, number
@@ -195,7 +195,7 @@ class Workers:
             raise
 
     def _hire(self) -> None:
-        """Start the workers that are not there."""
+        """Start the workers that do not run."""
         new = [worker for worker in self._workers if not worker.there]
         if not new:
             return
@@ -206,11 +206,11 @@ class Workers:
         self._gather(new, 0)
 
     def _ask(self, method: str, arguments: Callable[[Worker], tuple[Any, ...] | None]) -> list[tuple[Worker, Any]]:
-        """Ask all workers for which there are arguments, and wait for their answers.
+        """Call a method of the rows of all workers for which there are arguments, and wait for the answers.
 
         Raises:
-            WorkerError: One is dead.
-            BaseException: What the first raises that raises anything.
+            WorkerError: A worker is dead.
+            BaseException: The error of the first worker that has raised one.
         """
         self._be_theirs()
         self._identity += 1
@@ -223,10 +223,10 @@ class Workers:
         return self._gather([worker for worker, _ in packed], self._identity)
 
     def _be_theirs(self) -> None:
-        """Make sure that this is the process that they talk to.
+        """Make sure that the workers belong to this process.
 
         Raises:
-            WorkerError: It is a fork of that.
+            WorkerError: This process is a fork of the one to which they belong.
         """
         if os.getpid() != self._process:
             raise WorkerError(
@@ -237,7 +237,7 @@ class Workers:
         """Wait for answers.
 
         Raises:
-            BaseException: What the first worker raises that raises anything.
+            BaseException: The error of the first worker that has raised one.
         """
         results, errors = self._collect(asked, identity)
         for worker in asked:
@@ -248,7 +248,7 @@ class Workers:
     def _collect(
         self, asked: list[Worker], identity: int, seconds: float | None = None
     ) -> tuple[dict[Worker, Any], dict[Worker, BaseException]]:
-        """Wait until all have answered, have died or have let some seconds go by. Returns results, and errors."""
+        """Wait until all workers have answered or died, or until a timeout. Return their results and their errors."""
         until = None if seconds is None else monotonic() + seconds
         results: dict[Worker, Any] = {}
         errors: dict[Worker, BaseException] = {}
@@ -261,14 +261,14 @@ class Workers:
                 if worker.pipe not in ready and worker.sentinel not in ready:
                     continue
                 try:
-                    if worker.pipe not in ready and not worker.pipe.poll():  # it has died, and has not answered before
+                    if worker.pipe not in ready and not worker.pipe.poll():  # died without an answer
                         raise worker.died()
                     answered, fine, answer = worker.receive()
                 except WorkerError as error:
                     errors[worker] = error
                     continue
                 if answered != identity:
-                    continue  # to what was asked before its user was interrupted
+                    continue  # the answer to a request whose wait was interrupted
                 if fine:
                     results[worker] = answer
                 else:
@@ -276,11 +276,11 @@ class Workers:
                     annotate(errors[worker], f"simenv_marl: in {worker.name}")
         return {worker: results[worker] for worker in asked if worker in results}, errors
 
-    # -- what a row does --------------------------------------------------------------------------
+    # -- the interface of a row -------------------------------------------------------------------
 
     @property
     def ended(self) -> set[int]:
-        """The numbers of those whose episode has ended and has not begun anew."""
+        """The numbers of the sub-environments whose episode has ended, with no new one begun."""
         batch = self.batch
         if self._mode == AutoresetMode.SAME_STEP or not (batch.terminations.any() or batch.truncations.any()):
             return set()
@@ -288,11 +288,11 @@ class Workers:
 
     @property
     def views(self) -> list[Any]:
-        """The environments of the simulations, which are not here."""
+        """Raise an error: the sub-environments are in other processes."""
         raise AttributeError("the sub-environments are in other processes; use call(), get_attr() and set_attr()")
 
     def reset(self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: Sequence[int]) -> Told:
-        """As ``Row.reset``, and start those workers anew that have died."""
+        """Do as ``Row.reset``, after a restart of the workers that have died."""
         self.failed = True
 
         def arguments(worker: Worker) -> tuple[Any, ...] | None:
@@ -305,11 +305,11 @@ class Workers:
         return told
 
     def check(self, actions: Sequence[Any]) -> None:
-        """As ``Row.check``."""
+        """Do as ``Row.check``."""
         self._ask("check", lambda worker: (actions[worker.first : worker.end],))
 
     def step(self, actions: Sequence[Any]) -> Told:
-        """As ``Row.step``."""
+        """Do as ``Row.step``."""
         self.failed = True
         told = self._told(self._ask("step", lambda worker: (actions[worker.first : worker.end],)))
         self.failed = False
@@ -326,18 +326,18 @@ class Workers:
         return told
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
-        """As ``Row.call``."""
+        """Do as ``Row.call``."""
         return [value for _, values in self._ask("call", lambda _: (name, args, kwargs)) for value in values]
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
-        """As ``Row.set_attr``."""
+        """Do as ``Row.set_attr``."""
         self._ask("set_attr", lambda worker: (name, values[worker.first : worker.end]))
 
     def close(self) -> None:
         """Unwind all simulations and end the workers, by force after some seconds.
 
         Raises:
-            BaseException: What the first simulation raises that raises anything; the others are unwound all the same.
+            BaseException: The first error that a simulation raises. The others are unwound nevertheless.
         """
         self._be_theirs()
         try:
@@ -351,20 +351,20 @@ class Workers:
             if len(results) + len(errors) < len(there):
                 warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are ended by force", ResourceWarning)
             for worker, error in errors.items():
-                if worker.there:  # else it has died, and there is nothing left to be closed
+                if worker.there:  # otherwise it has died, and nothing is left to close
                     raise error
         finally:
             self.abandon()
 
     @property
     def suspended(self) -> bool:
-        """Whether something is still to be ended here: nothing is."""
+        """Return False: no simulation runs in this process."""
         return False
 
     def abandon(self) -> None:
-        """End the workers; from a finalizer, too: raises nothing."""
+        """End the workers. A finalizer may call this; it raises no errors."""
         if os.getpid() != self._process:
-            return  # they are those of the process of which this is a fork
+            return  # the workers belong to the process of which this one is a fork
         for worker in self._workers:
             if worker.there:
                 with suppress(WorkerError):

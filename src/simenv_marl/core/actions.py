@@ -174,7 +174,7 @@ def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
 
         def cast(value: Any) -> Any:
             if not isinstance(value, (tuple, list)) or len(value) != len(parts):
-                raise MaskError(f"the mask {shown(value)} has not the {len(parts)} parts of {shown(space)}")
+                raise MaskError(f"the mask {shown(value)} must have the {len(parts)} parts of {shown(space)}")
             return tuple(part(item) for part, item in zip(parts, value, strict=True))
 
         return cast
@@ -188,7 +188,7 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
     def cast(value: Any) -> NDArray[np.int8]:
         mask = np.asarray(value)
         if mask.shape != shape:
-            raise MaskError(f"the mask {shown(value)} has shape {mask.shape} and not {shape}, as {shown(space)} asks")
+            raise MaskError(f"the mask {shown(value)} has shape {mask.shape}; {shown(space)} needs {shape}")
         if mask.dtype.char not in _ONE_BYTE:
             given, mask = mask, mask.astype(bool)
             if not (mask == given).all():

@@ -88,7 +88,8 @@ class AskingPolicy:
         session = self._session()
         if session is None:
             raise OptionValueError(
-                f"the policy {shown(self.policy)} asks for {ENVIRONMENT}, which there is not here: name it in policies="
+                f"the policy {shown(self.policy)} asks for {ENVIRONMENT}, but there is no environment to give it here;"
+                " pass the policy in policies="
             )
         episode = session.episode
         if episode.alone or PLANNING.get():

@@ -116,7 +116,7 @@ def _dict_cast(space: spaces.Dict) -> Cast:
         except (TypeError, KeyError):
             pass
         raise ObservationError(
-            f"the observation {shown(value)} has not just the keys {shown(sorted(casts))} of {shown(space)}"
+            f"the observation {shown(value)} must have exactly the keys {shown(sorted(casts))} of {shown(space)}"
         )
 
     return cast
@@ -127,7 +127,7 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
 
     def cast(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (tuple, list)) or len(value) != len(casts):
-            raise ObservationError(f"the observation {shown(value)} has not the {len(casts)} parts of {shown(space)}")
+            raise ObservationError(f"the observation {shown(value)} must have the {len(casts)} parts of {shown(space)}")
         return tuple(part(item) for part, item in zip(casts, value, strict=True))
 
     return cast

@@ -194,7 +194,8 @@ class BaseDriver:
         if self.given_up is None:
             self.given_up = (
                 f"refuses to end: it went on after {UNWINDING_TRIES} times SimulationExit was raised in it; it is left"
-                " suspended. Let it re-raise what it does not know; what is called back by C code needs a CallbackGuard"
+                " suspended. Let the model re-raise exceptions that it does not know; callbacks from C need a"
+                " CallbackGuard"
             )
         self.give_up()
         return problems
@@ -206,7 +207,7 @@ class BaseDriver:
 
     @property
     def children(self) -> Children:
-        """The threads and other resources that the simulation has opened, over all its episodes."""
+        """The threads, processes and sockets that the simulation has opened, over all its episodes."""
         if self._children is None:
             self._children = Children(self)
         return self._children

@@ -74,7 +74,7 @@ class OneAgentView(View, gym.Env[Any, Any]):
         """
         if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
             raise ViewError(
-                f"there are masks of Discrete and MultiDiscrete action spaces, and not of {self.action_space}; joint"
+                f"there are masks of Discrete and MultiDiscrete action spaces only, not of {self.action_space}; joint"
                 " environments of discrete actions have a MultiDiscrete with flatten=True"
             )
         masks = self._legal(self._running())

@@ -32,7 +32,7 @@ class AgentsView(View):
             SimEnvError: The plan does not work in this view.
         """
         if plan.options.padded and not plan.complete:
-            raise OptionValueError("padded=True needs a roster: say in possible_agents= who there may be")
+            raise OptionValueError("padded=True needs to know all agents: declare them in possible_agents=")
         super().__init__(plan)
         if plan.possible_agents is not None:
             self.possible_agents = plan.possible_agents

@@ -40,7 +40,7 @@ def run_job(driver: BaseDriver, job: Callable[[], Any], context: Context | None 
 
 
 class Spare:
-    """A simulation that a plan made for inspection, with its stack. The first environment takes both.
+    """A simulation that a plan made for inspection, with its stack, until an environment takes both.
 
     Attributes:
         kind: The driver's name.

@@ -18,7 +18,7 @@ from .loops import hush
 from .switch import SECONDS_TO_UNWIND, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
 
 _A_WHILE: Final = 1.0
-"""The seconds after which a wait of the user is interrupted. A Ctrl-C just before a wait would not interrupt it."""
+"""The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
 
 SIMULATION: Final = "simulation"
 """The name of the threads of simulations."""

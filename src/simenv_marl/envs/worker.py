@@ -163,7 +163,7 @@ def work(
         mode: When a new episode follows one that has ended.
     """
     with suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the user's process handles Ctrl-C, and ends the workers
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the user's process, which decides what to do
     for other in others:
         other.close()
     row: Row | None = None

@@ -1,8 +1,7 @@
 """Rows of simulations in worker processes: how the user starts, asks and ends them.
 
-No wait here lasts for ever. A wait for a worker's answer also ends when the worker dies, and the pipe of a worker closes
-when its user ends. The shared memory has no name, and there are no semaphores. So even a killed process leaves nothing
-behind.
+No wait here lasts for ever. A wait for an answer also ends when the worker dies, and a worker's pipe closes when its
+user ends. The shared memory has no name, and there are no semaphores. So even a killed process leaves nothing behind.
 """
 
 from __future__ import annotations

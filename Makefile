@@ -1,4 +1,4 @@
-# Each target does all of its own set-up: python3 with venv and pip is all it needs.
+# Each target does all of its own set-up; it needs only python3 with venv and pip.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -11,7 +11,7 @@ demo: .venv/.demo
 plan: .venv/.demo
 	$(BIN)/python -m examples.greenhouse_coop.plan
 
-# What has been run is not run again. MATRIX="--quick --out /tmp/matrix"
+# Runs only what is missing. MATRIX="--quick --out /tmp/matrix"
 matrix: .venv/.matrix
 	$(BIN)/python -m examples.greenhouse_coop.matrix $(MATRIX)
 
@@ -33,7 +33,8 @@ pension: .venv/.matrix
 coverage: .venv/.test
 	$(BIN)/python -m pytest --cov --cov-report=term
 
-# Small mistakes, put into a copy of the library one at a time: which of them does no test find? MUTANTS="--number 20"
+# Mutation tests: puts small mistakes into a copy of the library, one at a time, and reports which of them no test finds.
+# MUTANTS="--number 20"
 mutants: .venv/.test
 	$(BIN)/python -m tools.mutants $(MUTANTS)
 
@@ -41,7 +42,7 @@ soak: .venv/.test
 	$(BIN)/python -m benchmarks.soak --driver greenlet
 	$(BIN)/python -m benchmarks.soak --driver thread
 
-# Real learners. RLlib pins an older Gymnasium than the others want, and has an environment of its own.
+# Tests with real learners. RLlib pins an older Gymnasium than the others need, so it has its own virtual environment.
 test-clients: .venv-clients/.clients
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m pytest tests/clients \
 	    --ignore tests/clients/test_rllib.py --ignore tests/clients/test_supersuit.py
@@ -49,7 +50,7 @@ test-clients: .venv-clients/.clients
 test-rllib: .venv-rllib/.rllib
 	OMP_NUM_THREADS=1 RAY_USAGE_STATS_ENABLED=0 .venv-rllib/bin/python -m pytest tests/clients/test_rllib.py tests/clients/test_experiment.py
 
-# SuperSuit, and what wrappers of Gymnasium and PettingZoo want that make films, windows and tensors.
+# SuperSuit, and the dependencies of those wrappers of Gymnasium and PettingZoo that make videos, windows and tensors.
 test-wrappers: .venv-wrappers/.wrappers
 	OMP_NUM_THREADS=1 .venv-wrappers/bin/python -m pytest tests/clients/test_supersuit.py tests/envs/test_wrappers.py
 
@@ -58,7 +59,7 @@ test-wrappers: .venv-wrappers/.wrappers
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[$(subst .,,$(@F))]'
 	touch $@
 
-# The oldest versions of everything that this library builds on, with the tests of what happens when.
+# The oldest supported versions of all dependencies, with the tests of the order of events.
 OLDEST_TESTS := $(addprefix tests/contract/test_,$(addsuffix .py,conformance ends environments episodes errors goals_and_time identity \
 	joint many_agents rounds side_by_side simulate simulate_many)) \
 	tests/core/test_drivers.py tests/envs/test_vector.py tests/many/test_workers.py tests/test_definitions.py
@@ -93,7 +94,7 @@ test-pythons:
 	    "tests/contract tests/core tests/envs" \
 	    $(filter-out $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'),$(PYTHONS))
 
-# Local clusters, on the loopback address alone. Each has an environment of its own, because of what it pins.
+# Local clusters, on the loopback address only. Each has its own virtual environment, because of its pinned versions.
 test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 	.venv-dask/bin/python -m tests.clusters.check dask
 	RAY_USAGE_STATS_ENABLED=0 .venv-ray/bin/python -m tests.clusters.check ray
@@ -105,7 +106,7 @@ test-clusters: .venv-dask/.experiments .venv-ray/.experiments
 	$(@D)/bin/pip install --quiet --disable-pip-version-check --editable '.[experiments]' '$(CLUSTER)'
 	touch $@
 
-# Simulators outside Python: in C++, ns-3, Java and EnergyPlus. What cannot be installed here is told of, and left out.
+# Simulators outside Python: in C++, ns-3, Java and EnergyPlus. Reports and skips what cannot be installed here.
 test-outside: .venv/.test
 	sh tools/outside.sh
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[energyplus]' || \
@@ -128,7 +129,7 @@ docs: .venv/.test
 benchmark: .venv/.test
 	taskset -c 0 $(BIN)/python -m benchmarks.core
 
-# A marker for each set of dependencies: installed anew when what is asked for has changed.
+# A marker file for each set of dependencies: make installs them again when pyproject.toml has changed.
 .venv/.%: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[$*]'
@@ -137,14 +138,14 @@ benchmark: .venv/.test
 clean:
 	rm -rf .venv .venv-* .mutants build dist docs/_build
 
-# One policy for all sheep of Mesa's model: trained, compared, and drawn into docs/figures.
+# One policy for all sheep of Mesa's model: trains it, compares it, and writes the figures to docs/figures.
 .PHONY: wolf-sheep
 wolf-sheep: .venv-clients/.clients
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.train
 	OMP_NUM_THREADS=1 .venv-clients/bin/python -m examples.wolf_sheep.results
 	.venv-clients/bin/python -m examples.wolf_sheep.picture
 
-# The cooperative experiment, all of it: less than half an hour on two cores. What is done already is not done again.
+# The whole cooperative experiment: less than half an hour on two cores. Runs only what is missing.
 .PHONY: experiment
 EXPERIMENT := examples.greenhouse_coop.experiment
 EXPERIMENT_OUT ?= examples/greenhouse_coop/out/experiment

@@ -1,9 +1,9 @@
-"""A sweep of Mesa's own model of wealth, by Mesa's ``batch_run`` and by ``run_experiment``: lines, and seconds.
+"""A sweep of Mesa's wealth model, with Mesa's ``batch_run`` and with ``run_experiment``: lines of code, and seconds.
 
-How unequal are people in the end, depending on how many they are and how much room they have: a mean with its interval
-for each combination. The same seeds bring the same numbers. What a user writes are the functions ``by_...``: their
-lines are counted. Two processes are measured only where this is not pinned to one core: ``python -m benchmarks.core
---only batch_run``.
+The sweep measures the final inequality, depending on the number of people and on the space: a mean with its interval
+for each combination. The same seeds give the same numbers. A user would write the functions ``by_...``, whose lines are
+counted. Two processes are measured only if this is not pinned to one core: ``python -m benchmarks.core --only
+batch_run``.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ SEEDS = range(8)
 STEPS = 100
 
 ABLE = "n" in inspect.signature(BoltzmannWealth).parameters
-"""Whether ``batch_run`` can run this model of Mesa's: in Mesa 3.5 it cannot, which takes a scenario there."""
+"""Whether ``batch_run`` can run this model: it cannot in Mesa 3.5, where the model takes a scenario."""
 
 ROUNDS = 11
 
 
 def interval(values: Any) -> Any:
-    """Half the width of a mean's interval."""
+    """Return half the width of a mean's interval."""
     return 1.96 * values.sem()
 
 
@@ -70,16 +70,16 @@ def by_batch_run_resumed(store: Path) -> Any:
     return DataFrame(runs).groupby(["n", "width"])["Gini"].agg(["mean", interval])
 
 
-# -- how much that is, and how long it takes ------------------------------------------------------
+# -- lines and seconds ----------------------------------------------------------------------------
 
 
 def lines(*written: Any) -> int:
-    """How many lines these are, empty ones not counted."""
+    """Count the lines of functions, without empty ones."""
     return sum(bool(line.strip()) for thing in written for line in inspect.getsource(thing).splitlines())
 
 
 def stored(processes: int = 1) -> Any:
-    """By ``run_experiment``, in a folder that is thrown away."""
+    """Run the sweep with ``run_experiment``, in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
         return by_run_experiment(Path(folder), 0 if processes == 1 else processes)
 
@@ -88,11 +88,11 @@ WAYS: dict[str, Callable[[int], Any]] = {"batch_run": by_batch_run, "run_experim
 
 
 def taken(way: Callable[[int], Any], processes: int) -> Contender:
-    """The seconds that it takes: the processor's, where it is one process; else the wall clock's."""
+    """Make a contender: the seconds of a sweep, of the processor for one process, else of the wall clock."""
     clock = now if processes == 1 else time.perf_counter
 
     def run() -> float:
-        Agent._ids.clear()  # where Mesa's agents keep all models that there ever were
+        Agent._ids.clear()  # where Mesa's agents keep all earlier models alive
         gc.collect()
         start = clock()
         way(processes)
@@ -102,15 +102,15 @@ def taken(way: Callable[[int], Any], processes: int) -> Contender:
 
 
 def in_a_new_process(name: str) -> Contender:
-    """The seconds that two processes take in a process that has started no others before."""
+    """Make a contender: the seconds of two workers, started from a new process."""
     return lambda: float(alone("batch_run", name))
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure both.
+    """Compare both ways.
 
     Args:
-        rounds: How many rounds there are, at most.
+        rounds: The maximum number of rounds.
         number: Not used.
     """
     section, rounds = Section("A sweep of Mesa's model of wealth", "seconds"), min(rounds, ROUNDS)
@@ -132,7 +132,7 @@ def measure(rounds: int, number: int) -> Section:
 
 
 def main() -> None:
-    """One way in two processes: print its seconds."""
+    """Run one way in two processes, and print its seconds."""
     print(taken(WAYS[sys.argv[1]], 2)())
 
 

@@ -1,8 +1,8 @@
-"""What a branch costs beside the least that could do the same, and what two cores bring.
+"""The cost of a branch beside the minimum for the same task, and the speed-up by two cores.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only branches``. Times are the wall clock's, as
-branches are processes. They run one after the other, on one core, but for those on two cores, which are measured in a
-process of their own.
+Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only branches``. Times are wall-clock times,
+as branches are processes. They run one after another on one core, except for those on two cores, which are measured in
+a separate process.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from simenv_marl import branch, reseed_generators, single_env
 BRANCHES, STEPS = 20, 10
 
 MANY, MILLISECONDS = 64, 10.0
-"""Branches that are spread over two cores, and what each of them takes."""
+"""The number of branches that are spread over two cores, and the milliseconds of each."""
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds."""
+    """Measure in a number of rounds."""
     section = Section("Branches", f"milliseconds per branch of {STEPS} steps")
     rounds = max(3, rounds)
     env = single_env(Chancy, Model.left)
@@ -79,7 +79,7 @@ class Chancy(Alone):
 
 
 def some_steps(env: Any, number: int) -> float:
-    """What is done in each branch."""
+    """Take the steps of a branch."""
     step, total = env.step, 0.0
     for _ in range(STEPS):
         total += step(0)[1]
@@ -88,7 +88,7 @@ def some_steps(env: Any, number: int) -> float:
 
 @contextmanager
 def on(cores: set[int]) -> Iterator[None]:
-    """Have the process run on some cores, and as many branches at a time."""
+    """Pin the process to some cores, which also sets the number of parallel branches."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)
     try:
@@ -98,7 +98,7 @@ def on(cores: set[int]) -> Iterator[None]:
 
 
 def beside_open_files(env: Any) -> None:
-    """Branches while files are open: one that is read, a log, and one that is both read and written."""
+    """Run branches while three files are open: for reading, for appending, and for reading and writing."""
     with TemporaryDirectory() as folder, ExitStack() as files:
         for mode in ("r", "a", "r+"):
             path = Path(folder, mode)
@@ -108,7 +108,7 @@ def beside_open_files(env: Any) -> None:
 
 
 def timed_branches(run: Callable[[], Any], number: int = BRANCHES) -> Contender:
-    """A contender of so many branches."""
+    """Make a contender of a number of branches."""
 
     def timed() -> float:
         start = time.perf_counter()
@@ -119,7 +119,7 @@ def timed_branches(run: Callable[[], Any], number: int = BRANCHES) -> Contender:
 
 
 def bare(env: Any, number: int) -> Any:
-    """The same in a process that is forked by hand, and answers through a pipe."""
+    """Do the same in a process that is forked by hand and answers through a pipe."""
     reading, writing = os.pipe()
     process = os.fork()
     if process == 0:
@@ -134,17 +134,17 @@ def bare(env: Any, number: int) -> Any:
     return pickle.loads(received)
 
 
-# -- in a process of its own ----------------------------------------------------------------------
+# -- in a separate process ------------------------------------------------------------------------
 
 
 class Slow(Busy):
-    """A simulation that takes so many milliseconds for a decision."""
+    """A simulation that takes ``MILLISECONDS`` per decision."""
 
     nanoseconds = int(MILLISECONDS * 1e6)
 
 
 def cores(rounds: int) -> tuple[float, float, float]:
-    """How much faster branches are on two cores than one after the other; and the milliseconds of both."""
+    """Measure the speed-up of branches by two cores, and the milliseconds on one and on two."""
     env = single_env(Slow, Model.left)
     env.reset(seed=0)
     both = os.sched_getaffinity(0)

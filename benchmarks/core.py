@@ -1,7 +1,7 @@
-"""What it costs to leave a simulation in the lead: this library's views beside what they replace, in one run.
+"""The cost of a simulation that keeps its own loop: this library's views beside their alternatives, in one run.
 
-Run with ``make benchmark``, which pins it to one core. A section is a module with a function ``measure``; some
-can be run alone with ``--only``. Which source is measured says ``PYTHONPATH``.
+Run it with ``make benchmark``, which pins it to one core. A section is a module with a function ``measure``; ``--only``
+selects sections. ``PYTHONPATH`` determines which source is measured.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ SECTIONS = (
     "batch_run",
     "greenhouse",
 )
-"""In the order in which they run. The greenhouse comes last, and each is imported when it runs, because the
-greenhouse makes a ``difference()``, which stays."""
+"""The sections in the order in which they run. Each is imported when it runs, and the greenhouse comes last, because
+its module makes a ``difference()``, which stays in the process."""
 
 QUICK = {"rounds": 2, "number": 200}
-"""Enough to see that all of it runs."""
+"""Enough to check that all sections run."""
 
 
 def main() -> None:
-    """The command line."""
+    """Run the benchmarks from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS, help="sections to run (all)")
-    parser.add_argument("--rounds", type=int, default=31, help="how many rounds (%(default)s)")
+    parser.add_argument("--rounds", type=int, default=31, help="number of rounds (%(default)s)")
     parser.add_argument("--number", type=int, default=20_000, help="decisions per round (%(default)s)")
-    parser.add_argument("--quick", action="store_true", help="a smoke run, whose figures say nothing")
-    parser.add_argument("--write", type=Path, help="a Markdown file for the tables; a picture comes beside it")
+    parser.add_argument("--quick", action="store_true", help="a smoke test; its figures are meaningless")
+    parser.add_argument("--write", type=Path, help="a Markdown file for the tables; a figure is written beside it")
     parser.add_argument("--json", type=Path, help="a file for the figures")
     arguments = parser.parse_args()
     effort = QUICK if arguments.quick else {"rounds": arguments.rounds, "number": arguments.number}

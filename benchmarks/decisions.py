@@ -1,4 +1,4 @@
-"""What a decision costs in the AEC and the single view, beside what they replace."""
+"""The cost of a decision in the AEC and the single view, beside their alternatives."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from simenv_marl import aec_env, single_env
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many decisions of a contender in each."""
+    """Measure in a number of rounds, with a number of decisions of each contender."""
     model = Model()
     plain = Model.left.__wrapped__  # type: ignore[attr-defined]
     outside = side_by_side(
@@ -125,7 +125,7 @@ def _without_loop(outside: Times) -> Times:
 
 
 def dead_steps(env: Any, agents: int) -> Contender:
-    """``last`` and ``step`` of agents whose episode has ended."""
+    """Make a contender of ``last`` and ``step`` of agents whose episode has ended."""
 
     def prepare_and_run() -> float:
         env.reset(seed=0)
@@ -144,7 +144,7 @@ def dead_steps(env: Any, agents: int) -> Contender:
 
 
 def bare_greenlet() -> Any:
-    """A greenlet that only switches back; it waits for its first ``switch``."""
+    """Make a greenlet that only switches back; it waits for its first ``switch``."""
 
     def loop_in_greenlet() -> None:
         back = getcurrent().parent.switch
@@ -157,7 +157,7 @@ def bare_greenlet() -> Any:
 
 
 def round_trip(number: int) -> Contender:
-    """To a bare greenlet and back."""
+    """Make a contender of switches to a bare greenlet and back."""
     other = bare_greenlet()
 
     def loop(number: int) -> None:
@@ -174,7 +174,7 @@ def _nothing(number: int) -> None:
 
 
 def calls(function: Any, argument: Any, number: int) -> Contender:
-    """Calls of a function with one argument."""
+    """Make a contender of calls of a function with one argument."""
 
     def loop(number: int) -> None:
         for _ in range(number):

@@ -1,8 +1,8 @@
-"""What EnergyPlus keeps of its speed when its thermostats are agents.
+"""The speed of EnergyPlus when its thermostats are agents, relative to the plain run.
 
-Run with ``python -m benchmarks.energyplus``; it needs the extra ``energyplus``. With ``RULE`` throughout, so that what
-runs is the same simulation as without an environment. All of a run is counted: its making, the days on which EnergyPlus
-warms up, the days of the run, and its end.
+Run it with ``python -m benchmarks.energyplus``; it needs the extra ``energyplus``. All actions are ``RULE``, so that
+the simulation is the same as without an environment. The time is that of the whole run: set-up, EnergyPlus's warm-up
+days, the days of the run, and its end.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SEED = 3
 
 
 def measure(rounds: int) -> Section:
-    """Measure in so many rounds, of a run each."""
+    """Measure in a number of rounds, of one run each."""
     expected, decisions, _ = plain()
 
     def contender(run: Callable[[], tuple[str, int, float]]) -> Contender:
@@ -47,11 +47,11 @@ def measure(rounds: int) -> Section:
     return section
 
 
-# -- runs: each returns the results, how many decisions it took, and seconds -----------------------------------------
+# -- runs: each returns the results, the number of decisions, and seconds --------------------------------------------
 
 
 def plain() -> tuple[str, int, float]:
-    """The model by itself."""
+    """Run the model without an environment."""
     simulation = BuildingSim()
     started = now()
     simulation.reset(SEED)
@@ -62,7 +62,7 @@ def plain() -> tuple[str, int, float]:
 
 
 def aec(**options: Any) -> tuple[str, int, float]:
-    """An AEC environment, in the loop of PettingZoo's documentation."""
+    """Run an AEC environment, in the loop of PettingZoo's documentation."""
     env: Any = raw_env(**options)
     decisions = 0
     started = now()
@@ -79,12 +79,12 @@ def aec(**options: Any) -> tuple[str, int, float]:
 
 
 def threaded() -> tuple[str, int, float]:
-    """The same, in a thread of its own."""
+    """Run the same with the thread driver."""
     return aec(driver="thread")
 
 
 def rounds_of_both() -> tuple[str, int, float]:
-    """A parallel environment, all actions at once."""
+    """Run a parallel environment, with all actions at once."""
     env: Any = parallel_env()
     decisions = 0
     started = now()
@@ -97,7 +97,7 @@ def rounds_of_both() -> tuple[str, int, float]:
 
 
 def queues() -> tuple[str, int, float]:
-    """No environment: EnergyPlus in a thread, each decision over one queue and back over another."""
+    """Run EnergyPlus in a thread without an environment; decisions cross two queues."""
     simulation, asked, answered, rule = BuildingSim(), queue.Queue[Any](1), queue.Queue[Any](1), Zone.choose_setpoint
 
     def decide(zone: Zone) -> float:
@@ -128,7 +128,7 @@ def queues() -> tuple[str, int, float]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=20, help="how often each contender runs (20)")
+    parser.add_argument("--rounds", type=int, default=20, help="runs of each contender (20)")
     section = measure(parser.parse_args().rounds)
     for figure in section.ratios:
         print(*figure.row(), sep=" | ")

@@ -1,6 +1,6 @@
-"""What an experiment costs beside its model, what workers bring to it, and what it is worth to pair seeds.
+"""The overhead of an experiment, the speed-up by workers, and the benefit of paired seeds.
 
-Two workers are measured in a process pinned to two cores, where there are two.
+Two workers are measured in a process pinned to two cores, if there are two.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from simenv_marl import design, evaluate, run_experiment
 
 ROWS = 10_000
 WORK = 10e-3
-"""Seconds that a run of the slow model takes."""
+"""The seconds of a run of the slow model."""
 
 GENERATIONS = 15
-"""For how long the pair is trained: half a minute."""
+"""The generations of training of the pair: half a minute."""
 
 
 class Turn:
-    """A simulation that decides once, so that the machinery is all that remains."""
+    """A simulation with a single decision, so that only the overhead remains."""
 
     points = (f"{Model.__module__}.Model.left",)
 
@@ -46,7 +46,7 @@ class Turn:
 
 
 class SlowTurn(Turn):
-    """The same, after a while of work, of the processor."""
+    """The same after some processor time of work."""
 
     def run(self) -> None:
         end = time.thread_time() + WORK
@@ -56,7 +56,7 @@ class SlowTurn(Turn):
 
 
 def experiment(make: type, rows: int, workers: int) -> float:
-    """Seconds that an experiment takes, all of it; the processor's, where it is one process."""
+    """Measure the seconds of a whole experiment: processor time for one process, else wall-clock time."""
     table = design({"x": (0.0, 1.0), "n": (1, 1000)}, "sobol", rows)
     clock = time.perf_counter if workers else now
     with tempfile.TemporaryDirectory() as folder:
@@ -66,7 +66,7 @@ def experiment(make: type, rows: int, workers: int) -> float:
 
 
 def wall(rows: int, workers: int) -> float:
-    """The same of the slow model, by the wall clock."""
+    """Measure the same for the slow model, in wall-clock time."""
     table = design({"x": (0.0, 1.0), "n": (1, 1000)}, "sobol", rows)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
@@ -75,7 +75,7 @@ def wall(rows: int, workers: int) -> float:
 
 
 def widths(generations: int) -> tuple[float, float]:
-    """How wide the interval of the difference is, paired by seed and not: a trained pair against the best constants."""
+    """Measure the width of the interval of a difference, with paired and unpaired seeds."""
     with tqdm(disable=True) as bar, Crew(1, bar) as crew:
         trained = learn(crew.rate, BEST_CONSTANTS, generations, np.random.default_rng(0))
     contenders: dict[str, Any] = {"constants": BEST_CONSTANTS, "trained": trained}
@@ -95,12 +95,12 @@ def measure(rounds: int, number: int) -> Section:
     """Measure experiments.
 
     Args:
-        rounds: Not used: the many rows of one round are enough.
-        number: How many rows there are at most: a smoke run has few.
+        rounds: Not used, as the many rows of one round suffice.
+        number: The maximum number of rows; a smoke test has few.
     """
     rows = min(ROWS, number)
     section = Section("Experiments", "milliseconds per run, seconds")
-    experiment(Turn, min(rows, 200), 0)  # what is imported and looked up once
+    experiment(Turn, min(rows, 200), 0)  # warm-up of imports and caches
     overhead = experiment(Turn, rows, 0) / rows * 1e3
     section.ratio(f"milliseconds per run beside the model, {rows:,} rows, one process", overhead, 1.0, 0.3, 3)
     section.time("a run beside its model, milliseconds", overhead)

@@ -1,7 +1,7 @@
-"""What a decision costs beside a clock, a plugin that is not called, and what else is in use in the process.
+"""The cost of a decision with a clock, with a plugin that is not called, and beside other objects in the process.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only extras``. Each extra has a process of its
-own: a ``difference`` that was once made stays, and what one environment uses may be paid for by its neighbours.
+Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only extras``. Each extra has a separate
+process: a ``difference`` stays once it is made, and the features of one environment may slow down its neighbours.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from benchmarks.noop import DEFINITION, Alone, Model, Turns, aec, single
 from simenv_marl import aec_env, difference, expose_to_plugins, make_step, single_env
 
 GENERATIONS = 5
-"""How often the processes are started anew, because two that do the same differ by some percent."""
+"""How often the processes are restarted, because two equal processes differ by some per cent."""
 
 NEIGHBOURS = 1_000
-"""How many other environments, or decision points, make a crowd."""
+"""The number of other environments or decision points."""
 
 
 class TimedTurns(Turns):
@@ -37,7 +37,7 @@ class TimedAlone(Alone):
 
 @expose_to_plugins
 def idle() -> None:
-    """A function of the model that is not called while it is measured."""
+    """A function of the model that is not called during the measurement."""
 
 
 def nothing() -> None:
@@ -57,7 +57,7 @@ def plugin() -> dict[str, Any]:
 
 
 def elsewhere() -> dict[str, Any]:
-    """A ``difference`` that another environment uses, which stands in mid-episode."""
+    """Views beside a ``difference`` of another environment, which is in mid-episode."""
     rewarded = make_step(**DEFINITION | {"reward_mapping": difference(lambda model: 1.0)})
     other = single_env(Alone, {Model.left: rewarded})
     other.reset(seed=0)
@@ -65,7 +65,7 @@ def elsewhere() -> dict[str, Any]:
 
 
 def environments() -> dict[str, Any]:
-    """Very many other environments that stand in mid-episode."""
+    """Views beside very many other environments in mid-episode."""
     others = [single_env(Alone, Model.left) for _ in range(NEIGHBOURS)]
     for env in others:
         env.reset(seed=0)
@@ -73,7 +73,7 @@ def environments() -> dict[str, Any]:
 
 
 def points() -> dict[str, Any]:
-    """Very many other decision points."""
+    """Views beside very many other decision points."""
     return {**views(), "others": [other_point(number) for number in range(NEIGHBOURS)]}
 
 
@@ -86,7 +86,7 @@ def other_point(number: int) -> Any:
 
 
 def views(turns: type = Turns, alone: type = Alone, **options: Any) -> dict[str, Any]:
-    """An AEC and a single environment of the simulation that does nothing."""
+    """Make an AEC and a single environment of the no-op simulation."""
     return {
         "AEC": aec_env(turns, [Model.left, Model.right], **options),
         "single": single_env(alone, Model.left, **options),
@@ -105,7 +105,7 @@ HELD = ("AEC, with a clock", "AEC, with an idle plugin", "AEC, with a difference
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many decisions of a contender in each."""
+    """Measure in a number of rounds, with a number of decisions of each contender."""
     times: Times = {}
     generations = min(GENERATIONS, rounds)
     for _ in range(generations):
@@ -119,7 +119,7 @@ def measure(rounds: int, number: int) -> Section:
             times.setdefault(name, []).extend(values)
         for process in processes.values():
             process.close()
-    section = Section("What else is in use", "microseconds per decision")
+    section = Section("Additional features in use", "microseconds per decision")
     for name in times:
         view, _, extra = name.partition(", ")
         if extra != "without":
@@ -130,7 +130,7 @@ def measure(rounds: int, number: int) -> Section:
 
 
 def main(extra: str, number: int) -> None:
-    """Measure one extra when told to, in this process."""
+    """Measure one extra in this process, on request."""
     made = EXTRAS[extra]()
     serve({"AEC": aec(made["AEC"], number), "single": single(made["single"], number)})
 

@@ -1,4 +1,4 @@
-"""The greenhouse of the examples with and without an environment: the same mappings, the same days."""
+"""The speed of the example's greenhouse with and without an environment, with the same mappings and days."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from examples.greenhouse_coop.model import Greenhouse
 from benchmarks.measure import Contender, Section, now, ratio, side_by_side
 
 WATER = np.array([0.065], np.float32)
-"""An action that keeps the plants alive for the whole episode, so that all of its days are alike."""
+"""An action that keeps the plants alive for the whole episode, so that all days cost the same."""
 
 AIR = np.array([0.2], np.float32)
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, of an episode each."""
+    """Measure in a number of rounds, of one episode each."""
     times = side_by_side(
         {
             "watering, plain loop": plain_days(PlainWatering),
@@ -55,7 +55,7 @@ def measure(rounds: int, number: int) -> Section:
 
 
 class PlainWatering(Greenhouse):
-    """Evaluates the waterer's mappings where an environment would, and decides by itself."""
+    """A greenhouse that evaluates the waterer's mappings where an environment would, and takes a constant action."""
 
     def choose_water_amount(self) -> float:
         reward(self)

@@ -1,8 +1,8 @@
-"""What the environments of this library are measured against: environments written by hand.
+"""Environments written by hand, with which the benchmarks compare the environments of this library.
 
 The AEC environment has the bookkeeping of PettingZoo's documented template, the single one the parts of
-Gymnasium's (``_get_obs``, ``_get_info``); ``BareEnv`` has not even these. All of them are no-op simulations
-with an observation of four float32 and a reward of 1.0, which never end.
+Gymnasium's (``_get_obs``, ``_get_info``); ``BareEnv`` does not even have these. All of them are no-op simulations
+without an end, with an observation of four float32 and a reward of 1.0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ACTION_SPACE = spaces.Discrete(2)
 
 
 class State:
-    """All there is in a no-op simulation."""
+    """The state of a no-op simulation."""
 
     def __init__(self) -> None:
         self.values = np.array([0.1, 0.2, 0.3, 0.4], np.float32)
@@ -32,7 +32,7 @@ class State:
         return np.array(self.values)
 
     def act(self, action: int) -> None:
-        """Do what an action says, which is nothing."""
+        """Apply an action, which does nothing."""
 
 
 class TemplateAECEnv(AECEnv[str, Any, Any]):
@@ -89,10 +89,10 @@ class TemplateAECEnv(AECEnv[str, Any, Any]):
         self._accumulate_rewards()
 
     def render(self) -> None:
-        """Nothing to be seen."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing to be closed."""
+        """Do nothing."""
 
 
 class TemplateEnv(gym.Env[Any, Any]):
@@ -124,17 +124,17 @@ class TemplateEnv(gym.Env[Any, Any]):
 
 
 class BareEnv(TemplateEnv):
-    """The least that a Gymnasium environment can do."""
+    """The minimal Gymnasium environment."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         return np.array(self.model.values), 1.0, False, False, {}
 
 
-# -- other ways to leave a simulation in the lead --------------------------------------------------
+# -- other ways to let a simulation keep its own loop ----------------------------------------------
 
 
 class GeneratorEnv(TemplateEnv):
-    """The simulation is a generator that yields at its decisions: quick, but every frame above must, too."""
+    """The simulation is a generator that yields at its decisions: fast, but all its callers must be generators, too."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.simulation = self._run()
@@ -149,7 +149,7 @@ class GeneratorEnv(TemplateEnv):
 
 
 class ThreadEnv(TemplateEnv):
-    """The simulation runs in a thread and takes turns with its user."""
+    """The simulation runs in a thread and alternates with its user."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.over = False
@@ -177,7 +177,7 @@ class ThreadEnv(TemplateEnv):
 
 
 class EventEnv(ThreadEnv):
-    """Takes turns by two events, as the original does."""
+    """Alternation by two events, as in the original Sim-Env."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -199,7 +199,7 @@ class EventEnv(ThreadEnv):
 
 
 class LockEnv(ThreadEnv):
-    """Takes turns by two locks."""
+    """Alternation by two locks."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,7 +1,7 @@
-"""What it brings to have policies answer many simulations at once, and to have several processes share the work.
+"""The speed-up by policies that answer many simulations at once, and by several processes that share the work.
 
-Run with ``make benchmark``, which is pinned to one core, or alone with ``python -m benchmarks.core --only many``, not
-pinned, for what several processes bring. Torch is measured where it is installed.
+Run it with ``make benchmark``, which is pinned to one core; or alone and not pinned, with ``python -m benchmarks.core
+--only many``, for the speed-up by several processes. Torch is measured if it is installed.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from simenv_marl import simulate, simulate_many
 
 SIMULATIONS, DECISIONS = 1000, 100
 FEW = 128
-"""Simulations of which all fit into a processor's cache."""
+"""A number of simulations that fit into the processor's cache."""
 SLOWLY = 100e-6
-"""Seconds that a decision of the slow simulation takes."""
+"""The seconds of a decision of the slow simulation."""
 
 
 class Turns:
-    """A simulation that does nothing but decide, so that the machinery is all that remains."""
+    """A simulation that only makes decisions, so that only the overhead remains."""
 
     def reset(self) -> None:
         self.model = Model()
@@ -39,7 +39,7 @@ class Turns:
 
 
 class SlowTurns(Turns):
-    """The same, and every decision is followed by a while of work."""
+    """The same with some work after each decision."""
 
     def run(self) -> None:
         for _ in range(DECISIONS // 10):
@@ -50,7 +50,7 @@ class SlowTurns(Turns):
 
 
 def perceptron() -> list[tuple[Any, Any]]:
-    """The weights of a network with two hidden layers of 64."""
+    """Draw the weights of a network with two hidden layers of 64."""
     generator = np.random.default_rng(0)
     sizes = (OBSERVATION_SPACE.shape[0], 64, 64, int(ACTION_SPACE.n))
     return [
@@ -59,7 +59,7 @@ def perceptron() -> list[tuple[Any, Any]]:
 
 
 def numpy_policy() -> Callable[[Any], Any]:
-    """A policy of one observation or of many."""
+    """Make a policy for one observation or a batch."""
     (w0, b0), (w1, b1), (w2, b2) = perceptron()
 
     def policy(observations: Any) -> Any:
@@ -70,7 +70,7 @@ def numpy_policy() -> Callable[[Any], Any]:
 
 
 def torch_policy() -> Callable[[Any], Any] | None:
-    """The same with torch; None where that is not installed."""
+    """Make the same policy with Torch; None if it is not installed."""
     try:
         import torch
     except ImportError:
@@ -91,7 +91,7 @@ def torch_policy() -> Callable[[Any], Any] | None:
 
 
 def zeros(observations: Any) -> Any:
-    """A policy that costs nothing."""
+    """Choose action 0: a policy without cost."""
     return np.zeros(len(observations), np.int64)
 
 
@@ -128,11 +128,11 @@ def slowly(policy: Callable[[Any], Any], number: int, workers: int) -> Contender
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure many simulations: pinned to one core, the policies; else, the processes.
+    """Measure many simulations: the policies if pinned to one core, else the processes.
 
     Args:
-        rounds: How many rounds, at most; a few are enough here.
-        number: Not used: there are always as many decisions as a thousand simulations make.
+        rounds: The maximum number of rounds; a few suffice here.
+        number: Not used: the decisions are always those of a thousand simulations.
     """
     section = Section("Many simulations", "microseconds per decision")
     if (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) == 1:

@@ -1,7 +1,7 @@
 """Measuring side by side: all contenders in turn, many rounds, medians of the ratios within a round.
 
-A machine that is slow for a while is slow for all contenders of a round, so that ratios stand where times
-do not. Time is the processor's, of all threads of a process; where processes share the work, the wall clock's.
+A machine that is slow for a while is slow for all contenders of a round, so ratios are reliable where times are not.
+Times are processor times of all threads of a process, or wall-clock times where processes share the work.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from rich.console import Console
 from rich.table import Table
 
 Contender = Callable[[], float]
-"""Runs once; returns microseconds per decision (or whatever is compared)."""
+"""Runs once; returns microseconds per decision (or another quantity to compare)."""
 
 Times = dict[str, list[float]]
 
 now = time.process_time
-"""The clock of all contenders but those that are several processes: what else runs on the machine is not counted."""
+"""The clock of all contenders except those of several processes; it does not count other programs on the machine."""
 
 ROOT = Path(__file__).parent.parent
 
@@ -39,7 +39,7 @@ PACKAGES = ("greenlet", "gymnasium", "pettingzoo", "mesa", "numpy")
 
 
 def timed(loop: Callable[[int], None], number: int, clock: Callable[[], float] = now) -> Contender:
-    """Make a contender of a loop that is told how often to go round."""
+    """Make a contender from a loop that takes the number of iterations."""
 
     def run() -> float:
         start = clock()
@@ -51,7 +51,7 @@ def timed(loop: Callable[[int], None], number: int, clock: Callable[[], float] =
 
 @contextmanager
 def without_collections() -> Iterator[None]:
-    """No garbage collection, which would fall to some contenders and not to others."""
+    """Disable garbage collection, which would hit some contenders and not others."""
     gc.collect()
     gc.disable()
     try:
@@ -61,7 +61,7 @@ def without_collections() -> Iterator[None]:
 
 
 def side_by_side(contenders: Mapping[str, Contender], rounds: int) -> Times:
-    """Run all contenders in turn, as many rounds as asked, after one round that does not count."""
+    """Run all contenders in turn for a number of rounds, after one warm-up round."""
     times: Times = {name: [] for name in contenders}
     with without_collections():
         for number in range(rounds + 1):
@@ -73,15 +73,15 @@ def side_by_side(contenders: Mapping[str, Contender], rounds: int) -> Times:
 
 
 def ratio(times: Times, over: str, *under: str) -> float:
-    """The median over the rounds of one contender's time over the sum of others'."""
+    """Compute the median over rounds of one contender's time divided by the sum of others' times."""
     sums = zip(*(times[name] for name in under), strict=True)
     return statistics.median(top / sum(bottom) for top, bottom in zip(times[over], sums, strict=True))
 
 
 class Elsewhere:
-    """Contenders in a process of their own, which take their turns like any others.
+    """Contenders in another process, which take turns like all others.
 
-    For what all that is in a process may have to pay for. The other process is a module that calls ``serve``.
+    This is for effects on everything else in a process. The other process runs a module that calls ``serve``.
     """
 
     def __init__(self, module: str, *arguments: str) -> None:
@@ -94,7 +94,7 @@ class Elsewhere:
         )
 
     def contender(self, name: str) -> Contender:
-        """Make a contender of the one that has this name over there."""
+        """Make a contender from the one of this name in the other process."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         asking, told = self._process.stdin, self._process.stdout
@@ -111,7 +111,7 @@ class Elsewhere:
 
 
 def alone(section: str, *arguments: str, cores: str | None = None) -> Any:
-    """Measure something in a process that has done nothing before: a section's, which prints JSON."""
+    """Measure something in a new process, which runs a section's module and prints JSON."""
     command = [sys.executable, "-m", f"benchmarks.{section}", *arguments]
     if cores is not None:
         command = ["taskset", "-c", cores, *command]
@@ -120,7 +120,7 @@ def alone(section: str, *arguments: str, cores: str | None = None) -> Any:
 
 
 def serve(contenders: Mapping[str, Contender]) -> None:
-    """Run each contender whose name is read, until there is none left: the other side of ``Elsewhere``."""
+    """Run the contenders whose names arrive on standard input: the other side of ``Elsewhere``."""
     with without_collections():
         for line in sys.stdin:
             print(contenders[line.strip()](), flush=True)
@@ -128,14 +128,14 @@ def serve(contenders: Mapping[str, Contender]) -> None:
 
 @dataclass(frozen=True)
 class Figure:
-    """One ratio (or whatever else is held to something).
+    """One ratio, or another quantity with a target.
 
     Attributes:
-        what: What was compared.
-        value: What came out, rounded to what is shown.
-        bar, aim: What the project holds itself to, and what would be better; None for neither.
-        digits: How many decimals are shown.
-        at_least: Whether more is better; else less is.
+        what: The description.
+        value: The value, rounded to ``digits``.
+        bar, aim: The project's limit, and its better target; None for neither.
+        digits: The number of decimals.
+        at_least: Whether higher values are better; else lower ones are.
     """
 
     what: str
@@ -147,7 +147,7 @@ class Figure:
 
     @property
     def verdict(self) -> str:
-        """Which of the two it reaches."""
+        """Whether the value reaches the aim, the bar or neither."""
         sign = -1 if self.at_least else 1
         if self.bar is None:
             return ""
@@ -156,21 +156,21 @@ class Figure:
         return "bar" if sign * self.value <= sign * self.bar else "missed"
 
     def row(self) -> list[str]:
-        """The row of a table."""
+        """Return the row of a table."""
         sign = "≥" if self.at_least else "≤"
         limits = ["" if limit is None else f"{sign} {limit:g}" for limit in (self.bar, self.aim)]
         return [self.what, f"{self.value:.{self.digits}f}", *limits, self.verdict]
 
 
 class Section:
-    """What one module has measured: ratios, with what the project holds itself to, and the times behind them.
+    """The results of one module: ratios, with the project's limits, and the times behind them.
 
     Attributes:
-        title: What it is about.
-        unit: What the times are.
-        ratios: The rows of its first table.
-        medians: Those of its second: times by what took them.
-        remarks: What else is to be said.
+        title: The title.
+        unit: The unit of the times.
+        ratios: The rows of the first table.
+        medians: The rows of the second table: times by their description.
+        remarks: Additional remarks.
     """
 
     def __init__(self, title: str, unit: str) -> None:
@@ -189,7 +189,7 @@ class Section:
         *,
         at_least: bool = False,
     ) -> None:
-        """Add a ratio; its bar, if it is to stay below (or above) one; and what it would better be."""
+        """Add a ratio, with its bar (the limit) and its aim (the better target), if it has them."""
         self.ratios.append(Figure(what, round(value, digits), bar, aim, digits, at_least))
 
     def time(self, what: str, value: float) -> None:
@@ -203,7 +203,7 @@ class Section:
 
 
 class Report:
-    """Tables for the terminal and, the same, in Markdown; and figures for programs."""
+    """The report: the same tables for the terminal and in Markdown, and JSON for programs."""
 
     def __init__(self, title: str) -> None:
         self._console = Console()
@@ -218,11 +218,11 @@ class Report:
 
     @property
     def times(self) -> dict[str, float]:
-        """All times so far, by what took them."""
+        """All times so far, by their description."""
         return {what: time for section in self._sections for what, time in section.medians.items()}
 
     def add(self, section: Section) -> None:
-        """Tell what a section has measured."""
+        """Add a section, and print its results."""
         self._sections.append(section)
         for table in _tables(section):
             self._print(*table)
@@ -230,12 +230,12 @@ class Report:
             self._console.print(remark)
 
     def conclude(self) -> None:
-        """Tell what has become of all that is held to a bar."""
+        """Print all figures that have a bar."""
         self._print(*self._held())
 
     def _held(self) -> tuple[str, list[str], list[list[str]]]:
         figures = [figure for section in self._sections for figure in section.ratios if figure.bar is not None]
-        return "What the project holds itself to", COLUMNS, [figure.row() for figure in figures]
+        return "Targets of the project", COLUMNS, [figure.row() for figure in figures]
 
     def _print(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
         table = Table(*columns, title=title)
@@ -255,7 +255,7 @@ class Report:
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def dump(self, path: Path) -> None:
-        """Write all ratios and times as JSON: by section, and by what was measured."""
+        """Write all ratios and times as JSON, by section and description."""
         figures = {
             section.title: {
                 "ratios": {figure.what: figure.value for figure in section.ratios},
@@ -267,7 +267,7 @@ class Report:
 
 
 def _tables(section: Section) -> Iterator[tuple[str, list[str], list[list[str]]]]:
-    """Title, columns and rows of a section's tables."""
+    """Yield title, columns and rows of a section's tables."""
     if section.ratios:
         yield f"{section.title}: ratios", COLUMNS, [figure.row() for figure in section.ratios]
     rows = [[what, f"{value:.2f}" if value >= 0.1 else f"{value:.3f}"] for what, value in section.medians.items()]

@@ -1,4 +1,4 @@
-"""Simulations that do nothing, so that the machinery is all that remains; and loops over environments of them."""
+"""No-op simulations, so that only the overhead remains, and loops over their environments."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Alone(Turns):
 
 
 class Busy(Alone):
-    """One agent, whose simulation takes its time, of the processor."""
+    """One agent, whose simulation takes processor time."""
 
     nanoseconds = 0
 
@@ -101,7 +101,7 @@ class AloneBy(Turns):
 
 
 class Entity(State):
-    """One of many, an agent of its own."""
+    """One of many entities, each of which is an agent."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ class Entity(State):
 
 
 class Crowd:
-    """Many agents, round after round; without an end, or for one round."""
+    """Many agents, in rounds; without an end, or for a number of rounds."""
 
     def __init__(self, size: int, rounds: int | None = None) -> None:
         self.size, self.rounds = size, rounds
@@ -147,7 +147,7 @@ class CrowdBy(Crowd):
 
 
 class ForetoldCrowd(Crowd):
-    """Many agents, and it knows who is going to decide."""
+    """Many agents, with ``expected_calls``."""
 
     def expected_calls(self, point: str) -> list[tuple[Entity]]:
         return [(entity,) for entity in self.entities]
@@ -157,7 +157,7 @@ class ForetoldCrowd(Crowd):
 
 
 def last_and_step(env: Any) -> Callable[[int], None]:
-    """A loop of ``last`` and ``step`` of an AEC environment that does not end."""
+    """Make a loop of ``last`` and ``step`` of an AEC environment that does not end."""
     env.reset(seed=0)
 
     def loop(number: int) -> None:
@@ -170,12 +170,12 @@ def last_and_step(env: Any) -> Callable[[int], None]:
 
 
 def aec(env: Any, number: int) -> Contender:
-    """The same, timed."""
+    """Make a contender of this loop."""
     return timed(last_and_step(env), number)
 
 
 def single(env: Any, number: int) -> Contender:
-    """``step`` of a Gymnasium environment that does not end."""
+    """Make a contender of ``step`` of a Gymnasium environment that does not end."""
     env.reset(seed=0)
 
     def loop(number: int) -> None:

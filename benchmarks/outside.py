@@ -1,8 +1,8 @@
-"""What a decision costs that a simulator in another process asks for, beside the least that a pipe and JSON cost.
+"""The cost of a decision for a simulator in another process, beside the minimum for a pipe and JSON.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only outside``. It takes a compiler for C++.
-The time is the processor's, of both processes, which take turns on one core. What two cores bring is measured beside
-it, by the wall clock.
+Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only outside``. It needs a C++ compiler.
+Times are processor times of both processes, which alternate on one core. The effect of two cores is measured as well,
+in wall-clock time.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ TURN = make_step(
     agent=lambda call: call.entity,
 )
 
-OURS, BARE, PLAIN = "AEC, C++", "a line of JSON to and fro", "the plain C++"
+OURS, BARE, PLAIN = "AEC, C++", "a JSON round trip", "the plain C++"
 
 
 class PingPong:
-    """A process that sends a line for each line that it gets, and nothing more on either side than JSON."""
+    """A process that answers each line with a line; both sides only read and write JSON."""
 
     def __init__(self, program: Path) -> None:
         theirs_in, self._out = os.pipe()
@@ -51,7 +51,7 @@ class PingPong:
             os.close(descriptor)
 
     def play(self, number: int) -> None:
-        """So many lines."""
+        """Exchange a number of lines."""
         loads, dumps, reading, writing = json.loads, json.dumps, self._in, self._out
         for _ in range(number):
             frame = loads(os.read(reading, 65536))
@@ -65,7 +65,7 @@ class PingPong:
 
 
 def compiled(name: str, folder: str) -> Path:
-    """A program, compiled."""
+    """Compile a program."""
     program = Path(folder) / name
     sources = [f"-I{ROOT / 'clients' / 'cpp'}", str(ROOT / "benchmarks" / "cpp" / f"{name}.cpp")]
     subprocess.run([str(COMPILER), "-std=c++17", "-O2", *sources, "-o", str(program)], check=True, timeout=300)
@@ -73,18 +73,18 @@ def compiled(name: str, folder: str) -> Path:
 
 
 def children() -> set[int]:
-    """The processes that this one has started."""
+    """Return the child processes of this process."""
     return {int(process) for process in Path(f"/proc/self/task/{os.getpid()}/children").read_text("ascii").split()}
 
 
 def processors(process: int) -> Callable[[], float]:
-    """A clock of the processor's time that this process and another one take."""
-    clock = ~process << 3 | 2  # the number of the clock of a process, as Linux has it
+    """Make a clock of the processor time of this process and another one."""
+    clock = ~process << 3 | 2  # Linux's number of the clock of a process
     return lambda: time.process_time() + time.clock_gettime(clock)
 
 
 def compared(rounds: int, number: int, *, wall: bool = False) -> Times:
-    """Compare the AEC view of the process that asks with the other process, and with the same program by itself."""
+    """Compare the AEC view of a simulator process with the bare process and with the same program alone."""
     with TemporaryDirectory() as folder:
         noop, bare = compiled("noop", folder), PingPong(compiled("echo", folder))
         env = aec_env(ProcessSimulation([noop], {"noop.turn": TURN}))
@@ -106,13 +106,13 @@ def compared(rounds: int, number: int, *, wall: bool = False) -> Times:
 
 
 def over_the_plain(times: Times) -> float:
-    """By how much a decision takes longer than without an environment, in units of a line to and fro."""
+    """Compute the additional time of a decision in an environment, in units of a JSON round trip."""
     over = [ours - plain for ours, plain in zip(times[OURS], times[PLAIN], strict=True)]
     return ratio({OURS: over, BARE: times[BARE]}, OURS, BARE)
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many decisions of a contender in each."""
+    """Measure in a number of rounds, with a number of decisions of each contender."""
     section = Section("A simulator in another process", "microseconds per decision")
     if COMPILER is None:
         section.remarks.append("A simulator in another process: no compiler for C++, so that nothing was measured.")
@@ -120,7 +120,7 @@ def measure(rounds: int, number: int) -> Section:
     number = max(number // 10, 100)
     with on({min(os.sched_getaffinity(0))}):
         times = compared(rounds, number)
-    section.ratio("AEC, C++, over the plain C++ / a line of JSON to and fro", over_the_plain(times), 1.6, 1.3)
+    section.ratio("AEC, C++, over the plain C++ / a JSON round trip", over_the_plain(times), 1.6, 1.3)
     if (os.cpu_count() or 1) > 1:
         apart, ours, bare = alone("outside", str(min(rounds, 9)), str(number), cores="0,1")
         section.ratio("the same on two cores, by the wall clock", apart)
@@ -131,7 +131,7 @@ def measure(rounds: int, number: int) -> Section:
 
 
 def main(rounds: int, number: int) -> None:
-    """Measure by the wall clock, on all cores that this process has."""
+    """Measure in wall-clock time, on all cores of this process."""
     times = compared(rounds, number, wall=True)
     print(json.dumps([over_the_plain(times), *(statistics.median(times[name]) for name in (OURS, BARE))]))
 

@@ -1,7 +1,7 @@
-"""What premium decisions of ten thousand clients add to a pension fund, beside what moves of sheep add to a meadow.
+"""The overhead of premium decisions of ten thousand clients, beside the overhead of moves in Mesa's wolf-sheep model.
 
-The model's rule decides throughout. What is compared is what a decision *adds*: microseconds behind an AEC environment
-less those of the plain model, for the fund and for Mesa's wolves and sheep, in the same round.
+The model's rule makes all decisions. The comparison is of the time that a decision *adds*: microseconds in an AEC
+environment less those of the plain model, for the fund and for Mesa's wolves and sheep, in the same round.
 
 An agent's first decision and its end cost more than the decisions between them. The fund runs for ten years, so that a
 client decides about as often (7.5 times) as an animal (9.5 times).
@@ -40,10 +40,10 @@ AS_SHEEP = replace(
     action_mask_mapping=None,
     rule_action_mapping=None,
 )
-"""The same decision, observed and rewarded as a sheep's is in its benchmark."""
+"""The same decision, with observation and reward like a sheep's in its benchmark."""
 
 MASKED = replace(PREMIUM, rule_action_mapping=None)
-"""The same decision with all mappings but the one for those who learn from the rule."""
+"""The same decision with all mappings but ``rule_action_mapping``."""
 
 DEFINITIONS = {
     "mappings as for sheep": AS_SHEEP,
@@ -53,7 +53,7 @@ DEFINITIONS = {
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, of an episode each."""
+    """Measure in a number of rounds, of one episode each."""
     expected, _ = plain()
     decisions = aec(PREMIUM)[2]
     sheep = wolf_sheep.crossing()[1]
@@ -114,7 +114,7 @@ def measure(rounds: int, number: int) -> Section:
 
 
 def plain() -> tuple[Any, float]:
-    """The model by itself."""
+    """Run the model without an environment."""
     simulation = FundSim(YEARS, FUND)
     simulation.reset(SEED)
     started = now()
@@ -124,7 +124,7 @@ def plain() -> tuple[Any, float]:
 
 
 def called(definition: Any) -> tuple[Any, float]:
-    """The model without an environment, which calls the mappings of a definition at each decision."""
+    """Run the model without an environment, and call the mappings of a definition at each decision."""
     rule = Company.set_premium
 
     def decide(company: Any, client: Any) -> float:
@@ -141,7 +141,7 @@ def called(definition: Any) -> tuple[Any, float]:
 
 
 def aec(definition: Any) -> tuple[Any, float, int]:
-    """An AEC environment, in the shortest loop."""
+    """Run an AEC environment, in the shortest loop."""
     env: Any = aec_env(FundSim(YEARS, FUND), {POINT: definition})
     env.reset(seed=SEED)
     decisions = 0
@@ -159,6 +159,6 @@ def aec(definition: Any) -> tuple[Any, float, int]:
 
 
 def outcome(simulation: FundSim) -> Any:
-    """All that the decisions of a run have led to, in short."""
+    """Summarise the state at the end of a run."""
     fund = simulation.fund
     return fund.company.cents, fund.world.counts, fund.world.ledger.flows, fund.people.getstate()

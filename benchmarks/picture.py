@@ -1,4 +1,4 @@
-"""The picture of what many simulations cost: microseconds for each, by how many there are."""
+"""The figure of the cost of many simulations: microseconds per simulation, by their number."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ OTHERS = {"a thread with queues for each, 64": ("a thread with queues for each",
 
 
 def draw(times: Mapping[str, float], path: Path) -> None:
-    """Draw what the sections on vector environments and on what they replace have measured.
+    """Draw the results of the sections on vector environments and on suspended simulations.
 
     Args:
-        times: The times of both, by what took them.
-        path: Where to put it.
+        times: The times of both sections, by their description.
+        path: The file to write.
     """
     figure = Figure(figsize=(7.2, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
     axes = figure.add_subplot()
     for name, colour in COLOURS.items():
         points = [

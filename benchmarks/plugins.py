@@ -1,7 +1,7 @@
-"""What handlers cost those who have none, those whose neighbours have some, and those who have one.
+"""The cost of handlers for functions without one, for functions with another environment's handler, and with one.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only plugins``. Everything is compared to
-a plain call that does nothing.
+Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only plugins``. The comparison is with a
+plain call that does nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DEFINITION: dict[str, Any] = {
 
 
 class Model(State):
-    """Functions that do nothing, as they are and exposed."""
+    """Functions that do nothing, plain and exposed."""
 
     def plain(self) -> None: ...
 
@@ -95,7 +95,7 @@ def nothing(model: Model) -> None: ...
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many calls of a contender in each."""
+    """Measure in a number of rounds, with a number of calls of each contender."""
     section, model = Section("Plugins", "microseconds per call, and per step"), Model()
     other = single_env(Model, Model.decide, plugins=[(nothing, Model.others, "before")])
     attached = handlers(

@@ -1,7 +1,7 @@
-"""What a parallel step costs: every agent acts once, and then all of them are rewarded and observed.
+"""The cost of a parallel step: every agent acts once, and then all of them are rewarded and observed.
 
-All agents are entities, named by a callable. Beside our parallel view stand our AEC view, which takes as many
-turns, and PettingZoo's two converters over the hand-written AEC environment of as many agents.
+All agents are entities, named by a callable. The comparison is with our AEC view, which takes as many turns, and with
+PettingZoo's two converters over the hand-written AEC environment with as many agents.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from simenv_marl import aec_env, parallel_env
 SIZES = (2, 100, 1_000, 10_000)
 
 CONVERTED = (2, 100, 1_000)
-"""At how many agents ``aec_to_parallel`` is measured: its step is quadratic, and at 10,000 takes tens of seconds."""
+"""The numbers of agents for ``aec_to_parallel``: its step is quadratic, and takes tens of seconds at 10,000."""
 
 CONVERTED_ROUNDS = 3
 
 TURNS = 50
-"""Decisions of the turn-based converter, each of which is a step that is linear in the agents."""
+"""The number of steps of the turn-based converter; each is one decision, and is linear in the number of agents."""
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many decisions of a contender in each."""
+    """Measure in a number of rounds, with a number of decisions of each contender."""
     ours: dict[str, Contender] = {}
     for size in SIZES:
         crowd = Crowd(size)
@@ -39,7 +39,7 @@ def measure(rounds: int, number: int) -> Section:
             parallel_env(ForetoldCrowd(size), Entity.decide), size, number
         )
     times = side_by_side(ours, rounds)
-    # In rounds of their own, because they are dear; with ours again, for the ratios.
+    # in separate rounds, because they are expensive; with ours again, for the ratios
     beside: dict[str, Contender] = {}
     for size in SIZES:
         beside[f"parallel, {size:,}"] = ours[f"parallel, {size:,}"]
@@ -88,10 +88,10 @@ def _tell(times: Times, beside: Times) -> Section:
 
 
 def steps(env: Any, agents: int, number: int) -> Contender:
-    """Steps of a parallel environment that does not end, about as many decisions as asked, with everybody's action."""
+    """Make a contender of steps of a parallel environment that does not end, with actions of all agents."""
     env.reset(seed=0)
     number = max(number // agents, 1)
-    if len(env.agents) < agents:  # some are yet to be met
+    if len(env.agents) < agents:  # some agents have not appeared yet
         for _ in range(agents):
             env.step(dict.fromkeys(env.agents, 1))
     actions = dict.fromkeys(env.agents, 1)
@@ -107,7 +107,7 @@ def steps(env: Any, agents: int, number: int) -> Contender:
 
 
 def turns(env: Any, number: int) -> Contender:
-    """Steps of a converted environment that asks one agent at each."""
+    """Make a contender of steps of a converted environment, each of which is the decision of one agent."""
     env.reset(seed=0)
     actions = dict.fromkeys(env.agents, 1)
 

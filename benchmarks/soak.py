@@ -1,7 +1,7 @@
-"""Very many episodes that are cut short at random: what do they leave behind?
+"""A soak test: very many episodes that are cut short at random must not leak resources.
 
-Run with ``python -m benchmarks.soak``; ``make soak`` does so with both drivers. Fails if anything is left:
-threads, greenlets, file descriptors, objects, or memory.
+Run it with ``python -m benchmarks.soak``; ``make soak`` does so with both drivers. It fails if threads, greenlets, file
+descriptors, objects or memory leak.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from simenv_marl import RULE, aec_env, joint_env, make_step, parallel_env, singl
 
 DRIVERS = ("greenlet", "thread")
 WARM = 0.1
-"""The part of the episodes after which nothing may grow any more."""
+"""The share of episodes after which no figure may grow."""
 MEGABYTES = 8
-"""How much more memory may be in use at the end: allocators keep some for later."""
+"""The allowed growth of memory, in megabytes: allocators keep some for later."""
 
 
 class Failed(Exception):
-    """What the model raises now and then."""
+    """An error that the model raises now and then."""
 
 
 class Animal:
-    """One of those that decide."""
+    """An animal, which makes decisions."""
 
     def __init__(self, model: Model, number: int) -> None:
         self.model, self.number, self.load = model, number, bytearray(2000)
@@ -48,7 +48,7 @@ class Animal:
 
 
 class Model:
-    """Animals that are born and die, and a keeper who decides inside a generator."""
+    """A model of animals that are born and die, and of a keeper who decides inside a generator."""
 
     def reset(self, seed: int | None = None) -> None:
         self.random = random.Random(seed)
@@ -74,14 +74,14 @@ class Model:
             self.animals.clear()
 
     def keep(self) -> int:
-        """Decide whether there is to be another one."""
+        """Decide whether to add another animal."""
         return self.random.randrange(2)
 
     def remove(self, animal: Animal) -> None:
         self.animals.remove(animal)
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """The next calls."""
+        """Return the next calls."""
         return [(animal,) for animal in self.animals] if point.endswith("move") else [(self,)]
 
 
@@ -108,7 +108,7 @@ MOVE = make_step(
 
 
 def environments(driver: str) -> list[Callable[[], Any]]:
-    """What makes an environment of each view."""
+    """Return functions that make an environment of each view."""
     both = {f"{NAME}.keep": KEEP, NAMED: MOVE}
     roster = {NAMED: [f"animal_{number}" for number in range(30)]}
     return [
@@ -120,7 +120,7 @@ def environments(driver: str) -> list[Callable[[], Any]]:
 
 
 def episode(env: Any, draw: random.Random) -> None:
-    """Play some of an episode."""
+    """Play a part of an episode."""
     env.reset(seed=draw.randrange(2**31))
     for _ in range(draw.randrange(12)):
         if hasattr(env, "agent_selection"):
@@ -132,7 +132,7 @@ def episode(env: Any, draw: random.Random) -> None:
 
 
 def play(driver: str, number: int, draw: random.Random) -> None:
-    """Play so many episodes, and end each in some way or other."""
+    """Play a number of episodes, and end each in a random way."""
     makers = environments(driver)
     kept = [make() for make in makers]
     for _ in range(number):
@@ -145,20 +145,20 @@ def play(driver: str, number: int, draw: random.Random) -> None:
         if end < 0.3:
             kept[at].close()
         elif end < 0.4:
-            kept[at] = makers[at]()  # the one before is abandoned
+            kept[at] = makers[at]()  # the previous environment is abandoned
     for env in kept:
         env.close()
 
 
 def figures() -> dict[str, int]:
-    """What there is in this process."""
+    """Count the resources of this process."""
     gc.collect()
     things = gc.get_objects()
     with open("/proc/self/statm") as statm:
         resident = int(statm.read().split()[1]) * resource.getpagesize()
     return {
         "threads": threading.active_count(),
-        # A thread's own, which has no parent, is freed a moment after the thread has ended.
+        # a thread's own greenlet, which has no parent, is freed a moment after the thread has ended
         "greenlets": sum(isinstance(thing, greenlet) and thing.parent is not None for thing in things),
         "descriptors": len(os.listdir("/proc/self/fd")),
         "objects": len(things),

@@ -1,7 +1,7 @@
-"""Where the time of one AEC decision goes: stage by stage, from the bare switch to ``env.step`` and ``last``.
+"""The time of one AEC decision by stages, from the bare switch to ``env.step`` and ``last``.
 
-A section of ``benchmarks.core``. Each row is the time up to and with that stage. The last rows show what a switch of
-stacks adds to what runs after it, which no stage can save: NumPy makes an array more slowly right after a switch.
+A section of ``benchmarks.core``. Each row is the time up to and including that stage. The last rows show the effect of
+a switch of stacks on the code after it, which no stage can avoid: NumPy makes an array more slowly after a switch.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from simenv_marl import aec_env
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many decisions of a contender in each."""
+    """Measure in a number of rounds, with a number of decisions of each contender."""
     env: Any = aec_env(Turns, [Model.left, Model.right])
     env.reset(seed=0)
     episode = env.unwrapped._session.episode

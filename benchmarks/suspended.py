@@ -1,7 +1,7 @@
-"""What simulations suspended side by side replace, a thread or a process for each; what they hold; what workers bring.
+"""Simulations suspended side by side, beside one thread or process for each; their memory; the speed-up by workers.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only suspended``. Memory and the scaling over
-two cores are measured in processes of their own, the latter in one that may use two, wherever the others are pinned.
+Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only suspended``. Memory and the scaling
+over two cores are measured in separate processes, the latter in one pinned to two cores.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from benchmarks.vector import ours, steps
 from simenv_marl import vector_env
 
 MICROSECONDS = 100.0
-"""What a decision costs the simulation that is spread over two cores."""
+"""The duration of a decision of the simulation that is spread over two cores."""
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many decisions of a contender in each."""
+    """Measure in a number of rounds, with a number of decisions of each contender."""
     section = Section("Suspended simulations", "microseconds per simulation and step")
     rounds = max(3, rounds // 3)
     _beside_threads(section, rounds, number)
@@ -55,7 +55,7 @@ def measure(rounds: int, number: int) -> Section:
 
 
 def _beside_threads(section: Section, rounds: int, number: int) -> None:
-    """Ours beside a thread for each simulation."""
+    """Compare our vector environment with one thread per simulation."""
     size = 64
     threads, alone = Threads(size), ours(size)
     contenders = {
@@ -76,7 +76,7 @@ def _beside_threads(section: Section, rounds: int, number: int) -> None:
 
 
 def _beside_processes(section: Section, rounds: int, number: int) -> None:
-    """Ours beside a process for each simulation."""
+    """Compare our vector environment with one process per simulation."""
     few = 4
     processes, in_workers, alone = AsyncVectorEnv([TemplateEnv] * few), ours(few, workers=2), ours(few)
     contenders = {
@@ -92,10 +92,10 @@ def _beside_processes(section: Section, rounds: int, number: int) -> None:
 
 
 class Threads:
-    """A thread for each simulation, which takes turns with its user as RLlib's ExternalEnv has it.
+    """One thread per simulation, which alternates with its user as in RLlib's ExternalEnv.
 
-    Each has a queue for what it tells and one for its actions, and all share a condition that says that somebody has
-    told something.
+    Each thread has a queue for observations and one for actions. All threads share a condition, which they notify after
+    each observation.
     """
 
     def __init__(self, number: int) -> None:
@@ -141,17 +141,17 @@ class Threads:
             thread.join()
 
 
-# -- in processes of their own --------------------------------------------------------------------
+# -- in separate processes ------------------------------------------------------------------------
 
 
 class Slow(Busy):
-    """A simulation that takes so many microseconds for a decision."""
+    """A simulation that takes ``MICROSECONDS`` per decision."""
 
     nanoseconds = int(MICROSECONDS * 1000)
 
 
 def memory(number: int = 10_000) -> float:
-    """KiB of resident memory for each of many suspended simulations."""
+    """Measure the resident memory of each of many suspended simulations, in KiB."""
     warm = ours(100)
     warm.reset(seed=0)
     gc.collect()
@@ -169,7 +169,7 @@ def _resident() -> float:
 
 
 def cores(rounds: int, size: int = 64) -> tuple[float, float, float]:
-    """How much faster two workers are than one process; and the microseconds of both."""
+    """Measure the speed-up by two workers, and the microseconds of one process and of two workers."""
     envs = {workers: vector_env(Slow, Model.left, num_envs=size, workers=workers) for workers in (0, 2)}
     times = side_by_side(
         {str(workers): steps(env, size, size * 20, time.perf_counter) for workers, env in envs.items()}, rounds

@@ -1,6 +1,6 @@
-"""What a step of many simulations costs, suspended side by side in one process, beside Gymnasium's own.
+"""The cost of a step of many simulations, suspended side by side in one process, beside Gymnasium's vector views.
 
-Run with ``make benchmark``, or alone with ``python -m benchmarks.core --only vector``.
+Run it with ``make benchmark``, or alone with ``python -m benchmarks.core --only vector``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ KINDS = {
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, with so many decisions of a contender in each."""
+    """Measure in a number of rounds, with a number of decisions of each contender."""
     section = Section("Vector environments", "microseconds per simulation and step")
     for size in SIZES:
         _compare(section, size, max(3, rounds if size == 64 else rounds // 3), number)
@@ -53,7 +53,7 @@ def measure(rounds: int, number: int) -> Section:
 
 
 def _compare(section: Section, size: int, rounds: int, number: int) -> None:
-    """Ours beside Gymnasium's, over our views and over environments written by hand."""
+    """Compare our vector environment with Gymnasium's, over our views and over hand-written environments."""
     envs = {name: make(size) for name, make in KINDS.items()}
     times = side_by_side({name: steps(env, size, number) for name, env in envs.items()}, rounds)
     what, hand = f"{size:,} simulations: ours", "SyncVectorEnv, by hand"
@@ -77,7 +77,7 @@ def _compare(section: Section, size: int, rounds: int, number: int) -> None:
 
 
 def steps(env: Any, size: int, number: int, clock: Callable[[], float] = now) -> Contender:
-    """Steps of a vector environment that does not end."""
+    """Make a contender of steps of a vector environment that does not end."""
     env.reset(seed=0)
     actions, times = np.ones(size, np.int64), max(number // size, 1)
 

@@ -1,6 +1,6 @@
-"""What a model of somebody else keeps of its speed: Mesa's wolves and sheep, as they come.
+"""The speed of a third-party model in environments, relative to the plain run: Mesa's unmodified wolf-sheep model.
 
-With ``RULE`` throughout, so that what runs is the same simulation as without an environment, tick for tick.
+All actions are ``RULE``, so that the simulation is the same as without an environment, tick for tick.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ KINDS: dict[str, Any] = {"wolf": Wolf, "sheep": Sheep}
 
 
 class Meadow(SimulationInterface):
-    """The model for so many ticks.
+    """The model over ``TICKS`` ticks.
 
     Attributes:
-        counts: How many wolves and sheep there were after each tick.
+        counts: The numbers of wolves and sheep after each tick.
     """
 
     def reset(self, seed: int | None = None) -> None:
@@ -47,7 +47,7 @@ class Meadow(SimulationInterface):
         return [(animal,) for kind in KINDS.values() if point == name_of(kind) for animal in living.get(kind, ())]
 
     def outcome(self) -> Any:
-        """All that the decisions of a run have led to."""
+        """Return the state at the end of a run."""
         animals = [
             (animal.unique_id, animal.energy, animal.cell.coordinate)
             for kind in KINDS.values()
@@ -57,7 +57,7 @@ class Meadow(SimulationInterface):
 
 
 def wolves_and_sheep(seed: int | None) -> tuple[Any, Any]:
-    """The model, and what runs it for so many ticks: itself since Mesa 3.5, a simulator before."""
+    """Make the model, and the object that runs its ticks: since Mesa 3.5 the model itself, before a simulator."""
     if hasattr(wolf_sheep, "WolfSheepScenario"):
         model = wolf_sheep.WolfSheep(wolf_sheep.WolfSheepScenario(rng=seed))
         return model, model
@@ -68,7 +68,7 @@ def wolves_and_sheep(seed: int | None) -> tuple[Any, Any]:
 
 
 def name_of(kind: type) -> str:
-    """The name of a kind's decision point."""
+    """Return the name of a kind's decision point."""
     return f"{kind.__module__}.{kind.__qualname__}.move"
 
 
@@ -101,7 +101,7 @@ POINTS = {name_of(kind): definition(word) for word, kind in KINDS.items()}
 
 
 def measure(rounds: int, number: int) -> Section:
-    """Measure in so many rounds, of an episode each."""
+    """Measure in a number of rounds, of one episode each."""
     expected, ticks, _ = plain()
     _, decisions, _ = crossing()
 
@@ -110,7 +110,7 @@ def measure(rounds: int, number: int) -> Section:
             outcome, counted, seconds = run()
             assert outcome == expected
             assert counted == count
-            gc.collect()  # the model's cycles, which nobody collects meanwhile
+            gc.collect()  # the model's reference cycles, as automatic collection is off
             return seconds / decisions * 1e6
 
         return checked
@@ -159,11 +159,11 @@ def measure(rounds: int, number: int) -> Section:
     return section
 
 
-# -- runs: each returns the outcome, how many decisions, steps or ticks it took, and seconds -------------------
+# -- runs: each returns the outcome, the number of decisions, steps or ticks, and seconds ----------------------
 
 
 def plain() -> tuple[Any, int, float]:
-    """The model by itself."""
+    """Run the model without an environment."""
     simulation = Meadow()
     simulation.reset(SEED)
     started = now()
@@ -173,7 +173,7 @@ def plain() -> tuple[Any, int, float]:
 
 
 def aec(*, look: bool = True) -> tuple[Any, int, float]:
-    """An AEC environment, in the loop of PettingZoo's documentation or in the shortest one."""
+    """Run an AEC environment, in the loop of PettingZoo's documentation or in the shortest one."""
     env: Any = aec_env(Meadow, POINTS)
     env.reset(seed=SEED)
     decisions = 0
@@ -196,7 +196,7 @@ def aec(*, look: bool = True) -> tuple[Any, int, float]:
 
 
 def parallel() -> tuple[Any, int, float]:
-    """A parallel environment, all actions at once."""
+    """Run a parallel environment, with all actions at once."""
     env: Any = parallel_env(Meadow, POINTS)
     env.reset(seed=SEED)
     steps = 0
@@ -210,7 +210,7 @@ def parallel() -> tuple[Any, int, float]:
 
 
 def crossing(*, mappings: bool = False) -> tuple[Any, int, float]:
-    """No environment: each decision is suspended and resumed, and does nothing else but, on demand, the mappings."""
+    """Run without an environment: suspend and resume each decision, and call the mappings on demand."""
     simulation = Meadow()
     simulation.reset(SEED)
     rules = {kind: kind.move for kind in KINDS.values()}

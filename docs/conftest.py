@@ -1,4 +1,4 @@
-"""Lets each page's examples import the models that lie beside it, as if no other page had."""
+"""Fixtures that let each page's examples import the models beside it, independently of other pages."""
 
 import gc
 import sys
@@ -17,12 +17,12 @@ def _models_beside_the_page(request, monkeypatch):
     monkeypatch.chdir(Path(__file__).parent)
     for model in ("bakery", "bakery_env", "lake"):
         monkeypatch.delitem(sys.modules, model, raising=False)
-    gc.collect()  # what the collection after the page before has unwound
-    if "joblib" in sys.modules:  # its workers were started by somebody else, and would look for models elsewhere
+    gc.collect()  # collects what remains of the previous page
+    if "joblib" in sys.modules:  # workers of earlier tests would look for models elsewhere
         sys.modules["joblib"].externals.loky.get_reusable_executor().shutdown(wait=True)
     with registries_put_back():
         yield
-    # What a page has decorated would be found by the next page's names, as long as anything keeps it.
+    # the next page's names would find this page's decorated functions as long as there is a reference to them
     request.node.dtest.globs.clear()
     for model in ("bakery", "bakery_env", "lake"):
         sys.modules.pop(model, None)

@@ -35,7 +35,7 @@ def speak(reading, writing):
     def receive():
         line = reading.readline()
         if not line:
-            sys.exit()  # the environment has gone
+            sys.exit()  # the environment has closed the pipe
         return json.loads(line)
 
     send({"hello": 1, "points": ["dam.outlet"]})

@@ -1,1 +1,1 @@
-"""Examples of what simulations become with ``simenv_marl``; each is a package of its own."""
+"""Examples of environments made with ``simenv_marl``."""

@@ -1,16 +1,17 @@
-"""What an agent's action was worth with all else the same: by branches, and by returns less a learnt baseline.
+"""Credit assignment: the advantage of an agent's action, by branches and by returns less a learned baseline.
 
-``python -m examples.credit`` goes to decisions of the greenhouse pair and of the sheep of Mesa's meadow, draws an
-action for each, and asks what it was worth beside what the agent's base would have done there: the difference between
-the values of the two, where the base goes on after either. Each way of estimating it is held against the same truth,
-the mean of many futures to the end, and costs simulated days (ticks of the meadow):
+``python -m examples.credit`` goes to decisions of the greenhouse's two agents and of the sheep on Mesa's meadow, and
+draws an action for each. The advantage of the action is the difference between its value and the value of the base
+policy's action, where the base policy continues after both. The script compares several estimators of it with the same
+ground truth, the mean over many futures to the end, and counts their cost in simulated days (ticks of the meadow):
 
-- the return of one future in which the action is taken, less what a baseline that was learnt from episodes of the base
-  expects there: what policy gradients go by;
-- the difference between two branches of ``action_values`` in the same future, or in two independent ones;
-- the same, cut off after a few days; what comes then is what the baseline expects.
+- the return of one future after the action, less a baseline that was learned from episodes of the base policy: the
+  estimator of policy gradients;
+- the difference between two branches of ``action_values``, in the same future or in two independent ones;
+- the same, cut off after a few days, with the baseline as terminal value.
 
-It prints a table in Markdown. The days from which the baseline was learnt are not counted: all can make use of it.
+It prints a table in Markdown. The cost does not include the days for learning the baseline, as all estimators can use
+it.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from .greenhouse_coop.plan import BEST, VENTILATOR, WATERER
 from .wolf_sheep.env import MOVE, Meadow, sheep_points
 
 TICKS: Final = 60
-"""For how long meadows last: few sheep live that long."""
+"""The length of an episode on the meadow, in ticks: few sheep live that long."""
 
 DAYS_SPENT: Final = 200
-"""At how many days for each decision the ways are compared."""
+"""The budget of simulated days per decision at which the estimators are compared."""
 
 HORIZONS: Final = (3, 10)
-"""After how many decisions of the agent futures are cut off."""
+"""The numbers of the agent's decisions after which futures are cut off."""
 
 
 # -- decisions ------------------------------------------------------------------------------------
@@ -46,15 +47,15 @@ Baseline = Callable[[NDArray[np.float32]], float]
 
 @dataclass(frozen=True)
 class World:
-    """Where decisions are looked at.
+    """A simulation whose decisions are studied.
 
     Attributes:
-        title: Whose they are.
-        make: Makes the simulation.
-        points: Its decision points.
-        key: Of the agents whose decisions they are, in ``policies``.
-        base: The policies of all.
-        a_day: How many decisions a day has that may all be given credit.
+        title: The name of the agents.
+        make: The function that makes the simulation.
+        points: The decision points.
+        key: The key of the agents in ``policies``.
+        base: The base policies of all agents.
+        a_day: The number of decisions per day that can all be assigned credit.
     """
 
     title: str
@@ -66,17 +67,17 @@ class World:
 
 
 def worlds() -> Iterator[World]:
-    """Both agents of the greenhouse, around the best constants, and the sheep, around their rule."""
+    """Yield both agents of the greenhouse, with the best constants as base, and the sheep, with their rule."""
     for agent in (WATERER, VENTILATOR):
         yield World(f"greenhouse, {agent}", GreenhouseSim, None, agent, BEST, 2)
     yield World("one of the sheep", lambda: Meadow(TICKS), sheep_points(), MOVE, RULE, 100)
 
 
 def decisions(world: World, number: int, rng: np.random.Generator) -> Iterator[tuple[Any, list[Any]]]:
-    """Go to decisions, each of another episode.
+    """Go to decisions, each in another episode.
 
     Yields:
-        The environment with the decision pending, and two candidates: one that is drawn, and that of the base.
+        The environment with the decision pending, and two candidates: a random action, and that of the base policy.
     """
     while number:
         env = aec_env(world.make(), world.points)
@@ -90,7 +91,7 @@ def decisions(world: World, number: int, rng: np.random.Generator) -> Iterator[t
             base = RULE if world.base is RULE else world.base[agent](env.last()[0])
             env.step(None if env.terminations[agent] or env.truncations[agent] else base)
             passed -= 1
-        if not env.agents:  # it has ended before
+        if not env.agents:  # the episode ended too early
             continue
         number -= 1
         observation = env.last()[0]
@@ -99,13 +100,13 @@ def decisions(world: World, number: int, rng: np.random.Generator) -> Iterator[t
         else:
             usual = world.base[world.key](observation)
             spread = 0.04 if world.key == WATERER else 0.4
-            drawn = 1 - np.abs(1 - np.abs(usual + rng.normal(0, spread, 1)))  # thrown back at 0 and at 1
+            drawn = 1 - np.abs(1 - np.abs(usual + rng.normal(0, spread, 1)))  # reflected at 0 and at 1
             yield env, [np.clip(drawn, 0, 1).astype(np.float32), usual]
         env.close()
 
 
 def learn_baseline(world: World, episodes: int) -> Baseline:
-    """Learn what to expect: least squares on squares and products of what is observed."""
+    """Learn a baseline: least squares on squares and products of the observations."""
     policies = {MOVE: RULE} if world.base is RULE else world.base
     found = collect_episodes(world.make, policies, points=world.points, seeds=range(10**6, 10**6 + episodes))[world.key]
     rest = np.concatenate(
@@ -128,14 +129,14 @@ def _features(observations: NDArray[np.float32]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Way:
-    """One way of giving credit.
+    """The results of an estimator.
 
     Attributes:
         title: Its name.
-        bias: The root of the mean square, over decisions, of how far its mean is from the truth.
-        deviation: Of one estimate, likewise.
-        days: What an estimate costs.
-        a_decision: What it costs where all decisions of an episode are given credit.
+        bias: The root mean square, over decisions, of the difference between its mean and the truth.
+        deviation: The root mean square, over decisions, of the standard deviation of one estimate.
+        days: The cost of one estimate, in simulated days.
+        a_decision: The cost per decision where all decisions of an episode are assigned credit, in simulated days.
     """
 
     title: str
@@ -146,22 +147,22 @@ class Way:
 
     @property
     def error(self) -> float:
-        """The root of the mean square error of as many estimates as ``DAYS_SPENT`` pay for."""
+        """The root mean square error of as many estimates as a budget of ``DAYS_SPENT`` allows."""
         return float(np.sqrt(self.bias**2 + self.deviation**2 * self.days / DAYS_SPENT))
 
 
 def measure(world: World, number: int, futures: int, episodes: int, seed: int) -> tuple[list[Way], float]:
-    """Estimate what actions were worth.
+    """Measure the errors of all estimators.
 
     Args:
-        world: Where.
-        number: How many decisions.
-        futures: In how many futures each way is tried, and the truth is found.
-        episodes: From how many the baseline is learnt.
-        seed: Of what is drawn.
+        world: The simulation.
+        number: The number of decisions.
+        futures: The number of futures for each estimator and for the truth.
+        episodes: The number of episodes from which the baseline is learned.
+        seed: The seed of the random draws.
 
     Returns:
-        The ways, and the root mean square of the truth.
+        The results of the estimators, and the root mean square of the truth.
     """
     rng = np.random.default_rng(seed)
     baseline = learn_baseline(world, episodes)
@@ -176,7 +177,7 @@ def measure(world: World, number: int, futures: int, episodes: int, seed: int) -
         taken, usual = action_values(env, candidates, base=world.base, futures=futures).returns
         truth = float(np.mean(taken - usual))
         truths.append(truth)
-        # What the truth is not sure of is no bias of those that are cut off.
+        # the sampling error of the truth does not count as a bias of the estimators that are cut off
         unsure = float(np.var(taken - usual, ddof=1)) / futures
         whole = float(np.mean(taken)) if world.base is RULE else float(DAYS - env.simulation.greenhouse.day)
         other = float(np.mean(usual)) if world.base is RULE else whole
@@ -203,7 +204,7 @@ def measure(world: World, number: int, futures: int, episodes: int, seed: int) -
 
 
 def table(world: World, ways: Sequence[Way], truth: float) -> str:
-    """Make the table of a world, in Markdown."""
+    """Make the table of a simulation, in Markdown."""
     first = ways[0]
     lines = [
         f"**{world.title}** (what actions were worth: {truth:.2f} in the root mean square)",
@@ -223,12 +224,12 @@ def table(world: World, ways: Sequence[Way], truth: float) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, list[Way]]:
-    """Measure, and print a table for each world."""
-    parser = argparse.ArgumentParser(description="Give credit for actions.")
-    parser.add_argument("--decisions", type=int, default=24, help="of each kind (default: %(default)s)")
-    parser.add_argument("--futures", type=int, default=48, help="for each way (default: %(default)s)")
-    parser.add_argument("--episodes", type=int, default=100, help="for the baselines (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of all that is drawn (default: %(default)s)")
+    """Measure the errors, and print a table for each simulation."""
+    parser = argparse.ArgumentParser(description="Compare estimators of the advantage of actions.")
+    parser.add_argument("--decisions", type=int, default=24, help="decisions of each kind (default: %(default)s)")
+    parser.add_argument("--futures", type=int, default=48, help="futures per estimator (default: %(default)s)")
+    parser.add_argument("--episodes", type=int, default=100, help="episodes for each baseline (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all randomness (default: %(default)s)")
     options = parser.parse_args(arguments)
     found = {}
     for world in worlds():

@@ -1,4 +1,4 @@
-"""Learning by evolution (CMA-ES), as several examples do it: whatever weights a policy has, by their returns alone."""
+"""Learning by evolution (CMA-ES), which several examples share: it needs only the returns of a policy's weights."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ def evolve(
     Args:
         rate: Returns the mean return of each candidate of a generation. It should play the same seeds for all of them,
             so that no candidate is chosen for its luck.
-        first: ``(weights,)``: where the search begins.
-        generations: How many generations are tried.
+        first: ``(weights,)``: the initial weights.
+        generations: The number of generations.
         rng: The source of all random numbers; ``rate`` may draw its seeds from it.
-        population: How many candidates a generation has.
+        population: The number of candidates per generation.
         spread: The standard deviation of the weights of the first generation.
 
     Returns:
         ``(weights,)``: the mean of the best weights found so far, over the last quarter of the generations. The best of
         a single generation varies with the seeds of that generation; this mean hardly does.
     """
-    import cma  # here, and not where a policy is loaded: a process that has imported much is forked slowly
+    import cma  # imported here, because a process with many imports forks slowly
 
     options: dict[str, Any] = {"popsize": population, "verbose": -9, "verb_log": 0}
-    # Without these two it would seed and use NumPy's global generator.
+    # without these two options, CMA-ES would seed and use NumPy's global generator
     options |= {"seed": math.nan, "randn": lambda *shape: rng.standard_normal(shape)}
     evolution = cma.CMAEvolutionStrategy(first, spread, options)
     best = []

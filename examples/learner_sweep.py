@@ -1,12 +1,12 @@
-"""Settings of a learner as factors: a sweep that resumes, and Optuna as the search over the same settings.
+"""Hyperparameters as factors: a sweep that resumes, and a search with Optuna over the same hyperparameters.
 
-A training run is a simulation like any other: its factors are the learner's settings, its seed is that of the training,
-and what comes of it is measured after its end. So ``run_experiment`` does sweeps of learners as it is. Here PPO of
-Stable-Baselines3 learns to water the greenhouse.
+A training run is a simulation like any other: its factors are the learner's hyperparameters, its seed is the seed of
+the training, and a metric evaluates it after its end. So ``run_experiment`` can sweep learners without changes. Here
+Stable-Baselines3's PPO learns to water the greenhouse.
 
-``python -m examples.learner_sweep`` needs the extra ``clients``. It does the sweep, then the search, and then trains
-anew with the settings that were found and with those that PPO comes with, on seeds that neither has met. What it has
-done is kept in a folder, and not done again.
+``python -m examples.learner_sweep`` needs the extra ``clients``. It runs the sweep, then the search, and then trains
+anew with the best hyperparameters and with PPO's defaults, on new seeds. A folder keeps all results, so that a second
+call runs only what is missing.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 LEVELS: Final = {"learning_rate": [3e-4, 1e-3, 3e-3], "gamma": [0.8, 0.9, 0.99]}
-"""What is swept: PPO comes with the first rate and the last discount."""
+"""The levels of the sweep. PPO's defaults are the first learning rate and the last discount factor."""
 
 SEEDS: Final = range(3)
-"""Of trainings."""
+"""The seeds of training runs."""
 
 HELD_OUT: Final = 1000
-"""The first of the seeds on which what was learnt is judged."""
+"""The first of the seeds for the evaluation."""
 
 
 class Training:
@@ -87,7 +87,7 @@ experiment = partial(run_experiment, Training, metric=GAIN, global_rng=True)
 
 
 def sweep(folder: Path, days: int, seeds: Sequence[int] = SEEDS, workers: int = 0) -> DataFrame:
-    """Train with every combination of the settings, on every seed."""
+    """Train with all combinations of the hyperparameters, on all seeds."""
     rows = design({**LEVELS, "days": [days]})
     return experiment(rows, seeds=seeds, store=folder / "sweep", workers=workers, progress=True)
 
@@ -118,7 +118,7 @@ def search(folder: Path, days: int, trials: int, seeds: Sequence[int] = SEEDS) -
 
 
 def confirm(folder: Path, days: int, settings: dict[str, float], seeds: Sequence[int], workers: int = 0) -> DataFrame:
-    """Train with other seeds and judge on others: who is best of many on some seeds, is so by luck, too."""
+    """Train and evaluate on new seeds, because the best of many trials is partly best by chance."""
     rows = [{"learning_rate": 3e-4, "gamma": 0.99}, settings]
     fresh = [{**row, "days": days, "held_out": 2 * HELD_OUT} for row in rows]
     return experiment(fresh, seeds=seeds, store=folder / "confirmed", workers=workers)
@@ -126,12 +126,12 @@ def confirm(folder: Path, days: int, settings: dict[str, float], seeds: Sequence
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Sweep, search, and confirm."""
-    parser = argparse.ArgumentParser(description="Look for the settings of a learner.")
-    parser.add_argument("--out", type=Path, default=Path("examples/out/learner_sweep"), help="(default: %(default)s)")
-    parser.add_argument("--days", type=int, default=3000, help="for each training (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=3, help="trainings with each settings (default: %(default)s)")
-    parser.add_argument("--trials", type=int, default=12, help="of Optuna (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=0, help="processes of the sweep (default: none)")
+    parser = argparse.ArgumentParser(description="Search for the hyperparameters of a learner.")
+    parser.add_argument("--out", type=Path, default=Path("examples/out/learner_sweep"), help="default: %(default)s")
+    parser.add_argument("--days", type=int, default=3000, help="days per training (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=3, help="trainings per setting (default: %(default)s)")
+    parser.add_argument("--trials", type=int, default=12, help="trials of Optuna (default: %(default)s)")
+    parser.add_argument("--workers", type=int, default=0, help="worker processes of the sweep (default: none)")
     options = parser.parse_args(arguments)
     folder, days, seeds = options.out, options.days, range(options.seeds)
     folder.mkdir(parents=True, exist_ok=True)

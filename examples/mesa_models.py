@@ -1,11 +1,11 @@
-"""Mesa's own example models as environments: not a line of them is changed, and each function is all that one needs.
+"""Mesa's own example models as environments: the models are unchanged, and each function below is all that one needs.
 
-``python -m examples.mesa_models`` runs each of them plainly and as an AEC environment with ``RULE`` throughout,
-compares all that the two models hold afterwards, plays random actions, and prints a table in Markdown. It needs Mesa
-3.3 or newer, with its extra ``network``.
+``python -m examples.mesa_models`` runs each model without an environment and as an AEC environment with ``RULE`` as
+every action, and compares the final states of the two models. It then plays random actions, and prints a table in
+Markdown. It needs Mesa 3.3 or newer, with its extra ``network``.
 
-From Mesa 3.5 on, some of these models take a scenario. ``stepped`` makes them in either way; a model of your own needs
-``SteppedSimulation`` alone.
+From Mesa 3.5 on, some of these models take a scenario. ``stepped`` handles both kinds; a model of your own needs only
+``SteppedSimulation``.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from mesa.examples.advanced.alliance_formation.model import MultiLevelAllianceMo
 from simenv_marl import RULE, Definition, SteppedSimulation, aec_env, difference, make_step
 
 STEPS: Final = 10
-"""How many steps of a model are run."""
+"""The number of steps of an episode."""
 
 Example = tuple[Callable[..., Any], dict[str, Definition], dict[str, Any]]
-"""A model, its decision points and the options of its environments."""
+"""A model, its decision points, and the options of its environments."""
 
 
 def boltzmann_wealth() -> Example:
-    """Where a person goes, who gives money away there."""
+    """A person decides where to go, and gives money away there."""
     move = make_step(
         observation_space=Box(0, np.inf, (2,), np.float32),
         observation_space_mapping=lambda person: [person.wealth, len(person.cell.agents) - 1],
@@ -61,7 +61,7 @@ def boltzmann_wealth() -> Example:
 
 
 def schelling() -> Example:
-    """Whether a household moves to another place."""
+    """A household decides whether to move to another place."""
 
     def relocate(action: Any, household: Any) -> None:
         if action:
@@ -83,7 +83,7 @@ def schelling() -> Example:
 
 
 def boid_flockers() -> Example:
-    """By how much a bird turns."""
+    """A bird decides by how much to turn."""
 
     def turn(action: Any, boid: Any) -> None:
         cosine, sine = math.cos(action[0]), math.sin(action[0])
@@ -102,7 +102,7 @@ def boid_flockers() -> Example:
 
 
 def conways_game_of_life() -> Example:
-    """Whether a cell lives on."""
+    """A cell decides whether it lives on."""
     state = make_step(
         observation_space=Box(0, 8, (2,), np.float32),
         observation_space_mapping=lambda cell: [cell.state, sum(other.is_alive for other in cell.neighbors)],
@@ -115,7 +115,7 @@ def conways_game_of_life() -> Example:
 
 
 def virus_on_network() -> Example:
-    """Whether a computer is treated. The network is drawn from Python's global generator: hence ``global_rng``."""
+    """A computer decides on its treatment. The network uses Python's global generator, hence ``global_rng``."""
     check = make_step(
         observation_space=Discrete(3),
         observation_space_mapping=lambda node: node.state.value,
@@ -129,7 +129,7 @@ def virus_on_network() -> Example:
 
 
 def epstein_civil_violence() -> Example:
-    """Where a cop goes. ``Cop.move`` is inherited; named so, it is the cops' alone, and citizens keep theirs."""
+    """A cop decides where to go. The inherited ``Cop.move``, named like this, leaves the citizens' move unchanged."""
     patrol = make_step(
         observation_space=Box(0, np.inf, (2,), np.float32),
         observation_space_mapping=lambda cop: [sum(1 for _ in cop.neighbors), len(cop.empty_neighbors)],
@@ -143,7 +143,7 @@ def epstein_civil_violence() -> Example:
 
 
 def pd_grid() -> Example:
-    """Whether a prisoner cooperates."""
+    """A prisoner decides whether to cooperate."""
     cooperate = make_step(
         observation_space=Box(0, np.inf, (3,), np.float32),
         observation_space_mapping=lambda prisoner: [
@@ -160,7 +160,7 @@ def pd_grid() -> Example:
 
 
 def sugarscape() -> Example:
-    """Where a trader goes, until it starves."""
+    """A trader decides where to go, until it starves."""
     move = make_step(
         observation_space=Box(-np.inf, np.inf, (4,), np.float32),
         observation_space_mapping=lambda trader: [trader.sugar, trader.spice, trader.cell.sugar, trader.cell.spice],
@@ -178,7 +178,7 @@ def sugarscape() -> Example:
 
 
 def wolf_sheep() -> Example:
-    """Where wolves and sheep go, from their birth to their death."""
+    """Wolves and sheep decide where to go, from birth to death."""
 
     def moves(kind: str) -> Definition:
         return make_step(
@@ -196,7 +196,7 @@ def wolf_sheep() -> Example:
 
 
 def alliance_formation() -> Example:
-    """Whether two join: agents have no behaviour of their own in this model, so one agent decides for all pairs."""
+    """One agent decides for each pair whether it joins, as this model's own agents have no behaviour."""
     worth = MultiLevelAllianceModel.calculate_shapley_value  # the rule
     join = make_step(
         observation_space=Box(0, np.inf, (4,), np.float32),
@@ -216,11 +216,11 @@ EXAMPLES: Final = (
 )  # fmt: skip
 
 
-# -- how they are run -----------------------------------------------------------------------------
+# -- running the models ---------------------------------------------------------------------------
 
 
 def stepped(model: Callable[..., Any], steps: int = STEPS) -> SteppedSimulation:
-    """Make a simulation of one of these models: with its seed, or with a scenario that holds the seed."""
+    """Make a simulation of one of these models, which takes a seed, or a scenario with the seed."""
     known = vars(sys.modules[model.__module__])
     scenario = next((known[name] for name in known if name.endswith("Scenario") and name != "Scenario"), None)
     if scenario is None:
@@ -229,7 +229,7 @@ def stepped(model: Callable[..., Any], steps: int = STEPS) -> SteppedSimulation:
 
 
 def fingerprint(simulation: SteppedSimulation) -> str:
-    """Take down all that a model holds that is a number or a name: agents, landscape, generators, collected data."""
+    """Write the state of a model as text: agents, landscape, generators, collected data."""
     model = simulation.model
     agents = [
         (type(agent).__name__, {name: plain(value) for name, value in vars(agent).items()}, positions(agent))
@@ -242,12 +242,12 @@ def fingerprint(simulation: SteppedSimulation) -> str:
 
 
 def positions(agent: Any) -> Any:
-    """Where an agent of a continuous space is; it is not held by the agent itself."""
+    """Return the position of an agent in a continuous space, which is not an attribute in its ``vars``."""
     return plain(agent.position) if hasattr(agent, "space") else None
 
 
 def plain(value: Any) -> Any:
-    """Make a value one that can be compared: what is no number and no name counts by its place or its type."""
+    """Make a value comparable: objects that are neither numbers nor names count by their coordinate or their type."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -258,7 +258,7 @@ def plain(value: Any) -> Any:
 
 
 def run_plainly(example: Example, seed: int) -> str:
-    """Run a model as it is, after seeding the global generators, and take down what it then holds."""
+    """Run a model without an environment, after seeding the global generators, and return its final state."""
     simulation = stepped(example[0])
     random.seed(seed)
     np.random.seed(seed)
@@ -268,10 +268,10 @@ def run_plainly(example: Example, seed: int) -> str:
 
 
 def play(example: Example, seed: int, answer: Callable[[Any, str], Any]) -> tuple[int, int, str]:
-    """Play an episode of the AEC environment of a model.
+    """Play an episode of a model's AEC environment.
 
     Returns:
-        How many agents and how many decisions there were, and what the model then holds.
+        The number of agents, the number of decisions, and the final state of the model.
     """
     model, points, options = example
     env = aec_env(stepped(model), points, **options)
@@ -287,27 +287,27 @@ def play(example: Example, seed: int, answer: Callable[[Any, str], Any]) -> tupl
 
 
 def by_rule(env: Any, agent: str) -> Any:
-    """Leave it to the model."""
+    """Follow the model's rule."""
     return RULE
 
 
 def at_random(env: Any, agent: str) -> Any:
-    """Take any legal action."""
+    """Draw a legal action."""
     return env.action_space(agent).sample(env.infos[agent].get("action_mask"))
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What has become of an example.
+    """The results of an example.
 
     Attributes:
         model: Its name.
         decisions: The names of its decision points.
-        lines: How many lines of code its definition has, without comments and empty lines.
-        agents: How many agents have decided in an episode.
-        asked: How many decisions there were in it.
-        same: Whether the run with ``RULE`` throughout is the plain run.
-        moved: Whether random actions make it another.
+        lines: The number of lines of code of its definition, without docstring and empty lines.
+        agents: The number of agents that decided in an episode.
+        asked: The number of decisions in an episode.
+        same: Whether the run with ``RULE`` gives the same state as the run without an environment.
+        moved: Whether random actions give another state.
     """
 
     model: str
@@ -320,7 +320,7 @@ class Outcome:
 
 
 def outcome(function: Callable[[], Example], seed: int = 5) -> Outcome:
-    """Run an example plainly, by rule, and with random actions."""
+    """Run an example without an environment, by its rule, and with random actions."""
     model, points, _ = function()
     agents, asked, by_rules = play(function(), seed, by_rule)
     return Outcome(
@@ -354,7 +354,7 @@ def main() -> None:
     print(f"Mesa {mesa.__version__}, Python {platform.python_version()}, {STEPS} steps")
     print(table(outcomes))
     if not all(one.same and one.moved for one in outcomes):
-        raise SystemExit("some are not what they should be")
+        raise SystemExit("some models differ under RULE, or do not react to random actions")
 
 
 if __name__ == "__main__":

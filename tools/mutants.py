@@ -1,15 +1,15 @@
-"""Mutants of the library: small mistakes put into a copy of it, one at a time, and do the tests find them?
+"""Mutation tests of the library: put small mistakes into a copy of it, one at a time; do the tests find them?
 
-Run with ``python -m tools.mutants``, or ``make mutants``. What is found goes to a file as it comes, one JSON object a
-line. Started once more, the script goes on where it was stopped; with ``--again`` it tries the survivors anew, which
-is what one wants when tests have been added. It draws from all modules except ``testing``, ``many/plots.py`` and the
-models among ``templates``.
+Run it with ``python -m tools.mutants``, or ``make mutants``. It writes each result to a file at once, one JSON object
+per line. A second call resumes where the first stopped; with ``--again`` it retries the survivors, for example after
+tests were added. It draws mutants from all modules except ``testing``, ``many/plots.py`` and the models among
+``templates``.
 
-Before the first mutant, the tests run once and it is measured which of them execute which lines, and how long they
-take. A mutant is only shown to tests that execute its function: first those that execute its line, some quick ones of
-each file before the others.
+Before the first mutant, it runs all tests once and measures which tests execute which lines, and their durations. Only
+tests that execute a mutant's function run for it: first those that execute its line, some quick ones of each file
+before the others.
 
-Some changes are no mistakes: ``mutants_known.toml`` has each with the reason why no test need find it.
+Some changes are no mistakes (equivalent mutants): ``mutants_known.toml`` lists each with the reason.
 """
 
 from __future__ import annotations
@@ -43,31 +43,31 @@ PACKAGE = Path("src/simenv_marl")
 LEFT_OUT = ("testing/", "many/plots.py", *(f"templates/{name}" for name in ("mesa", "plain", "simpy", "test_")))
 COPIED = ("src", "tests", "tools", "examples", "benchmarks", "docs", "README.md", "CHANGELOG.md", "pyproject.toml")
 TEST_LIMIT = 20.0
-"""Seconds that any test may take, beyond ten times what it took when nothing was wrong."""
+"""The time limit of a test in seconds, in addition to ten times its normal duration."""
 FIRST = 6
-"""How many tests of each file come first, which are its quickest."""
+"""The number of tests of each file that come first, its quickest ones."""
 QUICK = 0.2
-"""Seconds that those may take at most."""
+"""The longest duration of those tests, in seconds."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What has been measured: which tests execute which lines, and how long they take.
+    """The measurements: which tests execute which lines, and their durations.
 
     Attributes:
-        seconds: By test that passes, in the order in which they ran.
-        lines: By module and line, the tests that execute it.
+        seconds: The durations of the tests that pass, in the order in which they ran.
+        lines: For each module and line, the tests that execute it.
     """
 
     seconds: dict[str, float]
     lines: dict[str, dict[int, list[str]]]
 
     def tests(self, mutant: Mutant) -> list[str]:
-        """The tests that could find a mutant, in the order in which they are to run.
+        """List the tests that could find a mutant, in the order in which they should run.
 
-        First those that execute its line; then those that execute anything in its function, because what comes after a
-        switch between stacks is not always measured. Of what nothing executes, as at the import, all tests of the files
-        that execute anything in its module.
+        First those that execute its line; then those that execute any line of its function, because the measurement
+        can miss lines after a switch between stacks. If no test executes the function, as with code that runs at
+        import, all tests of the files that execute any line of its module.
         """
         lines = self.lines.get(mutant.module, {})
         found = [
@@ -80,7 +80,7 @@ class Measured:
         return list(dict.fromkeys(test for tests in found for test in self.ordered(tests)))
 
     def ordered(self, found: set[str]) -> list[str]:
-        """Tests in the order in which they are to run: some quick ones of each file first."""
+        """Sort tests into the order in which they should run: some quick ones of each file first."""
         by_file: dict[str, list[str]] = {}
         for test in self.seconds:
             if test in found:
@@ -93,25 +93,25 @@ class Measured:
             for test in sorted(tests, key=lambda test: ("[thread" in test, self.seconds[test]))[:FIRST]
         ]
         rest = [test for tests in files for test in tests]
-        rest.sort(key=lambda test: "[thread" in test)  # what the first driver finds, the second one need not
+        rest.sort(key=lambda test: "[thread" in test)  # the second driver rarely finds more than the first
         return first_ones + rest
 
 
 def file_of(test: str) -> str:
-    """The file in which a test stands."""
+    """Return the file of a test."""
     return test.partition("::")[0]
 
 
 def main() -> None:
-    """What ``python -m tools.mutants`` does."""
+    """Try mutants, and print a report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--number", type=int, default=200, help="how many mutants (200)")
-    parser.add_argument("--seed", type=int, default=0, help="with which they are drawn (0)")
-    parser.add_argument("--jobs", type=int, default=2, help="how many at a time (2)")
-    parser.add_argument("--out", type=Path, default=ROOT / ".mutants", help="the folder for what is found")
-    parser.add_argument("--only", default="", metavar="PATH", help="modules whose path below the package begins so")
-    parser.add_argument("--again", action="store_true", help="try those anew that have survived")
-    parser.add_argument("--report", action="store_true", help="only show what has been found")
+    parser.add_argument("--number", type=int, default=200, help="number of mutants (200)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the draw (0)")
+    parser.add_argument("--jobs", type=int, default=2, help="number of parallel jobs (2)")
+    parser.add_argument("--out", type=Path, default=ROOT / ".mutants", help="folder for the results")
+    parser.add_argument("--only", default="", metavar="PATH", help="only modules whose path begins with PATH")
+    parser.add_argument("--again", action="store_true", help="retry the survivors")
+    parser.add_argument("--report", action="store_true", help="only show the results so far")
     given = parser.parse_args()
     given.out.mkdir(exist_ok=True)
     results = given.out / f"seed-{given.seed}.jsonl"
@@ -135,13 +135,13 @@ def main() -> None:
 
 
 def modules() -> list[str]:
-    """The modules that mutants are drawn from."""
+    """List the modules from which mutants are drawn."""
     paths = sorted(path.relative_to(ROOT / PACKAGE).as_posix() for path in (ROOT / PACKAGE).rglob("*.py"))
     return [path for path in paths if not path.startswith(LEFT_OUT)]
 
 
 def draw(number: int, seed: int, only: str) -> list[Mutant]:
-    """So many mutants: of each module by its share of all there could be, at least one, of all kinds alike."""
+    """Draw mutants: from each module in proportion to its candidates, at least one, and evenly from all kinds."""
     found = {path: candidates(path, (ROOT / PACKAGE / path).read_text(encoding="utf-8")) for path in modules()}
     found = {path: mutants for path, mutants in found.items() if mutants and path.startswith(only)}
     total = sum(map(len, found.values()))
@@ -163,11 +163,11 @@ def draw(number: int, seed: int, only: str) -> list[Mutant]:
     return drawn
 
 
-# -- which test executes what ---------------------------------------------------------------------
+# -- which test executes which lines --------------------------------------------------------------
 
 
 def copied(folder: Path) -> Path:
-    """A copy of everything that the tests need."""
+    """Copy everything that the tests need to a folder."""
     for name in COPIED:
         source = ROOT / name
         if source.is_dir():
@@ -179,13 +179,13 @@ def copied(folder: Path) -> Path:
 
 
 def environment(folder: Path, **more: Path) -> dict[str, str]:
-    """The environment variables of the tests of a copy."""
+    """Return the environment variables for the tests of a copy."""
     path = os.pathsep.join([str(folder / "src"), str(folder)])
     return os.environ | {"PYTHONPATH": path, "MUTANTS_ROOT": str(folder)} | {name: str(at) for name, at in more.items()}
 
 
 def measure(cache: Path) -> Measured:
-    """Run all tests and see what they execute, unless that is known already of just this source and these tests."""
+    """Run all tests and measure which lines they execute, unless the cache has the same sources and tests."""
     digest = hashlib.sha256()
     for path in sorted([*ROOT.glob("src/**/*.py"), *ROOT.glob("tests/**/*.py")]):
         digest.update(path.read_bytes())
@@ -214,7 +214,7 @@ def measure(cache: Path) -> Measured:
 
 
 def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
-    """What the tests of a copy have noted."""
+    """Read the measurements of the tests of a copy."""
     from coverage import CoverageData
 
     outcomes: dict[str, tuple[str, float]] = {}
@@ -222,7 +222,7 @@ def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
         if outcomes.get(name, ("passed",))[0] == "passed":
             outcomes[name] = outcome, seconds
     for name in (name for name, (outcome, _) in outcomes.items() if outcome != "passed"):
-        print(f"left out, for it fails anyway: {name}", flush=True)
+        print(f"left out, because it fails without a mutant: {name}", flush=True)
     seconds_of = {name: seconds for name, (outcome, seconds) in outcomes.items() if outcome == "passed"}
     covered = CoverageData(str(data))
     covered.read()
@@ -238,20 +238,20 @@ def measured_in(folder: Path, notes: Path, data: Path) -> Measured:
 
 
 def twin(test: str) -> str:
-    """The same test with the other driver; it is not measured, but is taken to execute the same lines."""
+    """Return the same test with the other driver, which is assumed to execute the same lines."""
     return test.replace("[greenlet", "[thread", 1)
 
 
 def read(path: Path) -> list[Any]:
-    """The objects in a file of JSON lines, which need not be there."""
+    """Read the objects of a file of JSON lines; none if there is no file."""
     return list(map(json.loads, path.read_text(encoding="utf-8").splitlines())) if path.exists() else []
 
 
-# -- one mutant after the other -------------------------------------------------------------------
+# -- trying mutants -------------------------------------------------------------------------------
 
 
 def tried(mutants: list[Mutant], measured: Measured, jobs: int) -> Iterator[dict[str, Any]]:
-    """Show mutants to the tests, some at a time, each in a copy that no other is in."""
+    """Run the tests for each mutant, several mutants in parallel, each in its own copy."""
     with tempfile.TemporaryDirectory(prefix="mutants-") as temporary, ThreadPoolExecutor(jobs) as threads:
         free: SimpleQueue[Path] = SimpleQueue()
         for number in range(jobs):
@@ -270,7 +270,7 @@ def tried(mutants: list[Mutant], measured: Measured, jobs: int) -> Iterator[dict
 
 
 def outcome(mutant: Mutant, folder: Path, measured: Measured) -> dict[str, Any]:
-    """Whether a test finds a mutant, and which."""
+    """Find out whether a test finds a mutant, and which."""
     path = folder / PACKAGE / mutant.module
     original, begun = path.read_text(encoding="utf-8"), time.monotonic()
     changed = mutant.applied(original)
@@ -312,14 +312,14 @@ def outcome(mutant: Mutant, folder: Path, measured: Measured) -> dict[str, Any]:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a module, and forget what was compiled of it: within a second, its time says nothing."""
+    """Write a module, and delete its compiled files, as timestamps do not show changes within a second."""
     for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
         compiled.unlink(missing_ok=True)
     path.write_text(text, encoding="utf-8")
 
 
 def run(command: list[str], folder: Path, variables: dict[str, str], limit: float) -> int | str:
-    """The exit status of a command, or that its time was up; nothing of it is left."""
+    """Run a command, end all its processes, and return its exit status or "time limit"."""
     with subprocess.Popen(
         command, cwd=folder, env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     ) as process:
@@ -333,7 +333,7 @@ def run(command: list[str], folder: Path, variables: dict[str, str], limit: floa
 
 
 def report(results: list[dict[str, Any]]) -> None:
-    """Show by module and by kind how many were killed, and each of those that have survived."""
+    """Print how many mutants were killed, by module and by kind, and each survivor."""
     for what in ("module", "kind"):
         drawn = Counter(result[what] for result in results)
         killed = Counter(result[what] for result in results if result["outcome"] == "killed")
@@ -355,14 +355,14 @@ def report(results: list[dict[str, Any]]) -> None:
 
 
 def reasons() -> list[dict[str, str]]:
-    """The changes that are known to be no mistakes."""
+    """Read the changes that are known to be no mistakes."""
     text = (ROOT / "tools/mutants_known.toml").read_text(encoding="utf-8")
     found: list[dict[str, str]] = tomllib.loads(text)["known"]
     return found
 
 
 def change_of(result: dict[str, Any]) -> str:
-    """The lines that a mutant has changed, wherever they stand: those before, and those after."""
+    """Return the lines that a mutant changes, before and after, without their line numbers."""
     lines = [line for line in result["diff"].splitlines()[3:] if line.startswith(("-", "+"))]
     return "\n".join(f"{line[0]} {line[1:].strip()}" for line in lines)
 

@@ -1,7 +1,7 @@
-"""Which mutants of a module there could be: each a small mistake of one of a few kinds.
+"""Find all possible mutants of a module: each is a small mistake of one of a few kinds.
 
-What cannot matter is left out: annotations, docstrings, the words of messages, what is only there for type checkers,
-and what only says what holds anyway (``assert``, ``strict=``, the bodies of abstract methods).
+This leaves out changes without an effect on correct programs: in annotations, docstrings, texts of messages, code for
+type checkers, and code that only states what holds anyway (``assert``, ``strict=``, the bodies of abstract methods).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ CLEAN_UPS = {
     "cancel", "clear", "close", "discard", "join", "kill", "pop", "popitem", "release", "remove", "shutdown",
     "terminate", "unlink",
 }  # fmt: skip
-"""Methods that put something away."""
+"""Methods that clean up."""
 COMPARISONS: dict[type[ast.cmpop], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
     ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in",
@@ -40,11 +40,11 @@ class Mutant:
 
     Attributes:
         module: Its path below the package.
-        kind: What kind of mistake it is.
-        at: Where the text that is replaced begins and ends, in bytes.
-        instead: What replaces it.
-        lines: The first and the last line of the statement (of its head, where others are in it).
-        function: The same of the function around it.
+        kind: The kind of mistake.
+        at: The begin and the end of the replaced text, in bytes.
+        instead: The new text.
+        lines: The first and the last line of the statement (of its head, if it contains others).
+        function: The first and the last line of the enclosing function.
     """
 
     module: str
@@ -56,28 +56,28 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        """What no other mutant of this source is called."""
+        """A name that is unique for this source."""
         return f"{self.module}:{self.lines[0]} {self.kind} {self.at[0]}-{self.at[1]} {hash_of(self.instead)}"
 
     def applied(self, text: str) -> str:
-        """The text with the mistake in it."""
+        """Return the text with the mistake."""
         data = text.encode()
         return (data[: self.at[0]] + self.instead.encode() + data[self.at[1] :]).decode()
 
 
 def hash_of(text: str) -> str:
-    """A few letters that stay the same in every process."""
+    """Return a short hash that is the same in every process."""
     return f"{sum(number * letter for number, letter in enumerate(text.encode(), 1)) % 46656:05d}"
 
 
 def candidates(module: str, text: str) -> list[Mutant]:
-    """All mutants that there could be of a module."""
+    """List all possible mutants of a module."""
     found = {(mutant.at, mutant.instead): mutant for mutant in Drawer(module, text).all()}
     return [mutant for mutant in found.values() if compiles(mutant.applied(text))]
 
 
 def compiles(text: str) -> bool:
-    """Whether Python takes it at all."""
+    """Tell whether Python can compile a text."""
     try:
         compile(text, "mutant", "exec", dont_inherit=True)
     except SyntaxError:
@@ -86,7 +86,7 @@ def compiles(text: str) -> bool:
 
 
 class Drawer:
-    """Goes through the tree of a module."""
+    """Walks the syntax tree of a module, and yields its mutants."""
 
     def __init__(self, module: str, text: str) -> None:
         self.module = module
@@ -97,22 +97,22 @@ class Drawer:
             self.starts.append(self.starts[-1] + len(line))
 
     def span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
-        """Where a node begins and ends, in bytes."""
+        """Return the begin and the end of a node, in bytes."""
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
         return self.starts[node.lineno - 1] + node.col_offset, self.starts[node.end_lineno - 1] + node.end_col_offset
 
     def source(self, node: ast.expr | ast.stmt) -> str:
-        """A node's text."""
+        """Return the text of a node."""
         begin, end = self.span(node)
         return self.data[begin:end].decode()
 
     def all(self) -> Iterator[Mutant]:
-        """Every mutant of every kind."""
+        """Yield all mutants of all kinds."""
         yield from self.block(self.tree.body, (0, 0))
 
     def block(self, body: list[ast.stmt], function: tuple[int, int]) -> Iterator[Mutant]:
-        """Mutants of statements that follow each other."""
+        """Yield the mutants of a block of statements."""
         for number, statement in enumerate(body):
             if not counts(statement):
                 continue
@@ -134,7 +134,7 @@ class Drawer:
     def of_statement(
         self, statement: ast.stmt, rest: list[ast.stmt], lines: tuple[int, int], function: tuple[int, int]
     ) -> Iterator[Mutant]:
-        """It is dropped, or changes places with the next one."""
+        """Yield the mutants of a statement as a whole: it is dropped, or swapped with the next one."""
         kind = "clean-up" if puts_away(statement) else "dropped"
         yield Mutant(self.module, kind, self.span(statement), "pass", lines, function)
         if rest and isinstance(rest[0], SIMPLE) and counts(rest[0]) and depend(statement, rest[0]):
@@ -143,7 +143,7 @@ class Drawer:
             yield Mutant(self.module, "swapped", (begin, end), swapped, (lines[0], head(rest[0])), function)
 
     def of_expressions(self, statement: ast.stmt) -> Iterator[tuple[str, tuple[int, int], str]]:
-        """Mutants of the expressions of a statement, without those of the statements in it."""
+        """Yield the mutants of a statement's own expressions, without those of the statements in it."""
         if isinstance(statement, ast.If | ast.While) and not isinstance(statement.test, ast.Constant):
             yield "negated", self.span(statement.test), f"not ({self.source(statement.test)})"
         for node in expressions(statement):
@@ -173,13 +173,13 @@ class Drawer:
 
 
 def head(statement: ast.stmt) -> int:
-    """The last line of a statement's head, which is all of it where no others are in it."""
+    """Return the last line of a statement's head, which is the whole statement if it contains no others."""
     inner = [block[0].lineno for block in blocks(statement) if block]
     return max(statement.lineno, min(inner) - 1) if inner else statement.end_lineno or statement.lineno
 
 
 def counts(statement: ast.stmt) -> bool:
-    """Whether a mistake in a statement is one at all, and not a matter of names, types or words."""
+    """Tell whether a change of a statement can be a mistake, and does not concern names, types or texts alone."""
     if isinstance(statement, ast.Import | ast.ImportFrom | ast.Global | ast.Nonlocal | ast.Pass | ast.Assert):
         return False
     if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
@@ -201,7 +201,7 @@ def counts(statement: ast.stmt) -> bool:
 
 
 def blocks(statement: ast.stmt) -> Iterator[list[ast.stmt]]:
-    """The statements in a statement, but for those that it ends with in any case."""
+    """Yield the blocks of statements in a statement."""
     for field in ("body", "orelse", "finalbody"):
         yield from filter(None, [getattr(statement, field, None)])
     for part in (*getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
@@ -209,7 +209,7 @@ def blocks(statement: ast.stmt) -> Iterator[list[ast.stmt]]:
 
 
 def expressions(statement: ast.stmt) -> Iterator[ast.expr]:
-    """The expressions of a statement that matter: no annotations, no messages, nothing of the statements in it."""
+    """Yield a statement's own expressions, without annotations and messages."""
     waiting: list[ast.AST] = []
     for field, value in ast.iter_fields(statement):
         if field not in ("annotation", "returns", "decorator_list", "type_params", "bases"):
@@ -229,7 +229,7 @@ def expressions(statement: ast.stmt) -> Iterator[ast.expr]:
 
 
 def puts_away(statement: ast.stmt) -> bool:
-    """Whether a statement cleans up."""
+    """Tell whether a statement cleans up."""
     if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Call):
         function = statement.value.func
         return isinstance(function, ast.Attribute) and function.attr in CLEAN_UPS
@@ -237,22 +237,22 @@ def puts_away(statement: ast.stmt) -> bool:
 
 
 def copies(function: ast.expr) -> bool:
-    """Whether a function copies its first argument."""
+    """Tell whether a function copies its first argument."""
     name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
     return name in COPIES
 
 
 def depend(one: ast.stmt, other: ast.stmt) -> bool:
-    """Whether it may matter which of two statements comes first."""
+    """Tell whether the order of two statements can matter."""
     if ast.dump(one) == ast.dump(other) or not isinstance(one, ast.Assign | ast.AugAssign | ast.Expr | ast.Delete):
-        return False  # what follows a return is never reached
+        return False  # code after a return is never reached
     lists = [appended_to(one), appended_to(other)]
     if None not in lists and lists[0] != lists[1]:
         return False
     calls = [
         any(isinstance(node, ast.Call | ast.Yield | ast.Await) for node in ast.walk(part)) for part in (one, other)
     ]
-    if all(calls) and (isinstance(one, ast.Expr) or isinstance(other, ast.Expr)):  # what is called for what it does
+    if all(calls) and (isinstance(one, ast.Expr) or isinstance(other, ast.Expr)):  # a call for its side effects
         return True
     if isinstance(other, ast.Return | ast.Raise | ast.Continue | ast.Break):
         return True
@@ -260,7 +260,7 @@ def depend(one: ast.stmt, other: ast.stmt) -> bool:
 
 
 def appended_to(statement: ast.stmt) -> str | None:
-    """What a statement appends something to, if it does nothing else."""
+    """Return the list to which a statement appends, if it does nothing else."""
     call = statement.value if isinstance(statement, ast.Expr) else None
     if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute) or call.func.attr != "append":
         return None
@@ -269,13 +269,13 @@ def appended_to(statement: ast.stmt) -> str | None:
 
 
 def changed_by(statement: ast.stmt) -> set[str]:
-    """What a statement assigns to, as it is written."""
+    """Return the targets of a statement's assignments, as source text."""
     inner = [node.target for node in ast.walk(statement) if isinstance(node, ast.comprehension)]
-    own = {id(name) for target in inner for name in ast.walk(target)}  # which nothing else sees
+    own = {id(name) for target in inner for name in ast.walk(target)}  # local to the comprehension
     nodes = (node for node in ast.walk(statement) if isinstance(getattr(node, "ctx", None), ast.Store))
     return {ast.unparse(node) for node in nodes if id(node) not in own}
 
 
 def names_in(statement: ast.stmt) -> set[str]:
-    """The names and attributes in a statement, as they are written."""
+    """Return the names and attributes in a statement, as source text."""
     return {ast.unparse(node) for node in ast.walk(statement) if isinstance(node, ast.Name | ast.Attribute)}

@@ -1,8 +1,8 @@
-"""A plugin of pytest's for ``tools.mutants``: it notes how long tests take, and runs chosen ones in a given order.
+"""A pytest plugin for ``tools.mutants``: it records the durations of tests, and runs chosen tests in a given order.
 
-It is told what to do by two environment variables, each with the name of a file: ``MUTANTS_NOTE``, to which each test's
-name, outcome and seconds are written, and ``MUTANTS_TESTS``, a JSON object of names of tests, in the order in which
-they are to run, and the seconds that each may take. A test that takes longer ends the whole process.
+Two environment variables with the name of a file each control it. To ``MUTANTS_NOTE`` it writes each test's name,
+outcome and seconds. ``MUTANTS_TESTS`` is a JSON object that maps the names of the tests to run, in their order, to the
+time limit of each in seconds. A test that takes longer ends the whole process.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _seconds: dict[str, float] = {}
 
 
 def pytest_configure(config: Any) -> None:
-    """See to it that the copy of the library is tested, and no other."""
+    """Check that the tests import the copy of the library, and no other."""
     import simenv_marl
 
     if not Path(simenv_marl.__file__).is_relative_to(_ROOT):
@@ -41,20 +41,20 @@ def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
 
 
 def pytest_runtest_logstart(nodeid: str) -> None:
-    """From here on the test's time runs."""
+    """Start the timer of a test."""
     if nodeid in _limits:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, _limits[nodeid])
 
 
 def pytest_runtest_logfinish(nodeid: str) -> None:
-    """The test has ended within its time."""
+    """Stop the timer of a test that has ended in time."""
     if nodeid in _limits:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 def pytest_runtest_logreport(report: Any) -> None:
-    """Note what became of a test. With several processes, the one that collects the reports does it."""
+    """Record the outcome of a test. With several processes, the one that collects the reports does it."""
     if _NOTE is None or "PYTEST_XDIST_WORKER" in os.environ:
         return
     _seconds[report.nodeid] = _seconds.get(report.nodeid, 0.0) + report.duration

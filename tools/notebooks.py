@@ -1,6 +1,6 @@
-"""Notebooks of pages: the same text and the same code, with the outputs that the page shows.
+"""Make notebooks of pages: the same text and the same code, with the outputs that the page shows.
 
-``docs/conf.py`` calls ``write_notebooks`` when the pages are built. The tests run the code of the pages and of the
+``docs/conf.py`` calls ``write_notebooks`` when Sphinx builds the pages. The tests run the code of the pages and of the
 notebooks.
 """
 
@@ -53,7 +53,7 @@ def notebook(docs: Path, page: str) -> dict[str, Any]:
 
 
 def _cells(docs: Path, text: str) -> Iterator[dict[str, Any]]:
-    """The cells of a page, in its order; a file that the page needs is written by a cell before its first use."""
+    """Yield the cells of a page, in order; a cell writes each file that the page needs before its first use."""
     position, written = 0, set[str]()
     for found in [*FENCE.finditer(text), None]:
         prose = text[position : found.start() if found else None].strip()
@@ -72,7 +72,7 @@ def _cells(docs: Path, text: str) -> Iterator[dict[str, Any]]:
 
 
 def _prose(docs: Path, text: str) -> str:
-    """Replace what only the pages know: links to other pages, and files to download."""
+    """Replace links to other pages and to downloads, which do not work in a notebook."""
 
     def title(link: re.Match[str]) -> str:
         if link[1] or not link[2]:
@@ -84,7 +84,7 @@ def _prose(docs: Path, text: str) -> str:
 
 
 def _examples(session: str) -> Iterator[dict[str, Any]]:
-    """The cells of a session: each ends where the session shows an output."""
+    """Yield the cells of a session: each ends where the session shows an output."""
     sources: list[str] = []
     for example in DocTestParser().get_examples(session):
         sources.append(example.source)

@@ -1,5 +1,5 @@
 #!/bin/sh
-# What the simulators outside Python are built with: installed where that is allowed, else told of.
+# Installs the tools that build the simulators outside Python, or reports what is missing.
 set -eu
 
 missing=""
@@ -14,5 +14,5 @@ if [ "$(id -u)" = 0 ] && command -v apt-get > /dev/null; then
     # shellcheck disable=SC2086
     DEBIAN_FRONTEND=noninteractive apt-get install -qq --yes --no-install-recommends $missing > /dev/null
 else
-    echo "not installed, and not to be installed by this user:$missing. Tests that need them are skipped." >&2
+    echo "missing, and this user cannot install them:$missing. Tests that need them are skipped." >&2
 fi

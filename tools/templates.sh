@@ -1,6 +1,6 @@
 #!/bin/sh
-# Builds the wheel and begins with each template in an empty folder, where nothing but the wheel is installed. The newest
-# Python that is there serves, and with it the newest Mesa, whose example models are tried as well.
+# Builds the wheel, installs it, and creates each template in an empty folder and runs its tests. Uses the newest Python
+# found, and with it the newest Mesa, whose example models are tested as well.
 set -eu
 cd "$(dirname "$0")/.."
 venv=$PWD/.venv-templates
@@ -16,7 +16,7 @@ rm -rf "$venv/dist"
 "$venv/bin/pip" wheel $quiet --no-deps --wheel-dir "$venv/dist" .
 wheel=$(echo "$venv"/dist/*.whl)
 "$venv/bin/pip" install $quiet "$wheel[experiments]" pytest hypothesis simpy cma "mesa[network]"
-"$venv/bin/pip" install $quiet --force-reinstall --no-deps "$wheel" # of the same version, and yet another one
+"$venv/bin/pip" install $quiet --force-reinstall --no-deps "$wheel" # the same version, but a new build
 
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
@@ -26,7 +26,7 @@ for kind in plain simpy mesa; do
         "$venv/bin/python" -m simenv_marl new $kind "my_$kind"
         cd "my_$kind"
         "$venv/bin/python" -m pytest -q
-        # The plain one is trained by Stable-Baselines3: tests/clients/test_templates.py.
+        # the plain template trains with Stable-Baselines3: see tests/clients/test_templates.py
         test $kind = plain || "$venv/bin/python" -m "my_$kind" --quick
     )
 done

@@ -1,4 +1,4 @@
-// The least that a process can do that asks over a pipe: a line out, a line in; what comes in is not even looked at.
+// The minimal process that asks over a pipe: it writes a line and reads a line, which it does not parse.
 
 #include <unistd.h>
 

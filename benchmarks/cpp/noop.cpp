@@ -1,5 +1,5 @@
-// A simulator that does nothing but ask, turn by turn for two entities, without an end. By itself it prints how many
-// microseconds a decision takes.
+// A simulator that only asks for decisions, alternately for two entities, without an end. Without an environment, it
+// prints the microseconds per decision.
 
 #include <simenv.hpp>
 

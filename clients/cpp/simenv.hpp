@@ -1,6 +1,6 @@
 // simenv.hpp: the client of simenv_marl for simulators in C++. One header, C++17, POSIX, no dependencies.
 //
-// The simulator keeps its own loop and asks for decisions where it makes them:
+// The simulator keeps its own main loop, and asks for a decision where it would make one:
 //
 //     simenv::Client client({"sender.rate"});
 //     return client.run([&](const simenv::Episode& episode) {
@@ -9,8 +9,8 @@
 //         return model.sent();
 //     });
 //
-// Inside an environment (the variable SIMENV_MARL_FDS names a pair of pipes) the environment decides. Outside of one
-// `decide` runs the rule, at the cost of a test. A client belongs to one thread.
+// Inside an environment (the variable SIMENV_MARL_FDS names a pair of pipes), the environment decides. Without one,
+// `decide` runs the rule; the overhead is one test. Use a client from one thread only.
 
 #ifndef SIMENV_HPP
 #define SIMENV_HPP
@@ -50,19 +50,19 @@
 
 namespace simenv {
 
-/// How many bytes a line may have, its end included.
+/// The maximum length of a line in bytes, including its end.
 constexpr std::size_t LONGEST = std::size_t{16} << 20;
 
 /// The time of a simulation without a clock.
 constexpr double NO_TIME = std::numeric_limits<double>::quiet_NaN();
 
-/// Thrown by `decide` to unwind the model when its episode is given up. No std::exception, so that what a model does
-/// about errors does not meet it; what catches everything (`catch (...)`) must throw it on.
+/// Thrown by `decide` to unwind the model when the environment stops its episode. It is no std::exception, so that the
+/// model's error handling does not catch it; a `catch (...)` must rethrow it.
 struct Stop {};
 
 // -- JSON ------------------------------------------------------------------------------------------------------------
 
-/// What cannot be read as JSON, or is not of the type that was asked for.
+/// Invalid JSON, or a value that does not have the requested type.
 struct JsonError : std::invalid_argument {
     using std::invalid_argument::invalid_argument;
 };
@@ -74,7 +74,7 @@ template <class T> struct IsMap<T, std::void_t<typename T::mapped_type>> : std::
 template <class T> struct IsVector : std::false_type {};
 template <class T> struct IsVector<std::vector<T>> : std::true_type {};
 
-/// The length of the UTF-8 sequence that begins here; 0 if it is none.
+/// The length of the UTF-8 sequence at the begin of a text; 0 if it is invalid.
 inline std::size_t utf8_length(std::string_view text) {
     const auto byte = [&](std::size_t i) { return static_cast<unsigned char>(text[i]); };
     const unsigned char first = byte(0);
@@ -91,7 +91,7 @@ inline std::size_t utf8_length(std::string_view text) {
     return length;
 }
 
-/// The same text with U+FFFD for what is not UTF-8.
+/// The same text with U+FFFD in place of invalid UTF-8.
 inline std::string repaired(std::string_view text) {
     std::string out;
     for (std::size_t i = 0; i < text.size();) {
@@ -122,7 +122,7 @@ inline void write_text(std::string& out, std::string_view text) {
     out += '"';
 }
 
-/// The shortest number that is read as the same double; always with a point or an exponent, so that it stays a float.
+/// The shortest text that parses to the same double; always with a point or an exponent, so that it stays a float.
 inline void write_double(std::string& out, double value) {
     if (!std::isfinite(value)) {
         const char* name = std::isnan(value) ? "nan" : value > 0 ? "inf" : "-inf";
@@ -145,7 +145,7 @@ inline void write_double(std::string& out, double value) {
 
 }  // namespace detail
 
-/// A value as JSON has it. Integers are those of 64 bits; {"float": "nan"} and its like are read as doubles.
+/// A JSON value. Integers have 64 bits; {"float": "nan"} and the like are read as doubles.
 class Json {
   public:
     using Array = std::vector<Json>;
@@ -165,14 +165,14 @@ class Json {
     Json(Object members) : value_(std::move(members)) {}
     template <class T> Json(const std::vector<T>& values) : value_(Array(values.begin(), values.end())) {}
 
-    /// Reads one value. Throws JsonError.
+    /// Parses one value. Throws JsonError.
     static Json parse(std::string_view text);
 
     bool is_null() const { return std::holds_alternative<std::monostate>(value_); }
     bool is_object() const { return std::holds_alternative<Object>(value_); }
     bool is_true() const { return std::holds_alternative<bool>(value_) && std::get<bool>(value_); }
 
-    /// The member of that name, or null, by a pointer that lasts as long as this value.
+    /// A pointer to the member of that name, or null. It is valid as long as this value.
     const Json* find(std::string_view name) const {
         const Object* members = std::get_if<Object>(&value_);
         if (members)
@@ -181,13 +181,13 @@ class Json {
         return nullptr;
     }
 
-    /// The member of that name. Throws JsonError where there is none.
+    /// The member of that name. Throws JsonError if there is none.
     const Json& operator[](std::string_view name) const {
         if (const Json* member = find(name)) return *member;
         throw JsonError("no member \"" + std::string(name) + "\" in " + shown());
     }
 
-    /// The value as an integer of that type, if it is one that fits.
+    /// The value as an integer of that type, if it is an integer that fits.
     template <class T> std::optional<T> integer() const {
         const auto kept = [](auto number) -> std::optional<T> {
             const T cast = static_cast<T>(number);
@@ -258,8 +258,8 @@ void write_many(std::string& out, char open, const Range& items, char close, Eac
     out += close;
 }
 
-/// Writes a value as JSON: what a Json can hold, ranges and maps of that, and what a function returns. Throws JsonError
-/// for what is not UTF-8.
+/// Writes a value as JSON: any value that a Json can hold, ranges and maps of such values, and results of functions.
+/// Throws JsonError for invalid UTF-8.
 template <class T> void write(std::string& out, const T& value) {
     if constexpr (std::is_same_v<T, Json>) {
         value.write(out);
@@ -287,7 +287,7 @@ template <class T> void write(std::string& out, const T& value) {
     }
 }
 
-/// A value as the model takes it; an error begins with what it is about.
+/// A value converted to the model's type; the text of an error begins with the name of the value.
 template <class T, class About> T taken(const Json& value, About&& about) {
     try {
         return value.as<T>();
@@ -296,7 +296,7 @@ template <class T, class About> T taken(const Json& value, About&& about) {
     }
 }
 
-/// Reads JSON (RFC 8259).
+/// Parses JSON (RFC 8259).
 class Reader {
   public:
     explicit Reader(std::string_view text) : text_(text) {}
@@ -467,7 +467,7 @@ inline void Json::write(std::string& out) const {
 
 // -- the client ------------------------------------------------------------------------------------------------------
 
-/// Anything that can be written as JSON, for as long as the call to which it is given.
+/// A reference to anything that can be written as JSON, valid during the call that gets it.
 class Value {
   public:
     template <class T, std::enable_if_t<!std::is_same_v<T, Value>, int> = 0>
@@ -482,7 +482,7 @@ class Value {
 };
 
 /// The arguments of a call, as in {{"queue", 3.0}, {"rtt", rtt}}, or an object: a Json, a map by name, or a function
-/// that returns one, called where there is an environment. To be made in the call itself: it refers to what is given.
+/// that returns one, which is called only if there is an environment. Create it in the call: it holds references.
 class Arguments {
   public:
     Arguments(std::initializer_list<std::pair<std::string_view, Value>> arguments) : arguments_(arguments) {}
@@ -505,12 +505,12 @@ class Arguments {
     std::optional<Value> object_;
 };
 
-/// What an episode begins with.
+/// The parameters of an episode.
 struct Episode {
     std::uint64_t seed;
     Json options;
 
-    /// The option of that name, or what it is by default. Throws JsonError for one of another type.
+    /// The option of that name, or its default. Throws JsonError if it has another type.
     template <class T> T option(std::string_view name, T otherwise) const {
         const Json* found = options.find(name);
         return found ? detail::taken<T>(*found, [&] { return "option " + std::string(name); }) : otherwise;
@@ -520,10 +520,10 @@ struct Episode {
     }
 };
 
-/// The simulator's side of the wire. There is one in a process.
+/// The simulator's side of the wire. A process has one client.
 class Client {
   public:
-    /// Takes the names of the points that the model is going to ask at, as the environment knows them.
+    /// Takes the names of the model's decision points, which the environment uses as well.
     explicit Client(std::vector<std::string> points) : points_(std::move(points)) {
         const char* found = std::getenv("SIMENV_MARL_FDS");
         if (!found) return;
@@ -531,12 +531,12 @@ class Client {
         if (std::sscanf(found, "%d,%d%n", &in_, &out_, &length) != 2 || found[length])
             throw std::invalid_argument(std::string("SIMENV_MARL_FDS is to be two descriptors, R,W, not ") + found);
         for (const int descriptor : {in_, out_})
-            if (fcntl(descriptor, F_SETFD, FD_CLOEXEC) == -1)  // what the model starts must not hold the pipes open
+            if (fcntl(descriptor, F_SETFD, FD_CLOEXEC) == -1)  // child processes must not keep the pipes open
                 throw std::invalid_argument(std::string("SIMENV_MARL_FDS=") + found + ": " + std::strerror(errno));
         unsetenv("SIMENV_MARL_FDS");
         struct sigaction action {};
         if (sigaction(SIGPIPE, nullptr, &action) == 0 && action.sa_handler == SIG_DFL)
-            std::signal(SIGPIPE, [](int) {});  // and not SIG_IGN, which what the model starts would inherit
+            std::signal(SIGPIPE, [](int) {});  // not SIG_IGN, which child processes would inherit
         connected_ = true;
     }
     Client(const Client&) = delete;
@@ -545,14 +545,15 @@ class Client {
     /// Whether there is an environment.
     bool connected() const { return connected_; }
 
-    /// Whether the episode has been given up: the model is to come to its end, and asks in vain.
+    /// Whether the environment has stopped the episode: the model should end, and gets no more decisions.
     bool stopped() const { return state_ == State::stopped || state_ == State::closed; }
 
-    /// Says how the model's generators are seeded anew in mid-episode; to be called before the first episode.
+    /// Sets the function that reseeds the model's generators during an episode. Call it before the first episode.
     void on_reseed(std::function<void(std::uint64_t)> reseed) { reseed_ = std::move(reseed); }
 
-    /// Runs the model once for each episode, and returns what main() is to return. What the model returns is the result
-    /// of the episode; its exceptions are reported. Outside an environment it runs once, with this seed and options.
+    /// Runs the model once for each episode, and returns the exit status for main(). The model's return value is the
+    /// result of the episode; its exceptions are reported. Without an environment, the model runs once, with this seed
+    /// and these options.
     template <class Model> int run(Model&& model, std::uint64_t seed = 0, Json options = Json::Object()) {
         while (const std::optional<Episode> episode = next_episode(seed, options)) {
             if (!connected_) return play(model, *episode), 0;
@@ -568,7 +569,7 @@ class Client {
         return failed_ ? 1 : 0;
     }
 
-    /// Waits for the next episode; none when there will be no more. For loops of one's own, which have to catch Stop.
+    /// Waits for the next episode; returns nothing after the last one. For loops of your own, which have to catch Stop.
     std::optional<Episode> next_episode(std::uint64_t seed = 0, Json options = Json::Object()) {
         if (!connected_ && std::exchange(alone_, true)) return std::nullopt;
         if (!connected_) return Episode{seed, std::move(options)};
@@ -588,7 +589,8 @@ class Client {
         return Episode{*sent, given && !given->is_null() ? *given : Json::Object()};
     }
 
-    /// The decision: the environment's, or what `rule()` returns, whose type it has. `time` is the simulation's clock.
+    /// Returns the environment's decision or the result of `rule()`, in the type of the latter. `time` is the time of
+    /// the simulation's clock.
     template <class Rule>
     auto decide(std::string_view point, Value entity, const Arguments& arguments, Rule&& rule,
                 double time = NO_TIME) -> std::decay_t<decltype(rule())> {
@@ -597,7 +599,7 @@ class Client {
         return decision ? *std::move(decision) : rule();
     }
 
-    /// The environment's decision; nothing where the model's rule is to decide.
+    /// Returns the environment's decision; nothing if the model's rule should decide.
     template <class T>
     std::optional<T> ask(std::string_view point, Value entity, const Arguments& arguments, double time = NO_TIME) {
         if (!connected_) return std::nullopt;
@@ -607,20 +609,20 @@ class Client {
             *value, [&] { return "decision " + std::to_string(calls_) + ", at " + std::string(point); });
     }
 
-    /// Says what an entity's arguments are by now, for its last observation and reward: before it is removed, or before
-    /// the end.
+    /// Reports the current arguments of an entity, for its last observation and reward. Call it before the entity is
+    /// removed, or before the end.
     void update(std::string_view point, Value entity, const Arguments& arguments, double time = NO_TIME) {
         if (state_ != State::running) return;
         add([&](std::string& out) { named(out, "{\"update\":", entity, point, &arguments, time); });
     }
 
-    /// Says that an entity is gone, and decides no more.
+    /// Reports that an entity is gone and makes no more decisions.
     void remove(std::string_view point, Value entity) {
         if (state_ != State::running) return;
         add([&](std::string& out) { named(out, "{\"remove\":", entity, point, nullptr, NO_TIME); });
     }
 
-    /// Ends the episode, with what the model has to tell of it; `truncated`: by a limit of time, not by the task's end.
+    /// Ends the episode with a result. `truncated`: it ended by a time limit, not by the end of the task.
     template <class T> void end(const T& result, bool truncated = false) {
         finish([&](std::string& out) { detail::write(out, result); }, truncated);
     }
@@ -649,13 +651,13 @@ class Client {
         }
     }
 
-    /// A seed for an episode that was given none.
+    /// A random seed for an episode without a seed.
     static std::uint64_t drawn() {
         std::random_device device;
         return std::uint64_t{device()} << 32 | device();
     }
 
-    /// What the frames have in common that are about an entity. They are sent together with what comes next.
+    /// Writes the common part of frames about an entity. They are sent together with the next frame.
     static void named(std::string& out, const char* begin, const Value& entity, std::string_view point,
                       const Arguments* arguments, double time) {
         out += begin;
@@ -667,7 +669,7 @@ class Client {
         out += '}';
     }
 
-    /// Asks; returns the value, or nothing for the rule.
+    /// Asks for a decision; returns its value, or nothing if the rule should decide.
     std::optional<Json> call(std::string_view point, const Value& entity, const Arguments& arguments, double time) {
         if (state_ == State::idle) throw std::logic_error("a decision outside of an episode, at " + std::string(point));
         if (state_ != State::running) return unwind();
@@ -695,7 +697,7 @@ class Client {
         return unwind();
     }
 
-    /// Leaves the model. Where an exception does that already the rule decides: a second one would end the process.
+    /// Unwinds the model. During another exception, the rule decides instead: a second exception would end the process.
     std::optional<Json> unwind() {
         if (std::uncaught_exceptions() != 0) return std::nullopt;
         if (++refused_ <= 1000) throw Stop();
@@ -738,7 +740,7 @@ class Client {
         flush();
     }
 
-    /// A fault of the wire, after which there is nothing more to be said.
+    /// A protocol error, which ends the communication.
     void fail(const std::string& text) {
         if (state_ == State::closed) return;
         report("simenv::WireError", text, {});
@@ -759,7 +761,7 @@ class Client {
         return name;
     }
 
-    /// The exceptions that are nested in one, a line each.
+    /// The nested exceptions, one per line.
     static std::string causes(const std::exception& error) {
         try {
             std::rethrow_if_nested(error);
@@ -770,7 +772,7 @@ class Client {
         return {};
     }
 
-    /// Writes a line into what is to be sent: all of it, or nothing where that throws.
+    /// Appends a line to the send buffer: the whole line, or nothing if writing it throws.
     template <class Write> void add(Write&& write) {
         const std::size_t before = sending_.size();
         try {
@@ -792,7 +794,7 @@ class Client {
         sending_.clear();
     }
 
-    /// The next frame, an object; nothing when the wire has ended or is at fault.
+    /// Returns the next frame, an object; nothing after the end of the wire or a protocol error.
     std::optional<Json> receive() {
         flush();
         received_.erase(0, std::exchange(line_, 0));
@@ -822,9 +824,9 @@ class Client {
     State state_ = State::idle;
     int in_ = -1, out_ = -1;
     std::uint64_t calls_ = 0;
-    int refused_ = 0;  ///< How often the model was to unwind in this episode.
+    int refused_ = 0;  ///< How often `decide` has thrown Stop in this episode.
     std::string sending_, received_;
-    std::size_t line_ = 0;  ///< How much of what was received has been read.
+    std::size_t line_ = 0;  ///< How many received bytes have been read.
 };
 
 }  // namespace simenv

@@ -34,8 +34,8 @@ import java.util.function.LongSupplier;
 import java.util.function.Supplier;
 
 /**
- * A model in Java as an environment of simenv_marl: the model keeps its own main loop, and asks for decisions from
- * wherever it stands. This one file is the whole client. It needs Java 17 and nothing else; copy it into your sources.
+ * The client of simenv_marl for models in Java: the model keeps its own main loop, and asks for decisions from anywhere
+ * in its code. This file is the whole client. It needs only Java 17; copy it into your sources.
  *
  * <pre>{@code
  * public static void main(String[] arguments) {
@@ -44,21 +44,20 @@ import java.util.function.Supplier;
  *     }
  * }
  *
- * // and somewhere deep in the town:
+ * // somewhere in the model:
  * double price = SimEnv.decideDouble("shop.price", name, a -> a.time(day).put("stock", stock), () -> 1.2 * cost);
  * }</pre>
  *
- * <p>An environment starts the JVM with the numbers of two descriptors in {@code SIMENV_MARL_FDS}; the standard streams
- * stay the model's. Without that variable every decision is its rule, at the cost of a test: not even its arguments are
- * put together.
+ * <p>An environment starts the JVM with the numbers of two file descriptors in {@code SIMENV_MARL_FDS}; the model keeps
+ * the standard streams. Without that variable, the rule makes every decision; the overhead is one test, and the
+ * arguments are not collected.
  *
- * <p>Decisions may come from any thread of the model, one at a time. Threads that decide have to end with their
- * episode.
+ * <p>Any thread of the model may ask for decisions, one at a time. Such threads have to end with their episode.
  */
 public final class SimEnv {
     private static final int VERSION = 1;
     private static final int LONGEST_LINE = 16 << 20;
-    private static final int LONGEST_TEXT = 1 << 20; // of an error
+    private static final int LONGEST_TEXT = 1 << 20; // of an error, in characters
     private static final int DEEPEST = 500;
     private static final long SECONDS_TO_LEAVE = 5;
     private static final Object RULE = new Object();
@@ -73,13 +72,13 @@ public final class SimEnv {
     private int to;
     private LongConsumer reseed;
     private long calls;
-    private boolean running; // an episode goes on
-    private boolean stopped; // and is being unwound: nothing is said any more
-    private boolean busy; // a frame is being made or answered
-    private boolean waiting; // and its answer is still to come
-    private boolean gone; // there is no environment any more
-    private boolean broken; // what it says is not understood any more
-    private Throwable fault; // what went wrong in the episode, to be told when it is unwound
+    private boolean running; // an episode is in progress
+    private boolean stopped; // the episode is being unwound: nothing more is sent
+    private boolean busy; // a frame is being written or waits for its answer
+    private boolean waiting; // the answer has not arrived yet
+    private boolean gone; // the environment has closed the pipes
+    private boolean broken; // a protocol error has occurred
+    private Throwable fault; // the error of the episode, reported after unwinding
 
     private SimEnv(String descriptors) throws IOException {
         String[] numbers = descriptors.split(",");
@@ -105,25 +104,25 @@ public final class SimEnv {
     @FunctionalInterface
     public interface Episode {
         /**
-         * Runs it to its end.
+         * Runs the episode to its end.
          *
-         * @param seed of its generators; where the environment names none, it is drawn
-         * @param options that the environment's reset was given, as maps, lists, strings, booleans, longs and doubles
-         * @return what came out: anything that {@link Arguments#put(String, Object)} takes, or an {@link End}
-         * @throws Exception any: it becomes an error in the environment
+         * @param seed the seed of the model's generators; random if the environment gives none
+         * @param options the options of the environment's reset, as maps, lists, strings, booleans, longs and doubles
+         * @return the result: anything that {@link Arguments#put(String, Object)} takes, or an {@link End}
+         * @throws Exception any exception; it becomes an error in the environment
          */
         Object run(long seed, Map<String, Object> options) throws Exception;
     }
 
     /**
-     * What came out of an episode, and whether it ended at a limit of time and not at an end of the task.
+     * The result of an episode, and whether it ended by a time limit and not by the end of the task.
      *
-     * @param result what came out
-     * @param truncated whether it was a limit of time
+     * @param result the result
+     * @param truncated whether it ended by a time limit
      */
     public record End(Object result, boolean truncated) {}
 
-    /** Thrown by decisions to unwind an episode that is not gone on with. Let it pass; {@code finally} blocks run. */
+    /** Thrown by decisions to unwind an episode that has been stopped. Do not catch it; {@code finally} blocks run. */
     @SuppressWarnings("serial")
     public static final class Stop extends Error {
         private Stop() {
@@ -136,18 +135,18 @@ public final class SimEnv {
         return WIRE != null;
     }
 
-    /** As {@link #run(List, Episode, LongConsumer)}, for a model that cannot be seeded anew in mid-episode. */
+    /** As {@link #run(List, Episode, LongConsumer)}, for a model that cannot be reseeded during an episode. */
     public static boolean run(List<String> points, Episode episode) {
         return run(points, episode, null);
     }
 
     /**
-     * Runs the episodes that the environment asks for, until it is gone, and then ends the JVM.
+     * Runs the episodes that the environment requests, until it closes the pipes, and then exits the JVM.
      *
      * @param points the names of all decision points
      * @param episode one episode of the model
-     * @param reseed seeds the generators of the running episode anew, for another future from here on; null: it cannot
-     * @return false, at once, where there is no environment
+     * @param reseed reseeds the generators of the running episode, for another future; null: the model cannot do so
+     * @return false, immediately, if there is no environment
      */
     public static boolean run(List<String> points, Episode episode, LongConsumer reseed) {
         if (WIRE != null) {
@@ -243,13 +242,13 @@ public final class SimEnv {
     // -- decisions -------------------------------------------------------------------------------------------------
 
     /**
-     * Asks for a decision, or runs the rule: where there is no environment, and where that leaves it to the rule.
+     * Asks for a decision, or runs the rule if there is no environment or if the environment chooses the rule.
      *
      * @param point the name of the decision point
-     * @param entity who decides; null where there is but one
-     * @param arguments puts down what there is to know
-     * @param rule what the model decides by itself
-     * @param taken makes a decision of what was answered: a string, boolean, long, double, list, map or null
+     * @param entity the name of the entity that decides; null if there is only one
+     * @param arguments collects the arguments of the decision
+     * @param rule the model's own rule
+     * @param taken converts the answer, a string, boolean, long, double, list, map or null, to a decision
      * @return the decision
      */
     public static <T> T decide(
@@ -260,25 +259,25 @@ public final class SimEnv {
         return decided;
     }
 
-    /** As {@link #decide}, of a double; integers become doubles. */
+    /** As {@link #decide}, for a double; integers become doubles. */
     public static double decideDouble(String point, String entity, Consumer<Arguments> arguments, DoubleSupplier rule) {
         Object answer = ask(point, entity, arguments, value -> ((Number) value).doubleValue());
         return answer == RULE ? rule.getAsDouble() : (Double) answer;
     }
 
-    /** As {@link #decide}, of a long. */
+    /** As {@link #decide}, for a long. */
     public static long decideLong(String point, String entity, Consumer<Arguments> arguments, LongSupplier rule) {
         Object answer = ask(point, entity, arguments, value -> ((Long) value).longValue());
         return answer == RULE ? rule.getAsLong() : (Long) answer;
     }
 
-    /** As {@link #decide}, of an int. */
+    /** As {@link #decide}, for an int. */
     public static int decideInt(String point, String entity, Consumer<Arguments> arguments, IntSupplier rule) {
         Object answer = ask(point, entity, arguments, value -> Math.toIntExact((Long) value));
         return answer == RULE ? rule.getAsInt() : (Integer) answer;
     }
 
-    /** As {@link #decide}, of true or false. */
+    /** As {@link #decide}, for a boolean. */
     public static boolean decideBoolean(
             String point, String entity, Consumer<Arguments> arguments, BooleanSupplier rule) {
         Object answer = ask(point, entity, arguments, value -> ((Boolean) value).booleanValue());
@@ -286,12 +285,12 @@ public final class SimEnv {
     }
 
     /**
-     * Tells what there is to know of an entity by now: before it is removed, and before the episode ends, so that its
-     * last reward and observation are of this and not of its last decision.
+     * Reports the current arguments of an entity. Call it before the entity is removed and before the episode ends, so
+     * that its last reward and observation refer to this moment and not to its last decision.
      *
-     * @param point at which it decides
-     * @param entity who decides; null where there is but one
-     * @param arguments puts down what there is to know, as in a decision
+     * @param point the name of its decision point
+     * @param entity the name of the entity; null if there is only one
+     * @param arguments collects the arguments, as in a decision
      */
     public static void update(String point, String entity, Consumer<Arguments> arguments) {
         if (WIRE != null) {
@@ -300,10 +299,10 @@ public final class SimEnv {
     }
 
     /**
-     * Says that an entity is gone and decides no more.
+     * Reports that an entity is gone and makes no more decisions.
      *
-     * @param point at which it decided
-     * @param entity who is gone
+     * @param point the name of its decision point
+     * @param entity the name of the entity
      */
     public static void remove(String point, String entity) {
         if (WIRE != null) {
@@ -315,7 +314,7 @@ public final class SimEnv {
         return WIRE == null ? RULE : WIRE.call("decide", point, entity, arguments, taken);
     }
 
-    /** Sends a decision, and waits for its answer; or says something of an entity, where no answer is taken. */
+    /** Sends a decision and waits for its answer, or sends a report about an entity, which has no answer. */
     private synchronized Object call(
             String what, String point, String entity, Consumer<Arguments> arguing, Function<Object, ?> taken) {
         boolean asks = taken != null;
@@ -371,7 +370,7 @@ public final class SimEnv {
                 try {
                     reseed.accept(seed(told.get("reseed")));
                 } catch (RuntimeException error) {
-                    fault = error; // the answer comes all the same
+                    fault = error; // the answer arrives nevertheless
                 }
                 continue;
             }
@@ -407,7 +406,7 @@ public final class SimEnv {
 
     // -- faults ----------------------------------------------------------------------------------------------------
 
-    /** What the environment said is not understood, and nothing after it would be. */
+    /** A protocol error: the client does not understand the environment from here on. */
     @SuppressWarnings("serial")
     private static final class WireError extends RuntimeException {
         WireError(String text) {
@@ -427,7 +426,7 @@ public final class SimEnv {
         return text.length() > LONGEST_TEXT ? text.substring(0, LONGEST_TEXT) : text;
     }
 
-    /** The environment is gone: the episode is unwound, and a model that does not let itself be unwound is left. */
+    /** The environment is gone: unwinds the episode, and exits the JVM if the model does not end. */
     private Stop leave() {
         if (!gone) {
             Thread end = new Thread(SimEnv::halt, "simenv-leave");
@@ -488,7 +487,7 @@ public final class SimEnv {
 
     // -- JSON ------------------------------------------------------------------------------------------------------
 
-    /** What there is to know at a decision. */
+    /** The arguments of a decision. */
     public static final class Arguments {
         private final Writer writer;
         private double time;
@@ -497,7 +496,7 @@ public final class SimEnv {
             this.writer = writer;
         }
 
-        /** Says what time it is in the model. */
+        /** Sets the model's time. */
         public Arguments time(double now) {
             time = now;
             return this;
@@ -522,7 +521,7 @@ public final class SimEnv {
             return put(name, (Object) value);
         }
 
-        /** Puts down a string, number, boolean, enum (its name), array, iterable or map of such, or null. */
+        /** Adds a string, number, boolean, enum (its name), array, iterable or map of such, or null. */
         public Arguments put(String name, Object value) {
             writer.key(name).value(value);
             return this;
@@ -530,7 +529,7 @@ public final class SimEnv {
     }
 
     /**
-     * Writes a value as the environment gets it, in one line of JSON: for plain runs that are to be compared.
+     * Writes a value as the environment gets it, in one line of JSON: to compare runs without an environment.
      *
      * @param value a string, number, boolean, enum, array, iterable or map of such, null, or an {@link End}
      */
@@ -547,7 +546,7 @@ public final class SimEnv {
         private int length;
         private boolean first;
 
-        /** Begins a frame, whatever has become of the one before. */
+        /** Begins a frame, and discards an unfinished one. */
         Writer begin() {
             length = 0;
             return open();
@@ -650,7 +649,7 @@ public final class SimEnv {
             return Character.isSupplementaryCodePoint(text.codePointAt(at));
         }
 
-        @SuppressWarnings("deprecation") // of all ways to get at the bytes of ASCII, the fastest
+        @SuppressWarnings("deprecation") // the fastest way to get the bytes of ASCII
         private Writer ascii(String text) {
             int size = text.length();
             room(size);
@@ -776,7 +775,7 @@ public final class SimEnv {
 
         private String string() throws CharacterCodingException {
             int begin = ++at;
-            StringBuilder text = null; // what stands before the last escape
+            StringBuilder text = null; // the text before the last escape
             boolean ascii = true;
             for (; at < end; at++) {
                 if (line[at] == '"') {
@@ -795,7 +794,7 @@ public final class SimEnv {
             throw wrong("a string does not end");
         }
 
-        /** What the escape at hand stands for; goes on to its last byte. */
+        /** Decodes the current escape, and moves to its last byte. */
         private char escaped() {
             if (++at >= end) {
                 throw wrong("a string does not end");

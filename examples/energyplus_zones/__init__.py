@@ -1,1 +1,1 @@
-"""EnergyPlus, in the same process and by its own C interface: two rooms, an agent for the heater of each."""
+"""EnergyPlus in the same process, through its C API: two rooms, with one agent for each heater."""

@@ -1,7 +1,7 @@
-"""One run of EnergyPlus, by as much of its C interface as is needed here.
+"""A run of EnergyPlus, through the part of its C API that this example needs.
 
-EnergyPlus calls back while it runs, through ctypes. What is raised in a callback cannot cross its C++ code, so a
-``CallbackGuard`` carries it: it has EnergyPlus stop, and raises it again where EnergyPlus was called.
+EnergyPlus calls callbacks while it runs, through ctypes. An exception in a callback cannot cross its C++ code. So a
+``CallbackGuard`` stops EnergyPlus and raises the exception again in the function that called EnergyPlus.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _FUNCTIONS: Final[dict[str, tuple[Any, ...]]] = {
     "energyplus": (ctypes.c_int, _STATE, ctypes.c_int, ctypes.POINTER(_TEXT)),
     "stopSimulation": (None, _STATE),
 }
-"""What is used of the interface: what each function returns, and what it takes."""
+"""The functions of the API in use: the return type of each, then the types of its arguments."""
 
 
 @cache
@@ -58,25 +58,25 @@ def _library() -> Any:
 
 
 class Engine:
-    """EnergyPlus with one building, for one run.
+    """A run of EnergyPlus with one building.
 
     Attributes:
-        folder: Where it writes; gone once the engine is closed.
+        folder: The folder of its output files; ``close`` removes it.
     """
 
     def __init__(self, building: str) -> None:
         """Prepare a run.
 
         Args:
-            building: The building, in the words of EnergyPlus's input files.
+            building: The building, as the text of an EnergyPlus input file (IDF).
         """
         self._library = _library()
         self.folder = Path(mkdtemp(prefix="energyplus-"))
-        self._remove = finalize(self, rmtree, self.folder, True)  # at the latest when the process ends
+        self._remove = finalize(self, rmtree, self.folder, True)  # when the process ends, at the latest
         (self.folder / "in.idf").write_text(building)
         self._state: int | None = self._library.stateNewPython()
         self._guard = CallbackGuard(stop=lambda: self._library.stopSimulation(self._state))
-        self._callbacks: list[Any] = []  # EnergyPlus calls them, and does not keep them alive
+        self._callbacks: list[Any] = []  # EnergyPlus does not keep them alive
         self._variables: list[tuple[bytes, bytes]] = []
         self._actuators: list[tuple[bytes, bytes, bytes]] = []
         self._handles: list[int] = []
@@ -86,30 +86,30 @@ class Engine:
     # -- before the run ---------------------------------------------------------------------------
 
     def sensor(self, variable: str, key: str) -> int:
-        """Ask for an output variable.
+        """Request an output variable.
 
         Returns:
-            Its number, for ``read``.
+            The number of the sensor, for ``read``.
         """
         self._variables.append((variable.encode(), key.encode()))
         self._library.requestVariable(self._state, *self._variables[-1])
         return len(self._variables) - 1
 
     def actuator(self, component: str, control: str, key: str) -> int:
-        """Ask for something that can be set.
+        """Request an actuator.
 
         Returns:
-            Its number, for ``set``.
+            The number of the actuator, for ``set``.
         """
         self._actuators.append((component.encode(), control.encode(), key.encode()))
         return len(self._actuators) - 1
 
     def at_begin_of_step(self, function: Callable[[], Any]) -> None:
-        """Have a function called before EnergyPlus works out what heaters are to do in a time step."""
+        """Register a function that runs before EnergyPlus predicts the heating loads of a time step."""
         self._call_back("callbackBeginTimeStepBeforePredictor", function)
 
     def at_end_of_step(self, function: Callable[[], Any]) -> None:
-        """Have a function called when a time step of the heating is over, of which a time step has one or more."""
+        """Register a function that runs after each system time step; a zone time step has one or more of them."""
         self._call_back("callbackEndOfSystemTimeStepAfterHVACReporting", function)
 
     def _call_back(self, when: str, function: Callable[[], Any]) -> None:
@@ -122,7 +122,7 @@ class Engine:
         getattr(self._library, when)(self._state, self._callbacks[-1])
 
     def _ready(self) -> bool:
-        """Whether the days of the run have begun; handles are known from then on."""
+        """Tell whether the warm-up is over and the days of the run have begun; look up the handles first."""
         library, state = self._library, self._state
         if not self._handles:
             if not library.apiDataFullyReady(state):
@@ -131,7 +131,7 @@ class Engine:
             self._handles += [library.getActuatorHandle(state, *actuator) for actuator in self._actuators]
             for handle, words in zip(self._handles, (*self._variables, *self._actuators), strict=True):
                 if handle < 0:
-                    raise LookupError(f"EnergyPlus knows nothing of {b', '.join(words).decode()}")
+                    raise LookupError(f"EnergyPlus does not have {b', '.join(words).decode()}")
         return not library.warmupFlag(state)
 
     # -- the run ----------------------------------------------------------------------------------
@@ -140,8 +140,8 @@ class Engine:
         """Run the days of the building.
 
         Raises:
-            RuntimeError: EnergyPlus has failed; the error holds what it says of that.
-            BaseException: What a callback has raised.
+            RuntimeError: EnergyPlus has failed; the message is its error file.
+            BaseException: A callback has raised it.
         """
         words = ["energyplus", "-w", str(WEATHER), "-d", str(self.folder), str(self.folder / "in.idf")]
         arguments = (_TEXT * len(words))(*map(str.encode, words))
@@ -151,38 +151,38 @@ class Engine:
             raise RuntimeError((self.folder / "eplusout.err").read_text())
 
     def read(self, sensor: int) -> float:
-        """The present value of an output variable."""
+        """Read the current value of an output variable."""
         value: float = self._library.getVariableValue(self._state, self._handles[sensor])
         return value
 
     def set(self, actuator: int, value: float) -> None:
-        """Set something, until it is set anew."""
+        """Set an actuator, until the next call."""
         self._library.setActuatorValue(self._state, self._handles[len(self._variables) + actuator], value)
 
     @property
     def weekday(self) -> int:
-        """The day of the week, from 0, a Monday."""
+        """The day of the week; 0 is Monday."""
         day: int = self._library.dayOfWeek(self._state)
-        return (day - 2) % 7  # EnergyPlus counts from 1, a Sunday
+        return (day - 2) % 7  # in EnergyPlus, 1 is Sunday
 
     @property
     def hour(self) -> float:
-        """The hour of the day, with its fraction, at which the present time step ends."""
+        """The hour of the day, with its fraction, at which the current time step ends."""
         hour: float = self._library.currentTime(self._state)
         return hour
 
     @property
     def hours_of_step(self) -> float:
-        """How long the present time step of the heating takes."""
+        """The length of the current system time step, in hours."""
         hours: float = self._library.systemTimeStep(self._state)
         return hours
 
     def results(self) -> str:
-        """What EnergyPlus has written about the run, but for the line that says when that was."""
+        """Read EnergyPlus's output of the run, without the line that contains the time of the run."""
         return (self.folder / "eplusout.eso").read_text().partition("\n")[2]
 
     def close(self) -> None:
-        """Let go of EnergyPlus's memory, and remove its files."""
+        """Free EnergyPlus's memory, and remove its files."""
         state, self._state = self._state, None
         if state is not None:
             self._library.stateDelete(state)

@@ -1,10 +1,10 @@
-"""The two rooms as environments: each thermostat is an agent.
+"""Environments made from the two rooms: each thermostat is an agent.
 
-- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, bare and in PettingZoo's wrappers.
-- ``parallel_env``: both agents, a round every quarter of an hour.
+- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, without and with PettingZoo's wrappers.
+- ``parallel_env``: both agents, with one round every quarter of an hour.
 
-Importing this module registers them as ``energyplus_zones/coop_v0``. An agent is rewarded with what its room has cost
-since its decision before, as a negative number; the reward of the team is the sum.
+Importing this module registers them as ``energyplus_zones/coop_v0``. An agent's reward is minus the cost of its room
+since its previous decision; the reward of the team is the sum.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ OBSERVED: Final = (
     "degrees in the room beside it",
     "people in the room",
 )
-"""What an agent observes."""
+"""The observation of an agent."""
 
 
 def observe(zone: Zone) -> NDArray[np.float32]:
-    """Observe what ``OBSERVED`` lists."""
+    """Observe a room, as ``OBSERVED`` lists it."""
     building, angle = zone.building, zone.building.hour / 12 * pi
     values = (sin(angle), cos(angle), building.outside, zone.temperature, zone.other.temperature, zone.people)
     return np.array(values, np.float32)
@@ -56,17 +56,17 @@ _cost_since = difference(lambda zone: zone.cost)
 
 
 def reward(zone: Zone) -> float:
-    """What the room has cost since its agent was last asked, as a loss."""
+    """Compute the reward: minus the cost of the room since its agent's previous decision."""
     return -float(_cost_since(zone))
 
 
 def to_degrees(action: Any) -> float:
-    """The setpoint that an action decides: 0 the lowest, 1 the highest."""
+    """Map an action to a setpoint: 0 to the lowest, 1 to the highest."""
     return LOWEST_SETPOINT + (HIGHEST_SETPOINT - LOWEST_SETPOINT) * float(np.asarray(action).item())
 
 
 def to_action(degrees: float) -> list[float]:
-    """The action that decides a setpoint."""
+    """Map a setpoint to its action."""
     return [(degrees - LOWEST_SETPOINT) / (HIGHEST_SETPOINT - LOWEST_SETPOINT)]
 
 
@@ -87,11 +87,11 @@ POINTS: Final[dict[Any, Definition]] = {
 
 
 class BuildingSim(SimulationInterface):
-    """Runs a building for some days in winter.
+    """The simulation of a building for some days in winter.
 
     Attributes:
-        building: The building of the present episode.
-        results: What EnergyPlus has written about the latest run that came to its end.
+        building: The building of the current episode.
+        results: EnergyPlus's output of the latest completed run.
     """
 
     points = POINTS
@@ -99,29 +99,29 @@ class BuildingSim(SimulationInterface):
     results: str
 
     def reset(self, seed: int | None = None) -> None:
-        """Build it anew."""
+        """Create a new building."""
         self.building = Building(seed)
 
     def run(self) -> Any:
-        """Let the days go by."""
+        """Simulate the days of the run."""
         self.building.run()
         self.results = self.building.engine.results()
         return TRUNCATED
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Which rooms are going to decide: both."""
+        """Return the calls to come: one for each room."""
         return [(zone,) for zone in self.building.zones]
 
     def time(self) -> float:
-        """Hours since the run has begun."""
+        """The time since the beginning of the run, in hours."""
         return self.building.steps / STEPS_PER_HOUR
 
     def reseed(self, seed: int) -> None:
-        """Draw anew who comes on the days that lie ahead."""
+        """Draw another future of the people's presence."""
         self.building.random.seed(seed)
 
     def close(self) -> None:
-        """Let go of EnergyPlus, and of its files."""
+        """Close EnergyPlus, and remove its files."""
         self.building.close()
 
 
@@ -129,33 +129,33 @@ def raw_env(**options: Any) -> SimulationAECEnv:
     """Make the environment of both agents.
 
     Args:
-        **options: As ``simenv_marl.aec_env`` takes them.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return aec_env(BuildingSim, **{"possible_agents": AGENTS} | options)
 
 
 def env(**options: Any) -> OrderEnforcingWrapper[str, Any, Any]:
-    """Make the environment of both agents in PettingZoo's wrappers, which tell mistakes and clip actions.
+    """Make the environment of both agents in PettingZoo's wrappers, which report wrong use and clip actions.
 
     Args:
-        **options: As ``simenv_marl.aec_env`` takes them.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(raw_env(**options)))
 
 
 def parallel_env(**options: Any) -> SimulationParallelEnv:
-    """Make the environment of both agents in which they decide at once.
+    """Make the parallel environment, in which both agents decide simultaneously.
 
     Args:
-        **options: As ``simenv_marl.parallel_env`` takes them.
+        **options: The options of ``simenv_marl.parallel_env``.
     """
     return simenv_marl.parallel_env(BuildingSim, **{"possible_agents": AGENTS} | options)
 
 
 def _register() -> None:
-    """Tell the registry of PettingZoo, unless it knows already."""
+    """Register the environments with PettingZoo, unless they are registered already."""
     for kind, entry_point in (("aec", "env"), ("parallel", "parallel_env")):
-        known = getattr(pettingzoo, f"{kind}_registry", None)  # younger than the oldest PettingZoo that will do
+        known = getattr(pettingzoo, f"{kind}_registry", None)  # missing in the oldest supported PettingZoo
         if known is not None and "energyplus_zones/coop-v0" not in known:
             pettingzoo.register(kind, "energyplus_zones/coop_v0", f"{__name__}:{entry_point}")
 

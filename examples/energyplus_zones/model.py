@@ -1,6 +1,6 @@
-"""Two rooms, the people in them, and what it costs to keep them warm: a model on top of EnergyPlus.
+"""A model on top of EnergyPlus: two rooms, the people in them, and the cost of heating and discomfort.
 
-It knows nothing of reinforcement learning: ``python -m examples.energyplus_zones.model`` runs it by its own rule.
+It contains no reinforcement learning: ``python -m examples.energyplus_zones.model`` runs it by its own rule.
 """
 
 from __future__ import annotations
@@ -14,48 +14,48 @@ from typing import Final
 from .engine import Engine
 
 STEPS_PER_HOUR: Final = 20
-"""As the building has it."""
+"""Time steps per hour, as in the building's input file."""
 
 STEPS_PER_DECISION: Final = 5
-"""Thermostats are set every quarter of an hour."""
+"""Time steps between decisions: the model sets thermostats every quarter of an hour."""
 
 DAYS: Final = 3
-"""How many days a run takes, all of them working days."""
+"""The length of a run in days, all of them working days."""
 
 MONDAYS: Final = [date(2018, 1, 8) + timedelta(weeks=week) for week in range(7)]
 
 LOWEST_SETPOINT, HIGHEST_SETPOINT = 15.0, 23.0
 COMFORT: Final = 20.0
-"""Below so many degrees people are cold."""
+"""The temperature below which people are cold, in degrees Celsius."""
 
 COLD: Final = 0.25
-"""What it costs if a person is a degree too cold for an hour."""
+"""The cost per person, degree below ``COMFORT`` and hour."""
 
 
 def price(hour: float) -> float:
-    """What a kilowatt hour costs: half as much by night."""
+    """Return the price of a kilowatt hour, which is half as high at night."""
     return 0.15 if hour <= 6 or hour > 22 else 0.3
 
 
 class Zone:
-    """A room.
+    """A room of the building.
 
     Attributes:
         building: The building.
-        name: Its name.
-        other: The room beside it.
-        begin, end, expected: When people come and leave on the present day, and how many.
-        people: How many people are in it.
-        temperature: Of its air.
-        setpoint: Up to which temperature its heater works.
-        energy: Kilowatt hours that its heater has used.
-        cost: What that has cost, with what it costs that people were cold.
+        name: The name of the room.
+        other: The adjacent room.
+        begin, end, expected: The hours at which people come and leave on the current day, and their number.
+        people: The number of people in the room.
+        temperature: The air temperature, in degrees Celsius.
+        setpoint: The setpoint of its heater, in degrees Celsius.
+        energy: The energy that its heater has used, in kilowatt hours.
+        cost: The cost so far, of energy and of discomfort.
     """
 
     other: Zone
 
     def __init__(self, building: Building, name: str) -> None:
-        """Put a heater, a thermometer and a thermostat into a room of the building."""
+        """Connect to the room's heater, thermometer and thermostat in EnergyPlus."""
         engine = building.engine
         self.building, self.name = building, name.lower()
         self.people, self.temperature, self.setpoint = 0, 0.0, 0.0
@@ -68,13 +68,13 @@ class Zone:
         self._people = engine.actuator("People", "Number of People", f"{name} people")
 
     def plan_day(self) -> None:
-        """Draw when people come today, how many, and when they leave; on some days none come."""
+        """Draw the hours at which people come and leave today, and their number, which may be 0."""
         rng = self.building.random
         self.begin, self.end = rng.uniform(7, 10), rng.uniform(14, 18)
         self.expected = rng.choice((0, 1, 2, 3, 4))
 
     def look(self) -> None:
-        """See how warm it is, and who is there."""
+        """Update the temperature and the number of people."""
         engine = self.building.engine
         self.temperature = engine.read(self._air)
         self.people = self.expected if self.begin <= engine.hour < self.end else 0
@@ -86,15 +86,15 @@ class Zone:
         self.building.engine.set(self._thermostat, self.setpoint)
 
     def choose_setpoint(self) -> float:
-        """Decide how warm it is to be.
+        """Choose the setpoint, in degrees Celsius.
 
         Returns:
-            What a time switch says: warm from six to six.
+            The setpoint of a time switch: warm from 6 to 18 o'clock.
         """
         return COMFORT + 0.5 if 6 <= self.building.hour < 18 else 16.0
 
     def account(self, hours: float) -> None:
-        """Take down what some time has cost."""
+        """Add the energy and the cost of some hours."""
         engine = self.building.engine
         self.temperature = engine.read(self._air)
         energy = engine.read(self._power) / 1000 * hours
@@ -104,19 +104,19 @@ class Zone:
 
 
 class Building:
-    """The two rooms through some days in winter.
+    """A building of two rooms over some days in winter.
 
     Attributes:
         engine: EnergyPlus.
-        random: What chance is drawn from: the days, and the people of each.
+        random: The random number generator, for the days and the people.
         zones: The rooms.
-        hour, weekday: Of the present time step.
-        outside: The temperature of the air outside.
-        steps: How many time steps have begun.
+        hour, weekday: The hour and the weekday of the current time step.
+        outside: The outdoor air temperature, in degrees Celsius.
+        steps: The number of time steps that have begun.
     """
 
     def __init__(self, seed: int | None = None) -> None:
-        """Build it, and draw the days of the run."""
+        """Create the building, and draw the days of the run."""
         self.random = random.Random(seed)
         first = self.random.choice(MONDAYS) + timedelta(self.random.randrange(5 - DAYS + 1))
         last = first + timedelta(DAYS - 1)
@@ -131,11 +131,11 @@ class Building:
         engine.at_end_of_step(self.end_step)
 
     def run(self) -> None:
-        """Let the days go by."""
+        """Simulate the days of the run."""
         self.engine.run()
 
     def begin_step(self) -> None:
-        """Let people come and go, and from time to time decide for each room how warm it is to be."""
+        """Let people come and go; at every decision step, choose the setpoint of each room."""
         engine, before = self.engine, self.weekday
         self.hour, self.weekday, self.outside = engine.hour, engine.weekday, engine.read(self._outside)
         if self.steps == 0 or self.weekday != before:
@@ -149,23 +149,23 @@ class Building:
         self.steps += 1
 
     def end_step(self) -> None:
-        """Take down what a time step has cost."""
+        """Account for the cost of a time step."""
         if self.steps:
             for zone in self.zones:
                 zone.account(self.engine.hours_of_step)
 
     @property
     def cost(self) -> float:
-        """What both rooms have cost."""
+        """The cost of both rooms so far."""
         return sum(zone.cost for zone in self.zones)
 
     def close(self) -> None:
-        """Let go of EnergyPlus."""
+        """Close EnergyPlus."""
         self.engine.close()
 
 
 def main() -> None:
-    """Run the model as it is."""
+    """Run the model by its own rule."""
     building = Building(seed=0)
     building.run()
     for zone in building.zones:

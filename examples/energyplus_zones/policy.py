@@ -1,6 +1,6 @@
-"""A policy that looks who is there, and heats the earlier the colder the room is, beside the model's time switch.
+"""A presence-based policy: the colder the room is, the earlier it heats. A comparison with the model's time switch.
 
-``python -m examples.energyplus_zones.policy`` compares the two on the same days.
+``python -m examples.energyplus_zones.policy`` compares both on the same days.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from .model import COMFORT
 WARM, COLD = COMFORT + 0.2, 15.0
 
 BEGIN, LATEST = 8.5, 10.0
-"""When the room is to be warm, and from when on none come any more."""
+"""The hour at which the room should be warm, and the hour after which nobody arrives."""
 
 HOURS_PER_DEGREE: Final = 1.0
-"""How long the heater takes to make it a degree warmer."""
+"""The time that the heater takes to warm the room by one degree, in hours."""
 
 
 def by_presence(observation: NDArray[Any], info: dict[str, Any]) -> list[float]:
-    """Heat where people are, and in the morning in time for them."""
+    """Heat while people are present, and in the morning in time for their arrival."""
     sine, cosine, _, temperature, _, people = observation.tolist()
     hour = atan2(sine, cosine) / pi * 12 % 24
     early = max(0.0, COMFORT - temperature) * HOURS_PER_DEGREE

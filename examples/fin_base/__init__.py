@@ -1,1 +1,1 @@
-"""Blocks for models of financial entities, and a pension fund that is built on them."""
+"""Building blocks for models of financial entities, and two models built on them: a pension fund, a debt collector."""

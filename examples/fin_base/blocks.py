@@ -1,14 +1,14 @@
-"""Blocks of which models of financial entities are built: entities, money, contracts, requests, a calendar.
+"""Building blocks for models of financial entities: entities, money, contracts, requests, a calendar.
 
-- ``World``: what all entities of a model share: the month, the ids, the seed, the ledger, the calendar, the contracts.
-- ``Entity``: who can own money and be a party to contracts.
-- ``Ledger``: moves money, which is whole cents, from one entity to another. No cent appears or vanishes.
-- ``share``: divides cents by weights, and loses none.
-- ``Contract``: one party owes another an amount every so many months, from a start to an end.
-- ``Request``: what one entity wants of another, and is granted or denied with the reason.
-- ``Calendar``: what is to happen in which month.
+- ``World``: the shared state of a model: month, ids, seed, ledger, calendar, contracts.
+- ``Entity``: an owner of money and a party to contracts.
+- ``Ledger``: moves money, in whole cents, from one entity to another. No cent appears or vanishes.
+- ``share``: divides an amount of cents in proportion to weights, without losing a cent.
+- ``Contract``: one party pays another a fixed amount at regular intervals, from a start to an end.
+- ``Request``: one entity asks another for something, which is granted, or denied with a reason.
+- ``Calendar``: the schedule of events by month.
 
-Time is counted in months, as integers. ``World.advance`` goes through one of them.
+Time is an integer number of months. ``World.advance`` simulates one month.
 
 >>> world = World(seed=1)
 >>> landlord, tenant = Entity(world), Entity(world)
@@ -18,11 +18,11 @@ Time is counted in months, as integers. ``World.advance`` goes through one of th
 ...     world.advance()
 >>> tenant.cents, landlord.cents, world.ledger.flows["rent"]
 (5000, 20000, 20000)
->>> rent.missed  # there were no hundred left in the third month, nor in the fourth
+>>> rent.missed  # the tenant could not pay 100 in the third month, nor in the fourth
 2
 >>> world.check()
 
-Run on its own, it plays with these blocks at random, and checks that no cent is lost::
+As a script, the module runs random payments between entities, and checks that no cent is lost::
 
     python -m examples.fin_base.blocks
 """
@@ -38,29 +38,29 @@ from typing import Any, ClassVar
 
 
 class Shortage(ValueError):
-    """An entity does not have the money that it should pay."""
+    """An entity does not have the money for a payment."""
 
 
 class World:
-    """What all entities of a model share.
+    """The shared state of a model.
 
     Attributes:
-        seed: Determines all chance in the model.
-        random: Draws what no ``stream`` is there for.
-        month: The present month; the first is 0.
-        ledger: Moves money.
-        calendar: What is to happen in which month.
-        contracts: Those in force by their numbers.
-        entities: Those that exist by their names.
-        outside: The rest of the economy: the one entity that may owe money, as all money comes from there.
-        counts: How often what has happened.
+        seed: The seed of all randomness in the model.
+        random: The generator for everything that has no ``stream`` of its own.
+        month: The current month; the first is 0.
+        ledger: The ledger, which moves money.
+        calendar: The scheduled events.
+        contracts: The contracts in force, by number.
+        entities: The existing entities, by name.
+        outside: The rest of the economy. All money comes from it, so it is the one entity that may owe money.
+        counts: How often each kind of event has happened.
     """
 
     def __init__(self, seed: int | None = None) -> None:
         """Make an empty world.
 
         Args:
-            seed: Determines all chance; None: another each time.
+            seed: The seed of all randomness; None: a new one each time.
         """
         self.seed = Random().getrandbits(64) if seed is None else seed
         self.random = Random(self.seed)
@@ -75,30 +75,30 @@ class World:
         self.outside.may_owe = True
 
     def stream(self, name: str) -> Random:
-        """A generator of its own for one concern, so that more draws for another do not change this one's.
+        """Make a random number generator for one purpose, which draws for other purposes do not affect.
 
         Args:
-            name: Of the concern.
+            name: The name of the purpose.
 
         Returns:
-            A generator that the world's seed and the name determine.
+            A generator that depends on the world's seed and the name alone.
         """
         return Random(f"{self.seed}/{name}")
 
     def next_id(self, kind: str) -> int:
-        """Count on: the first of a kind in this world is number 0."""
+        """Return the next free number of a kind; the first of a kind in this world is 0."""
         number = self._ids[kind]
         self._ids[kind] = number + 1
         return number
 
     def advance(self) -> None:
-        """Go through one month: what the calendar has, then what contracts oblige to."""
+        """Simulate one month: the events of the calendar, then the payments of the contracts."""
         self.calendar.run(self.month)
         self.perform_contracts()
         self.month += 1
 
     def perform_contracts(self) -> None:
-        """Have all debtors pay what they owe this month, and end contracts whose time is over."""
+        """Make all payments that are due this month, and end the contracts that have expired."""
         month = self.month
         for contract in list(self.contracts.values()):
             if contract.end is not None and month >= contract.end:
@@ -107,22 +107,23 @@ class World:
                 contract.perform()
 
     def check(self) -> None:
-        """Check that no cent has appeared or vanished; it takes some nanoseconds for each entity.
+        """Check that no cent has appeared or vanished; this takes some nanoseconds per entity.
 
         Raises:
-            AssertionError: Money is not conserved, or an entity other than the outside owes some.
+            AssertionError: Money is not conserved, or an entity other than ``outside`` has a negative balance.
         """
         self.ledger.check()
 
 
 class Entity:
-    """Who can own money and be a party to contracts.
+    """An entity, which owns money and can be a party to contracts.
 
     Attributes:
-        world: Where it exists.
-        number: Its id among those of its kind in this world.
-        name: Its name, which is unique in its world.
-        cents: The money that it owns. Only the ledger changes it.
+        world: The world of the entity.
+        number: Its id among the entities of its kind in this world.
+        name: Its name, unique in its world.
+        cents: The money that it owns, in cents. Only the ledger changes it.
+        may_owe: Whether its balance may become negative.
     """
 
     __slots__ = ("__weakref__", "cents", "may_owe", "name", "number", "world")
@@ -130,7 +131,7 @@ class Entity:
     kind: ClassVar[str] = "entity"
 
     def __init__(self, world: World) -> None:
-        """Come into existence, without money."""
+        """Create the entity, without money."""
         self.world = world
         self.number = world.next_id(self.kind)
         self.name = f"{self.kind}_{self.number}"
@@ -139,11 +140,11 @@ class Entity:
         world.entities[self.name] = self
 
     def vanish(self, heir: Entity, reason: str = "estate") -> None:
-        """Cease to exist.
+        """Remove the entity from its world.
 
         Args:
-            heir: Who gets the money that is left.
-            reason: Under which the ledger books that.
+            heir: The entity that gets the remaining money.
+            reason: The reason under which the ledger books this payment.
         """
         if self.cents:
             self.world.ledger.move(self, heir, self.cents, reason)
@@ -151,10 +152,10 @@ class Entity:
 
 
 class Ledger:
-    """Moves money between entities: each cent that one of them gets is one that another of them has given.
+    """The ledger, which moves money between entities: each cent that one entity receives, another one has paid.
 
     Attributes:
-        flows: How many cents have been moved so far, by reason.
+        flows: The cents moved so far, by reason.
 
     >>> world = World()
     >>> company = Entity(world)
@@ -183,15 +184,15 @@ class Ledger:
         """Move money.
 
         Args:
-            source: Who pays.
-            target: Who is paid.
-            cents: How much: an integer that is not negative.
-            reason: Under which it is booked.
+            source: The payer.
+            target: The payee.
+            cents: The amount: a non-negative integer.
+            reason: The reason under which the payment is booked.
 
         Raises:
-            Shortage: The source does not have it. Nothing has changed.
-            TypeError: The amount is no integer.
-            ValueError: It is negative.
+            Shortage: The payer does not have the amount. Nothing has changed.
+            TypeError: The amount is not an integer.
+            ValueError: The amount is negative.
         """
         if cents.__class__ is not int:
             raise TypeError(f"money is whole cents, not {cents!r}")
@@ -205,10 +206,10 @@ class Ledger:
         flows[reason] = flows.get(reason, 0) + cents
 
     def check(self) -> None:
-        """Check that all money sums up to nothing, the outside's debt being all that the others own.
+        """Check that all balances sum to zero: the debt of ``outside`` equals the money of all other entities.
 
         Raises:
-            AssertionError: It does not, or an entity owes that may not.
+            AssertionError: The sum is not zero, or an entity has a negative balance without ``may_owe``.
         """
         total = 0
         for entity in self._world.entities.values():
@@ -221,17 +222,18 @@ class Ledger:
 
 
 def share(cents: int, weights: Sequence[int]) -> list[int]:
-    """Divide money in proportion to weights, by largest remainders: the parts sum up to the whole.
+    """Divide money in proportion to weights, by the largest remainder method: the parts sum to the whole.
 
     Args:
-        cents: What is divided: not negative.
-        weights: One for each part; not negative, not all of them 0.
+        cents: The amount to divide; not negative.
+        weights: One weight for each part; not negative, not all of them 0.
 
     Returns:
-        The parts. Each is less than a cent away from its proportion; of equal remainders, the first get the cents.
+        The parts, in cents. Each differs from its exact proportion by less than a cent. Where remainders are equal,
+        the first parts get the cents.
 
     Raises:
-        ValueError: Nothing can be divided like this.
+        ValueError: The amount is negative, a weight is negative, or all weights are 0.
 
     >>> share(100, [1, 1, 1])
     [34, 33, 33]
@@ -248,18 +250,18 @@ def share(cents: int, weights: Sequence[int]) -> list[int]:
 
 
 class Contract:
-    """One party owes another an amount, every so many months, from a start to an end.
+    """A contract: one party pays another a fixed amount at regular intervals, from a start to an end.
 
     Attributes:
-        debtor: Who pays.
-        creditor: Who is paid.
-        cents: How much, each time; it may be amended at any time.
-        reason: Under which the ledger books it.
-        start: The first month in which it is due.
-        end: The first month in which it is in force no more; None: it has to be terminated.
-        every: How many months lie between two payments.
-        missed: How often the debtor did not have the money.
-        number: Its id in its world.
+        debtor: The party that pays.
+        creditor: The party that is paid.
+        cents: The amount of each payment; it may be amended at any time.
+        reason: The reason under which the ledger books the payments.
+        start: The month of the first payment.
+        end: The first month in which the contract is no longer in force; None: it runs until it is terminated.
+        every: The interval between two payments, in months.
+        missed: The number of payments for which the debtor did not have the money.
+        number: The contract's id in its world.
     """
 
     __slots__ = ("__weakref__", "cents", "creditor", "debtor", "end", "every", "missed", "number", "reason", "start")
@@ -275,7 +277,7 @@ class Contract:
         end: int | None = None,
         every: int = 1,
     ) -> None:
-        """Conclude it; ``start=None`` is the present month, the rest as the attributes are."""
+        """Conclude the contract. ``start=None`` means the current month; the other arguments are the attributes."""
         world = debtor.world
         if every < 1 or creditor.world is not world:
             raise ValueError("a contract binds two entities of one world, every month or less often")
@@ -287,19 +289,19 @@ class Contract:
 
     @property
     def in_force(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the contract has not ended yet."""
         return self.number in self.debtor.world.contracts
 
     def is_due(self, month: int) -> bool:
-        """Whether a payment is due in a month, as long as it is in force."""
+        """Tell whether a payment is due in a month, provided that the contract is in force."""
         passed = month - self.start
         return passed >= 0 and (self.every == 1 or passed % self.every == 0)
 
     def perform(self) -> bool:
-        """Pay once.
+        """Make one payment.
 
         Returns:
-            Whether the debtor could.
+            Whether the debtor could pay.
         """
         try:
             self.debtor.world.ledger.move(self.debtor, self.creditor, self.cents, self.reason)
@@ -309,17 +311,17 @@ class Contract:
         return True
 
     def terminate(self) -> None:
-        """End it now; ending it twice does no harm."""
+        """End the contract now; a second call does nothing."""
         self.debtor.world.contracts.pop(self.number, None)
 
 
 class Request:
-    """What one entity wants of another.
+    """A request of one entity to another.
 
-    A kind of request is a subclass: ``objection`` says why it is denied, ``carry_out`` does what was asked for.
+    Each kind of request is a subclass: ``objection`` says why the request is denied, ``carry_out`` fulfils it.
 
     Attributes:
-        applicant: Who wants something.
+        applicant: The entity that makes the request.
 
     >>> class Loan(Request):
     ...     def __init__(self, applicant, bank, cents):
@@ -342,18 +344,18 @@ class Request:
         self.applicant = applicant
 
     def objection(self) -> str | None:
-        """Why it is denied; None: it is granted. It changes nothing."""
+        """Return the reason for a denial; None: the request is granted. This changes nothing."""
         raise NotImplementedError
 
     def carry_out(self) -> None:
-        """Do what was asked for, once it is granted."""
+        """Fulfil the request, once it is granted."""
         raise NotImplementedError
 
     def submit(self) -> str | None:
-        """Have it granted and carried out, or denied; the world counts which.
+        """Submit the request: it is granted and carried out, or denied. The world counts the outcomes.
 
         Returns:
-            None, or the reason why it was denied. A request that was denied has changed nothing.
+            None, or the reason for the denial. A denied request has changed nothing.
         """
         reason = self.objection()
         kind = type(self).__name__
@@ -364,7 +366,7 @@ class Request:
 
 
 class Calendar:
-    """What is to happen in which month; within a month, in the order in which it was entered.
+    """The schedule of events by month; events of one month happen in the order in which they were scheduled.
 
     >>> calendar = Calendar()
     >>> calendar.at(3, print, "later")
@@ -386,33 +388,33 @@ class Calendar:
         return len(self._events)
 
     def at(self, month: int, action: Callable[..., object], *arguments: Any) -> None:
-        """Enter an event.
+        """Schedule an event.
 
         Args:
-            month: When it happens.
-            action: What happens.
-            *arguments: Of the action.
+            month: The month of the event.
+            action: The function that the event calls.
+            *arguments: The arguments of the action.
         """
         heapq.heappush(self._events, (month, self._entered, action, arguments))
         self._entered += 1
 
     def every(self, months: int, action: Callable[[], object], *, start: int) -> None:
-        """Enter an event that recurs.
+        """Schedule a recurring event.
 
         Args:
-            months: How many lie between two of them.
-            action: What happens.
-            start: When it happens first.
+            months: The interval between two occurrences, in months.
+            action: The function that the event calls.
+            start: The month of the first occurrence.
         """
         self.at(start, self._recur, months, action, start)
 
     def _recur(self, months: int, action: Callable[[], object], month: int) -> None:
-        """Let an event happen that recurs. No closure, so that a copy of a world has events of its own."""
+        """Run a recurring event, and schedule the next. No closure, so that copies of a world have their own events."""
         self.at(month + months, self._recur, months, action, month + months)
         action()
 
     def run(self, month: int) -> None:
-        """Let all happen that is due up to this month, including what is entered meanwhile."""
+        """Run all events that are due by this month, including those scheduled meanwhile."""
         events = self._events
         while events and events[0][0] <= month:
             _, _, action, arguments = heapq.heappop(events)
@@ -420,10 +422,10 @@ class Calendar:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Let entities pay each other at random, and check the money in every month."""
-    parser = argparse.ArgumentParser(description="Play with the blocks at random.")
-    parser.add_argument("--months", type=int, default=120, help="for how long (default: 120)")
-    parser.add_argument("--seed", type=int, help="of all chance (default: another each time)")
+    """Run random payments between entities, and check every month that money is conserved."""
+    parser = argparse.ArgumentParser(description="Run random payments; check that no cent is lost.")
+    parser.add_argument("--months", type=int, default=120, help="how many months to simulate (default: 120)")
+    parser.add_argument("--seed", type=int, help="seed of all randomness (default: a new one each time)")
     options = parser.parse_args(arguments)
     world = World(options.seed)
     people = [Entity(world) for _ in range(50)]

@@ -1,8 +1,8 @@
-"""An agency that collects debts, day by day. Nothing here knows of reinforcement learning.
+"""A model of a debt collection agency, in steps of a day. It contains no reinforcement learning.
 
-The agency owns debts of consumers. Each debtor owes one amount, and has wages, living costs, savings and a willingness
-to pay that the agency does not know. Debtors pay in full, ask for instalments, dispute the debt, or become insolvent.
-The agency sends letters, makes calls and goes to court. One tick of the ``World`` is one day here, not one month.
+The agency owns debts of consumers. Each debtor owes one amount. Wages, living costs, savings and the willingness to pay
+are unknown to the agency. Debtors pay in full, ask for instalments, dispute the debt, or become insolvent. The agency
+sends letters, makes calls and goes to court. One step of the ``World`` is one day here, not one month.
 
 **Decision.** ``Agency.choose_contact(debtor, choices)`` is called for each case that is due on a working day. It
 returns one of the ``choices``, which ``Agency.lawful`` lists: what the law, today's staff and the agency's money allow.
@@ -17,32 +17,32 @@ choice    cost                                 the case is due again
 ========= ==================================== ============================================================
 
 **Utility.** ``Agency.profit``: the money collected less all costs, when all cases are closed or after two years. The
-agency buys debts in the first half year alone, so that two years show what has become of them. What it has paid for the
-debts is spent already and does not count.
+agency buys debts in the first half year only, so two years show how their cases end. The price of the debts is a sunk
+cost and does not count.
 
 **The law** is that of the United States, simplified: Regulation F of the CFPB (12 CFR part 1006).
 
-- At most seven calls about a debt in seven days, and none within seven days after a conversation, the day of which is
-  the first of the seven (1006.14(b)(2), where exceeding these numbers is presumed to be a violation).
+- At most seven calls about a debt in seven days, and none within seven days after a conversation, whose day is the
+  first of the seven (1006.14(b)(2); more calls are presumed to be a violation).
 - The collector sends a notice with the first communication or within five days of it (1006.34(a)(1)). Here the first
   letter is the notice, and the agency does not call before it.
 - A consumer who disputes the debt in writing within the validation period stops the collection until the debt is
   verified (1006.38(d)(2)). The period ends 30 days after receipt; the mail may be assumed to take five working days
-  (1006.34(b)(5)). Here the agency does not sue before that.
+  (1006.34(b)(5)). Here the agency does not sue before the period has ended.
 - A consumer can ask in writing for no further communication. The agency can still sue (1006.6(c)).
 - No lawsuits for time-barred debts (1006.26(b)). The limit is four years here, as for written contracts in California
   (Code of Civil Procedure, section 337).
 - A garnishment takes at most a quarter of the disposable wages (15 U.S.C. 1673).
 
-All other numbers are assumptions: what debtors earn and owe, how they react, that the chance of a payment halves as a
-debt becomes ``HALF_LIFE`` days older. Interest, taxes and several debts of one person are not modelled.
+All other numbers are assumptions: the debtors' wages and debts, their reactions, and the half-life of the probability
+of a payment, which is ``HALF_LIFE`` days. The model leaves out interest, taxes and several debts of one person.
 
-Run on its own, the module prints how the agency fares::
+As a script, the module prints the agency's results::
 
     python -m examples.fin_base.collections --days 720
 
-Use ``-m`` for all modules of this folder: a script that is run by its path would import this file as the standard
-library's ``collections``.
+Use ``-m`` for all modules of this folder: a script that is run by its path would import this file instead of the
+standard library's ``collections``.
 """
 
 from __future__ import annotations
@@ -58,33 +58,33 @@ from .blocks import Contract, Entity, Request, World
 
 POSTAGE, CALL, FEE = 1_00, 3_00, 250_00
 COSTS: Final = {"leave": 0, "write": POSTAGE, "call": CALL, "sue": FEE}
-"""What each choice costs, in cents."""
+"""The cost of each choice, in cents."""
 
 CHOICES: Final = tuple(COSTS)
-"""All that can be done about a case."""
+"""All choices for a case."""
 
 PAUSES: Final = {"leave": 7, "write": 14, "call": 7, "sue": 0}
-"""After how many days a case is due again."""
+"""The number of days until a case is due again, by choice."""
 
 CALL_LIMIT, QUIET, VALIDATION, LIMITATION = 7, 7, 37, 4 * 365
-"""The law: calls in ``QUIET`` days, days without calls after a conversation, the validation period, the time bar."""
+"""The law: calls in ``QUIET`` days, days without calls after a conversation, the validation period, the limitation."""
 
 VERIFICATION, KEPT, MONTH, HALF_LIFE = 21, 365, 30, 240
-"""Days: of a verification, until a case is written off, between two wages, until the chance of a payment has halved."""
+"""Days: for a verification, until a write-off, between two wages, until the probability of a payment has halved."""
 
 ACTIVE: Final = ("open", "disputed", "plan", "court", "judged")
-"""The states of a case until it is closed. The agency decides on open ones."""
+"""The states of a case that is not closed. The agency decides on cases that are "open"."""
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What an agency is like.
+    """The parameters of an agency.
 
     Attributes:
-        arrivals: The mean number of debts that it buys in a day.
-        buying: On how many days it buys debts.
+        arrivals: The mean number of debts that it buys per day.
+        buying: The number of days on which it buys debts.
         stock: The number of debts on the first day.
-        calls: How many calls the staff can make on a working day.
+        calls: The number of calls that the staff can make on a working day.
         capital: The agency's money on the first day, in cents.
     """
 
@@ -96,13 +96,13 @@ class Parameters:
 
 
 class Repayment(Contract):
-    """A debtor pays off a debt month by month: in instalments, or by garnishment after a judgment."""
+    """A monthly repayment of a debt: in instalments, or by garnishment after a judgment."""
 
     __slots__ = ()
     debtor: Debtor
 
     def perform(self) -> bool:
-        """Pay; a plan ends with the second missed instalment."""
+        """Pay one instalment; the second missed instalment ends a plan."""
         self.cents = min(self.cents, self.debtor.balance)
         paid = super().perform()
         if paid:
@@ -114,49 +114,49 @@ class Repayment(Contract):
 
 
 class Plan(Request):
-    """A debtor asks to pay in instalments."""
+    """A debtor's request to pay in instalments."""
 
     __slots__ = ()
     applicant: Debtor
 
     def objection(self) -> str | None:
-        """One plan for each debtor, of two years at most."""
+        """Deny a second plan, and plans of more than two years."""
         if self.applicant.contract is not None:
             return "broke a plan"
         return None if self.applicant.offer * 24 >= self.applicant.balance else "takes too long"
 
     def carry_out(self) -> None:
-        """Pay from the next payday on."""
+        """Start the instalments at the next payday."""
         self.applicant.repay("plan", self.applicant.offer)
 
 
 class Debtor(Entity):
     """A person who owes a debt to the agency.
 
-    Each debtor has two streams of random numbers: what the agency decides changes neither the life of a debtor nor the
-    luck of others.
+    Each debtor has two streams of random numbers, so the agency's decisions change neither the random events of a
+    debtor's life nor those of other debtors.
 
     Attributes:
-        balance: What is still owed, in cents.
+        balance: The amount still owed, in cents.
         since: The day of the default, which may be before the first day.
         arrived: The day on which the agency bought the debt.
-        status: One of ``ACTIVE``, or how the case was closed.
+        status: One of ``ACTIVE``, or the way in which the case was closed.
         due: The day on which the agency decides on the case again, if it is open.
-        letters: How many letters were sent.
-        notified: The day of the first one; None before it.
-        attempts: How many calls were made.
-        calls: The days of the latest calls, up to ``CALL_LIMIT``.
+        letters: The number of letters sent.
+        notified: The day of the first letter; None before it.
+        attempts: The number of calls made.
+        calls: The days of the latest calls, at most ``CALL_LIMIT`` of them.
         contacted: The day of the latest letter or call; None before the first.
         talked: The day of the latest conversation; None before the first.
         ceased: Whether the debtor has asked for no further communication.
-        collected: What the debtor has paid to the agency, in cents.
-        spent: What the agency has spent on the case, in cents.
+        collected: The money that the debtor has paid to the agency, in cents.
+        spent: The agency's costs of the case, in cents.
         contract: The latest plan or garnishment.
-        wage, living, cushion: Monthly wage and living costs, and the highest savings, in cents. This and all below is
-            hidden from the agency.
+        wage, living, cushion: Monthly wage and living costs, and the maximum of savings, in cents. The agency does not
+            know these, nor the attributes below.
         employed: Whether the debtor earns the wage at present.
-        willingness, reach: How likely the debtor pays, and answers a call.
-        court: What a court would find, from 0 to 1: a low number means wages that can be garnished.
+        willingness, reach: How likely the debtor is to pay, and to answer a call, from 0 to 1.
+        court: The outcome of a lawsuit, from 0 to 1: a low number means wages that can be garnished.
         payday: The day of the next wage.
     """
 
@@ -198,7 +198,7 @@ class Debtor(Entity):
         return max(1, round(0.8 * (self.wage - self.living))) if self.employed else 1
 
     def live(self) -> None:
-        """Go through a payday: keep or lose the job, earn, spend, become insolvent, or pay the debt unasked."""
+        """Simulate a payday: keep or lose the job, earn, spend, become insolvent, or pay the debt voluntarily."""
         if self.status not in ACTIVE:
             return
         draw, world, garnished = self.life, self.world, self.status == "judged"
@@ -217,7 +217,7 @@ class Debtor(Entity):
         self.respond(0.1)
 
     def receive(self) -> None:
-        """Read a letter: dispute the debt after the first one, or respond, less to each further one."""
+        """Read a letter: dispute the debt after the first letter, or respond, less likely to each further letter."""
         if self.status == "open" and self.letters == 1 and self.draw.random() < 0.04:
             self.status = "disputed"
             self.world.calendar.at(self.world.month + VERIFICATION, self.verify)
@@ -239,31 +239,31 @@ class Debtor(Entity):
             Plan(self).submit()
 
     def repay(self, status: str, cents: int) -> None:
-        """Repay month by month from the next payday on."""
+        """Start monthly repayments at the next payday."""
         self.status = status
         self.contract = Repayment(self, self.agency, cents, status, start=self.payday, every=MONTH)
 
     def credit(self, cents: int) -> None:
-        """Owe less; a debt that is paid is closed."""
+        """Reduce the balance by a payment; close the case once the debt is paid."""
         self.balance -= cents
         self.collected += cents
         if not self.balance:
             self.close("paid")
 
     def verify(self) -> None:
-        """Learn what the agency has found out about a dispute: every second debtor was right."""
+        """Resolve a dispute: every second debtor was right."""
         if self.status == "disputed":
             self.close("not owed") if self.draw.random() < 0.5 else self.reopen()
 
     def judge(self) -> None:
-        """Hear the court's decision: wages are garnished, or none are found, or the suit is dismissed."""
+        """Apply the court's decision: it garnishes wages, finds none, or dismisses the lawsuit."""
         if self.status == "court" and self.court < 0.4:
             self.repay("judged", self.wage // 4)
         elif self.status == "court":
             self.close("nothing to garnish" if self.court < 0.9 else "dismissed")
 
     def reopen(self) -> None:
-        """Be a case for the agency's decisions again."""
+        """Reopen the case for the agency's decisions."""
         self.status, self.due = "open", self.world.month + 1
 
     def close(self, reason: str) -> None:
@@ -277,14 +277,14 @@ class Debtor(Entity):
 
 
 class Agency(Entity):
-    """Owns debts, buys others day by day (a Poisson process), and collects them.
+    """An agency, which buys debts (a Poisson process) and collects them.
 
     Attributes:
-        parameters: What it is like.
+        parameters: The agency's parameters.
         cases: All debtors whose cases are not closed, by number.
-        queue: The cases that are still due today.
-        calls_left: How many calls the staff can still make today.
-        random: Draws when debts are bought.
+        queue: The cases still due today.
+        calls_left: The number of calls that the staff can still make today.
+        random: The generator for the times of purchases.
     """
 
     __slots__ = ("calls_left", "cases", "parameters", "queue", "random")
@@ -292,7 +292,7 @@ class Agency(Entity):
     kind = "agency"
 
     def __init__(self, seed: int | None = None, parameters: Parameters | None = None) -> None:
-        """Begin in a world of its own; the seed determines all chance."""
+        """Create an agency in a world of its own; the seed determines all randomness."""
         super().__init__(World(seed))
         self.parameters = parameters = parameters or Parameters()
         world, self.random, self.calls_left = self.world, self.world.stream("purchases"), parameters.calls
@@ -305,7 +305,7 @@ class Agency(Entity):
             self.buy(0.0)
 
     def buy(self, time: float) -> None:
-        """Buy a debt, unless it is the first moment, and enter the next purchase into the calendar."""
+        """Buy a debt, except at time 0, and schedule the next purchase."""
         if time:
             Debtor(self)
         time += self.random.expovariate(self.parameters.arrivals)
@@ -313,7 +313,7 @@ class Agency(Entity):
             self.world.calendar.at(int(time), self.buy, time)
 
     def advance(self) -> None:
-        """Let a day go by: the agency's work, then what happens to debtors, then what is due."""
+        """Simulate one day: the agency's work, then the debtors' events, then the payments that are due."""
         self.work()
         self.world.advance()
 
@@ -323,7 +323,7 @@ class Agency(Entity):
         return self.cents - self.parameters.capital
 
     def lawful(self, debtor: Debtor) -> tuple[str, ...]:
-        """What may be done about a case now, in the order of ``CHOICES``. To leave it alone is always lawful."""
+        """List the choices that are lawful for a case now, in the order of ``CHOICES``; "leave" always is."""
         day, choices = self.world.month, ["leave"]
         if debtor.status != "open":
             return ("leave",)
@@ -338,15 +338,15 @@ class Agency(Entity):
         return tuple(choice for choice in choices if COSTS[choice] <= self.cents)
 
     def choose_contact(self, debtor: Debtor, choices: Sequence[str]) -> str:
-        """Decide what to do about a case.
+        """Choose what to do about a case.
 
         Args:
-            debtor: Whose case it is.
-            choices: What may be done.
+            debtor: The debtor of the case.
+            choices: The lawful choices.
 
         Returns:
-            One of the choices, by a dunning ladder: two letters, then up to six calls until there is a conversation,
-            then the court for debts of 500 and more.
+            One of the choices, by a dunning sequence: two letters, then up to six calls until there is a conversation,
+            then a lawsuit for debts of 500 dollars and more.
         """
         if debtor.letters < 2 and "write" in choices:
             return "write"
@@ -355,7 +355,7 @@ class Agency(Entity):
         return "sue" if "sue" in choices and debtor.balance >= 500_00 else "leave"
 
     def work(self) -> None:
-        """Go through all cases that are due, the longest waiting first; weekends are free."""
+        """Decide on all cases that are due, those due longest first; there is no work on weekends."""
         day = self.world.month
         if day % 7 >= 5:
             return
@@ -374,7 +374,7 @@ class Agency(Entity):
                 self.carry_out(choice, debtor)
 
     def carry_out(self, choice: str, debtor: Debtor) -> None:
-        """Pay for what was decided, and do it."""
+        """Pay for a choice, and carry it out."""
         world, day, draw = self.world, self.world.month, debtor.draw
         world.counts[choice] += 1
         world.ledger.move(self, world.outside, COSTS[choice], choice)
@@ -402,11 +402,11 @@ class Agency(Entity):
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print how an agency fares."""
-    parser = argparse.ArgumentParser(description="Let an agency collect debts by its own rule.")
-    parser.add_argument("--days", type=int, default=720, help="for how long (default: 720)")
-    parser.add_argument("--calls", type=int, default=Parameters.calls, help="calls a working day (default: 4)")
-    parser.add_argument("--seed", type=int, help="of all chance (default: another each time)")
+    """Run an agency, and print its results."""
+    parser = argparse.ArgumentParser(description="Run a debt collection agency by its own rule, and print its results.")
+    parser.add_argument("--days", type=int, default=720, help="how many days to simulate (default: 720)")
+    parser.add_argument("--calls", type=int, default=Parameters.calls, help="calls per working day (default: 4)")
+    parser.add_argument("--seed", type=int, help="seed of all randomness (default: a new one each time)")
     options = parser.parse_args(arguments)
     agency = Agency(options.seed, Parameters(calls=options.calls))
     print(" day  cases   owed, dollars  profit, dollars")

@@ -1,14 +1,14 @@
-"""The agency of ``collections`` as environments. The model knows nothing of this.
+"""Environments made from the agency of ``collections``. The model itself does not refer to this module.
 
-- ``CASES``: each debtor is an agent, from the first decision on its case until the case is closed. All have the same
-  spaces, so that one policy can serve them all. The reward is what the debtor has paid less what the case has cost.
-- ``COLLECTOR``: one agent, ``collector_0``, decides on all cases. The reward is the agency's gain.
+- ``CASES``: each debtor is an agent, from the first decision on its case until the case is closed. All agents have the
+  same spaces, so they can share one policy. The reward is the debtor's payments less the costs of the case.
+- ``COLLECTOR``: one agent, ``collector_0``, decides on all cases. The reward is the agency's profit.
 - ``NAMED_CASES`` and ``NAMED_COLLECTOR``: the same with fixed actions, those of ``CHOICES``, and a mask.
-- ``CollectionSim``: the simulation, some days of an agency.
+- ``CollectionSim``: the simulation: an agency over a number of days.
 
-In the first two the action is an index into the lawful choices that arrive with the call, so 2 can mean "call" today
-and "sue" tomorrow. The last three numbers of an observation tell which choices are lawful, and ``lawful`` lists them.
-In the parallel view the choices can change between the observation and the decision: take fixed actions there.
+In the first two, the action is an index into the lawful choices that the call gets, so 2 can mean "call" today and
+"sue" tomorrow. The last three numbers of an observation tell which choices are lawful, and ``lawful`` lists them. In
+the parallel view, the lawful choices can change between the observation and the decision: use fixed actions there.
 
 Rewards are in hundreds of dollars.
 """
@@ -28,7 +28,7 @@ from simenv_marl import TRUNCATED, Definition, SimulationInterface, difference, 
 from .collections import ACTIVE, CHOICES, KEPT, Agency, Debtor, Parameters
 
 DAYS: Final = 720
-"""After how many days an episode is truncated."""
+"""The number of days after which an episode is truncated."""
 
 POINT: Final = f"{Agency.__module__}.Agency.choose_contact"
 """The decision point."""
@@ -48,14 +48,14 @@ OBSERVED: Final = {
     "whether to call is lawful": 1,
     "whether to sue is lawful": 1,
 }
-"""What is observed of a case, with the highest values: what a collector can know."""
+"""The observation of a case: what a collector can know. The numbers are the upper bounds."""
 
 HIGH: Final = np.array(list(OBSERVED.values()), np.float32)
 SPACE: Final = Box(np.zeros(len(HIGH), np.float32), HIGH)
 
 
 def observe(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> NDArray[np.float32]:
-    """Observe what ``OBSERVED`` lists."""
+    """Observe a case, as ``OBSERVED`` lists it."""
     day, latest = agency.world.month, debtor.contacted
     seen = (
         debtor.balance / 1000_00,
@@ -74,20 +74,20 @@ def observe(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> NDArray[n
 
 
 def lawful(observation: Any) -> list[str]:
-    """The lawful choices that an observation tells, in the order in which actions number them."""
+    """Read the lawful choices from an observation, in the order of the action's index."""
     flags = (1.0, *observation[1 - len(CHOICES) :])
     return [choice for choice, flag in zip(CHOICES, flags, strict=True) if flag]
 
 
 @difference
 def gain_of_case(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> float:
-    """What the debtor has paid less what the case has cost."""
+    """The debtor's payments less the costs of the case, in hundreds of dollars."""
     return (debtor.collected - debtor.spent) / 100_00
 
 
 @difference
 def gain(agency: Agency, debtor: Debtor, choices: Sequence[str]) -> float:
-    """The agency's profit."""
+    """The agency's profit, in hundreds of dollars."""
     return agency.profit / 100_00
 
 
@@ -104,7 +104,7 @@ CASE: Final = make_step(
 
 
 def named(definition: Definition) -> Definition:
-    """Make the actions those of ``CHOICES``, of which the lawful ones are legal."""
+    """Change a definition to fixed actions, those of ``CHOICES``, with a mask of the lawful ones."""
     return replace(
         definition,
         choices=None,
@@ -115,7 +115,7 @@ def named(definition: Definition) -> Definition:
 
 
 CASES: Final[dict[Any, Definition]] = {POINT: CASE}
-"""An agent for each debtor."""
+"""One agent per debtor."""
 
 COLLECTOR: Final[dict[Any, Definition]] = {
     POINT: replace(CASE, reward_mapping=gain, agent="collector_0", removed_by={}),
@@ -123,17 +123,17 @@ COLLECTOR: Final[dict[Any, Definition]] = {
 """One agent for all cases."""
 
 NAMED_CASES: Final[dict[Any, Definition]] = {POINT: named(CASES[POINT])}
-"""An agent for each debtor, with fixed actions."""
+"""One agent per debtor, with fixed actions."""
 
 NAMED_COLLECTOR: Final[dict[Any, Definition]] = {POINT: named(COLLECTOR[POINT])}
 """One agent for all cases, with fixed actions."""
 
 
 class CollectionSim(SimulationInterface):
-    """Some days of an agency.
+    """An agency over a number of days.
 
     Attributes:
-        agency: The agency of the present episode.
+        agency: The agency of the current episode.
     """
 
     points = CASES
@@ -142,8 +142,8 @@ class CollectionSim(SimulationInterface):
         """Make a simulation.
 
         Args:
-            days: After how many days it is truncated.
-            parameters: What the agency is like; None: the model's defaults.
+            days: The number of days after which an episode is truncated.
+            parameters: The agency's parameters; None: the model's defaults.
         """
         self.days = days
         self.parameters = parameters or Parameters()
@@ -151,15 +151,15 @@ class CollectionSim(SimulationInterface):
         self._stopped = False
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin with another agency."""
+        """Create a new agency."""
         self._stopped = False
         self.agency = Agency(seed, self.parameters)
 
     def run(self) -> Any:
-        """Let day after day go by, until all cases are closed and no debts are bought.
+        """Simulate days until all cases are closed and the agency buys no more debts.
 
         Returns:
-            ``TRUNCATED`` if the last day comes first.
+            ``TRUNCATED`` if the last day comes first, else None.
         """
         agency = self.agency
         while agency.world.month < self.days and not self._stopped:
@@ -171,7 +171,7 @@ class CollectionSim(SimulationInterface):
         return None
 
     def stop(self) -> None:
-        """Ask the loop to end after the present day."""
+        """Ask the loop to end after the current day."""
         self._stopped = True
 
     def time(self) -> int:
@@ -179,16 +179,16 @@ class CollectionSim(SimulationInterface):
         return self.agency.world.month
 
     def reseed(self, seed: int) -> None:
-        """Draw anew what lies ahead: of the debtors that are there, and, by the world's seed, of those to come."""
+        """Draw another future, for the present debtors and, by the world's seed, for those to come."""
         self.agency.world.seed = seed
         reseed_generators(self, seed)
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Whose cases are still due today."""
+        """Return the calls for the cases still due today."""
         return [(self.agency, debtor, self.agency.lawful(debtor)) for debtor in self.agency.queue]
 
     def state(self) -> NDArray[np.float32]:
-        """What the agency knows of all its cases together, and what it does not: what debtors have and want."""
+        """Summarise all cases: what the agency knows, and the debtors' money and willingness, which it does not."""
         agency = self.agency
         cases = list(agency.cases.values())
         statuses = [debtor.status for debtor in cases]

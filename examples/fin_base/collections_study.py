@@ -1,8 +1,9 @@
-"""What a better policy is worth to the agency of ``collections``.
+"""A study: how much profit a better policy brings the agency of ``collections``.
 
-The policy has four numbers and looks at one case. It can decide on all cases as one agent, or serve the agents of all
-debtors. CMA-ES finds the numbers. ``main`` compares the policy with the rule, with constants, and with policies that
-have one of the numbers, on seeds that the search does not use. The utility is that of ``collections``::
+The policy has four parameters and looks at one case at a time. It can decide on all cases as one agent, or be shared
+by the agents of all debtors. CMA-ES finds the parameters. ``main`` compares the policy with the rule, with constant
+policies, and with policies that take over one parameter each, on seeds that the search does not use. The utility is
+that of ``collections``::
 
     python -m examples.fin_base.collections_study
 """
@@ -24,11 +25,11 @@ from .collections import HALF_LIFE
 from .collections_env import COLLECTOR, CollectionSim, lawful
 
 HELD_OUT: Final = 2_000_000
-"""Seeds from here on are for comparisons. Those below it are to learn from."""
+"""Seeds from this number on are for comparisons; those below it are for learning."""
 
 
 def prefer(*wanted: str) -> Any:
-    """Make a policy that always takes the first of the wanted choices that is lawful."""
+    """Make a policy that always takes the first lawful one of the wanted choices."""
 
     def policy(observation: Any) -> int:
         choices = lawful(observation)
@@ -39,13 +40,13 @@ def prefer(*wanted: str) -> Any:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """A policy that calls about debts that are worth it: the worth is the amount, halved for each ``HALF_LIFE`` of age.
+    """A threshold policy: it calls about debts of enough worth, which is the amount, halved per ``HALF_LIFE`` of age.
 
     Attributes:
-        letters: It sends letters until so many are sent.
-        attempts: It makes calls until so many are made.
+        letters: The number of letters after which it sends no more.
+        attempts: The number of calls after which it makes no more.
         call: The lowest worth for which it calls, in hundreds of dollars.
-        sue: The lowest amount for which it sues, in hundreds of dollars, when there is nothing else left to do.
+        sue: The lowest amount for which it sues when no other choice is left, in hundreds of dollars.
     """
 
     letters: float = 2.0
@@ -54,7 +55,7 @@ class Thresholds:
     sue: float = 5.0
 
     def __call__(self, observation: Any, info: Any = None) -> int:
-        """Choose the first of a call, a letter and a lawsuit that is worth it and lawful; else leave the case alone."""
+        """Choose the first of call, letter and lawsuit that is worth it and lawful; else leave the case alone."""
         owed, age, _, letters, attempts = (float(number) for number in observation[:5])
         worth = 10 * owed * 0.5 ** (365 * age / HALF_LIFE)
         wanted = {
@@ -70,22 +71,22 @@ LEARNED: Final = Thresholds(letters=7.63, attempts=20.0, call=1.35, sue=8.4)
 
 
 def rate(policy: Any, seeds: Sequence[int], simulation: Any = CollectionSim) -> float:
-    """The mean profit over seeds, in hundreds of dollars."""
+    """Compute a policy's mean profit over seeds, in hundreds of dollars."""
     runs = (simulate(simulation, {"collector_0": policy}, points=COLLECTOR, seed=seed) for seed in seeds)
     return float(np.mean([run.agency.profit / 100_00 for run in runs]))
 
 
 def learn(generations: int, seed: int = 0, *, episodes: int = 4, simulation: Any = CollectionSim) -> Thresholds:
-    """Find thresholds by CMA-ES, in logarithms.
+    """Find thresholds by CMA-ES, which searches their logarithms.
 
     Args:
-        generations: For how long.
-        seed: Of the search.
-        episodes: On how many seeds each candidate is rated; the same for all candidates of a generation.
-        simulation: What is simulated.
+        generations: The number of generations.
+        seed: The seed of the search.
+        episodes: The number of seeds on which each candidate is rated; all candidates of a generation share them.
+        simulation: The simulation's class.
 
     Returns:
-        The policy that was found.
+        The best policy found.
     """
     draw = np.random.default_rng(seed)
 
@@ -103,7 +104,7 @@ CONSTANTS: Final = {
     "call, write": prefer("call", "write"),
     "sue, write": prefer("sue", "write"),
 }
-"""Policies that take what is lawful, whatever the case."""
+"""Policies that ignore the case: they take their first wanted choice that is lawful."""
 
 
 def compare(policies: Mapping[str, Any], seeds: Sequence[int], simulation: Any = CollectionSim) -> Evaluation:
@@ -114,11 +115,11 @@ def compare(policies: Mapping[str, Any], seeds: Sequence[int], simulation: Any =
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Learn, compare, and print the table."""
+    """Learn a policy, compare it, and print the table."""
     parser = argparse.ArgumentParser(description="Learn whom to write to, call or sue, and compare.")
-    parser.add_argument("--generations", type=int, default=15, help="of the search (default: 15)")
-    parser.add_argument("--seeds", type=int, default=32, help="to compare on (default: 32)")
-    parser.add_argument("--seed", type=int, default=0, help="of the search (default: 0)")
+    parser.add_argument("--generations", type=int, default=15, help="generations of the search (default: 15)")
+    parser.add_argument("--seeds", type=int, default=32, help="number of seeds for the comparison (default: 32)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the search (default: 0)")
     options = parser.parse_args(arguments)
     learned = learn(options.generations, options.seed)
     print(learned)

@@ -1,4 +1,4 @@
-"""A pension company, its manager and its regulator: what they decide."""
+"""The decisions of a pension company, its asset manager and its regulator."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from .people import Client, PensionContract, RecoveryPlan, clients_of
 
 
 class Manager(Entity):
-    """Manages the company's assets.
+    """The asset manager of a company.
 
     Attributes:
-        company: Whose assets it manages.
-        equities: The share of them that is in equities; the rest is in bonds.
+        company: The company whose assets it manages.
+        equities: The share of the assets in equities; the rest is in bonds.
     """
 
     __slots__ = ("company", "equities")
@@ -40,46 +40,46 @@ class Manager(Entity):
         self.company, self.equities = company, equities
 
     def lawful_mix(self) -> float:
-        """The highest share of equities that is lawful: in a shortfall the present one."""
+        """The highest lawful share of equities: in a shortfall, this is the current share."""
         return self.equities if self.company.policy_coverage() < MINIMUM else 1.0
 
     def choose_mix(self) -> float:
-        """Decide on the share of equities: 40 % where that is lawful, and 30 % while coverage is below 100 %."""
+        """Choose the share of equities: 40 %, or 30 % while coverage is below 100 %, within what is lawful."""
         return min(0.4 if self.company.policy_coverage() >= TRANSFERABLE else 0.3, self.lawful_mix())
 
     def rebalance(self) -> None:
-        """Buy and sell, within what is lawful."""
+        """Buy and sell to reach the chosen mix, within what is lawful."""
         self.equities = min(max(self.choose_mix(), 0.0), self.lawful_mix())
 
 
 class Regulator(Entity):
-    """Decides what recovery plans have to contain."""
+    """The regulator, which decides what recovery plans must contain."""
 
     __slots__ = ()
 
     kind = "regulator"
 
     def choose_demand(self, company: Company) -> float:
-        """Decide which cut of rights to demand this year.
+        """Choose the cut of rights to demand this year.
 
         Returns:
-            A tenth of the shortfall if coverage is critical or has been below the minimum too often; 0 otherwise.
+            A tenth of the shortfall if coverage is critical or was below the minimum too often; 0 otherwise.
         """
         due = company.policy_coverage() < CRITICAL or company.measured_short >= MEASUREMENTS
         return company.shortfall() / SPREAD if due else 0.0
 
 
 class Company(Entity):
-    """Promises pensions, and holds assets for them.
+    """A pension company, which promises pensions and holds assets to pay them.
 
     Attributes:
-        market: Where its assets are.
-        tables: The mortality that it reckons with.
-        manager: Who manages the assets.
-        regulator: Who supervises it.
-        measured_short: At how many yearly measurements in a row its policy coverage was below the minimum.
-        rations: What each pension contract got in the last month, if there was not enough for all.
-        indexed: What a right of 1 from the first month has become by indexation and cuts.
+        market: The market in which its assets are invested.
+        tables: The mortality that it assumes.
+        manager: The manager of its assets.
+        regulator: The regulator that supervises it.
+        measured_short: The number of yearly measurements in a row at which its policy coverage was below the minimum.
+        rations: What each pension contract got in the last month, if the money did not suffice for all, in cents.
+        indexed: The current amount of a right that was 1 in the first month, after indexation and cuts.
     """
 
     __slots__ = (
@@ -108,23 +108,23 @@ class Company(Entity):
         self.measured_short, self.indexed = 0, 1.0
         self.rations: dict[int, int] = {}
         self._rationed = -1
-        self._rights = [0] * OLDEST  # by month of birth: the first is OLDEST - 1 months before the first month
+        self._rights = [0] * OLDEST  # by month of birth; the first is OLDEST - 1 months before month 0
         self._history: deque[float] = deque(maxlen=12)
         self._policy_coverage = 1.0
         self._factors = annuity_factors(tables, market.yield_steps, RETIREMENT)
         self._provisions: float | None = None
 
-    # what it knows at any time
+    # state
 
     def factor(self, age: int) -> float:
-        """What a pension of 1 a year is worth at an age in months, at the present yield."""
+        """The value of a pension of 1 a year at an age in months, at the current yield."""
         return self._factors[OLDEST - 1 - age]
 
     def provisions(self) -> float:
-        """What all rights are worth, in cents.
+        """The value of all rights, in cents.
 
-        Rights are kept as sums by month of birth, which do not change with time: each change of a right is one
-        addition, and each valuation one product of sums and factors, whatever the number of clients.
+        The company keeps sums of rights by month of birth, which do not change as time passes. Each change of a right
+        is one addition, and each valuation is one product of sums and factors, whatever the number of clients.
         """
         if self._provisions is None:
             youngest = self.world.month
@@ -132,66 +132,66 @@ class Company(Entity):
         return self._provisions
 
     def coverage(self) -> float:
-        """Assets by provisions, at present; without provisions it is 2."""
+        """The current ratio of assets to provisions; 2 without provisions."""
         provisions = self.provisions()
         return self.cents / provisions if provisions > 0 else 2.0
 
     def policy_coverage(self) -> float:
-        """The mean of the coverage over the last twelve months, by which it is judged."""
+        """The mean coverage over the last twelve months, by which the company is judged."""
         return self._policy_coverage
 
     def shortfall(self) -> float:
-        """The share of all rights that would have to be cut to reach the minimum."""
+        """The share by which all rights would have to be cut to reach the minimum."""
         return max(0.0, 1 - self.policy_coverage() / MINIMUM)
 
     def cost_rate(self, client: Client) -> float:
-        """The share of the wage that a client's standard accrual costs."""
+        """The cost of a client's standard accrual, as a share of the wage."""
         return ACCRUAL * self.factor(client.age)
 
     def lawful_premium(self, client: Client) -> tuple[float, float]:
-        """The lowest and the highest premium that is lawful for a client, as shares of the wage."""
+        """The lowest and the highest lawful premium for a client, as shares of the wage."""
         cost = min(self.cost_rate(client) * (1 + client.extra), HIGHEST_PREMIUM)
         return cost * (0.8 if self.policy_coverage() >= REQUIRED else 1.0), min(1.3 * cost, HIGHEST_PREMIUM)
 
     def repair(self) -> float:
-        """By how much rights may grow beyond inflation, where coverage is as high as required in the long run.
+        """How much more than inflation rights may grow, where coverage has the level required in the long run.
 
         Returns:
-            A fifth of what they are behind prices.
+            A fifth of the gap between rights and prices.
         """
         behind = self.market.price_level / max(self.indexed, 1e-9) - 1
         return max(0.0, behind) / 5 if self.policy_coverage() >= REQUIRED else 0.0
 
     def lawful_indexation(self) -> float:
-        """The highest indexation that is lawful: inflation and repair, if coverage is high enough."""
+        """The highest lawful indexation: inflation plus repair, if coverage is high enough."""
         return max(0.0, self.market.inflation) + self.repair() if self.policy_coverage() >= INDEXING else 0.0
 
     # decisions
 
     def set_premium(self, client: Client) -> float:
-        """Decide which share of the wage a client pays for a year.
+        """Choose a client's premium for the next year, as a share of the wage.
 
         Returns:
-            What the accrual costs and 5 % of it for solvency; 15 % in a shortfall; less a tenth where coverage is
-            well above what is required.
+            The cost of the accrual plus 5 % of it for solvency. The surcharge is 15 % in a shortfall; where coverage
+            is well above what is required, there is a discount of 10 % instead.
         """
         coverage = self.policy_coverage()
         surcharge = 1.15 if coverage < MINIMUM else 0.9 if coverage > REQUIRED + 0.15 else 1.05
         return surcharge * self.cost_rate(client) * (1 + client.extra)
 
     def choose_indexation(self) -> float:
-        """Decide by how much rights grow: the policy ladder, from nothing at 110 % to all that is lawful at 130 %."""
+        """Choose the indexation of rights: it rises linearly from zero at 110 % to the lawful maximum at 130 %."""
         step = (self.policy_coverage() - INDEXING) / 0.2
         return self.lawful_indexation() * min(max(step, 0.0), 1.0)
 
     def choose_cut(self) -> float:
-        """Decide by how much rights are cut in a shortfall: a tenth of it, from the third measurement on."""
+        """Choose the cut of rights in a shortfall: a tenth of the shortfall, from the third measurement on."""
         return self.shortfall() / SPREAD if self.measured_short >= 3 else 0.0
 
-    # what it does
+    # actions
 
     def book_right(self, born: int, cents: int) -> None:
-        """Note that rights of those born in a month have changed."""
+        """Record a change in the rights of those born in a month."""
         place = born + OLDEST - 1
         rights = self._rights
         if place >= len(rights):
@@ -202,7 +202,7 @@ class Company(Entity):
     def review(self, client: Client) -> None:
         """Set premium and accrual for a client's next year, and amend the contract.
 
-        What is paid and accrued beyond the standard ends where it costs more than can be asked for.
+        Contributions beyond the standard end if the premium for them would be above the legal maximum.
         """
         if self.cost_rate(client) * (1 + client.extra) > HIGHEST_PREMIUM:
             client.extra = 0.0
@@ -215,7 +215,7 @@ class Company(Entity):
         client.contract.missed = 0
 
     def change_rights(self, by: float) -> None:
-        """Let all rights grow or shrink by a share of them."""
+        """Increase or cut all rights by a share of them."""
         for client in clients_of(self.world):
             if client.accrued:
                 client.accrue(round(client.accrued * by))
@@ -224,7 +224,7 @@ class Company(Entity):
         self.indexed *= 1 + by
 
     def invest(self) -> None:
-        """Earn, or lose, what the market has done to the assets in a month, and value rights anew."""
+        """Book a month's gains or losses on the assets, and revalue the rights."""
         share_of_equities, market = self.manager.equities, self.market
         rate = share_of_equities * market.equity_return + (1 - share_of_equities) * market.bond_return
         change = round(self.cents * rate)
@@ -237,10 +237,10 @@ class Company(Entity):
         self._provisions = None
 
     def ration(self) -> dict[int, int]:
-        """See, once a month, whether there is enough for the pensions; if not, divide what there is.
+        """Check, once a month, whether the money suffices for all pensions; if not, divide it among them.
 
         Returns:
-            Cents by the number of the contract; nothing, where there is enough.
+            Cents by the number of the contract; empty if the money suffices.
         """
         month, contracts = self.world.month, self.world.contracts.items()
         if self._rationed == month:
@@ -253,13 +253,13 @@ class Company(Entity):
         return self.rations
 
     def measure(self) -> None:
-        """Note the coverage of the month."""
+        """Record the coverage of the month."""
         history = self._history
         history.append(self.coverage())
         self._policy_coverage = sum(history) / len(history)
 
     def conclude_year(self) -> None:
-        """Measure, index rights or cut them, after the regulator has looked at the plan."""
+        """Measure the coverage, then index rights; or cut them, after the regulator has reviewed the recovery plan."""
         counts = self.world.counts
         if self.policy_coverage() >= MINIMUM:
             self.measured_short = 0

@@ -1,15 +1,15 @@
-"""What a pension fund cannot decide: prices, yields, returns, and how long people live.
+"""The economy and the mortality around a pension fund: prices, yields, returns and lifetimes.
 
 **Mortality** is Makeham's law: at age x, the force of mortality is A + B c^x. ``Mortality`` has the parameters of the
 Standard Ultimate Survival Model, A = 0.00022, B = 2.7e-6, c = 1.124 (Dickson, Hardy and Waters, Actuarial Mathematics
 for Life Contingent Risks; also behind the Standard Ultimate Life Table of the Society of Actuaries' FAM-L exam).
 
-**The market** has three variables, which move by the month and are correlated. Inflation and the yield of bonds are
-first-order autoregressive, as inflation is in Wilkie's model (A stochastic investment model for actuarial use,
-Transactions of the Faculty of Actuaries 39, 1986; 0.58 of a deviation is left after a year, after his revision of
-1995) and the rate in Vasicek's (An equilibrium characterization of the term structure, Journal of Financial Economics
-5, 1977). Returns on equities are lognormal. The levels are round numbers of our own, in the range of what regulators
-assume, and fitted to nothing: see ``Market``.
+**The market** has three correlated variables in monthly steps. Inflation and the bond yield are first-order
+autoregressive, as inflation is in Wilkie's model (A stochastic investment model for actuarial use, Transactions of the
+Faculty of Actuaries 39, 1986; a yearly coefficient of 0.58, from his revision of 1995) and the interest rate in
+Vasicek's model (An equilibrium characterization of the term structure, Journal of Financial Economics 5, 1977). Equity
+returns are lognormal. The levels are round numbers of our own, in the range of what regulators assume; they are not
+fitted to data: see ``Climate``.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from math import exp, log, sqrt
 from random import Random
 
 OLDEST = 120 * 12
-"""The age in months that is not survived."""
+"""The maximum age in months, which no person survives."""
 
 STEP = 0.0025
-"""Provisions are valued at the yield rounded to this: there is a table of annuity factors for each step."""
+"""The rounding of the yield at which provisions are valued: there is a table of annuity factors for each step."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class Mortality:
     """Makeham's law of mortality.
 
     Attributes:
-        a: What does not depend on age.
-        b: The level of what does.
-        c: By which factor that grows each year.
-        factor: By which all of it is multiplied: less than 1, and people live longer than the tables say.
+        a: The part that does not depend on age.
+        b: The level of the part that grows with age.
+        c: The growth factor of that part per year of age.
+        factor: A factor on the whole force; below 1, people live longer than the tables say.
 
     >>> round(Mortality().life_expectancy(65 * 12), 1)
     22.7
@@ -51,7 +51,7 @@ class Mortality:
         return self.factor * (self.a + self.b * exp(years * log(self.c)))
 
     def monthly(self) -> list[float]:
-        """The probability to die within a month, by age in months up to ``OLDEST``.
+        """Compute the probability of death within a month, by age in months up to ``OLDEST``.
 
         It is 1 - exp(-the integral of the force over the month), which has a closed form.
         """
@@ -60,7 +60,7 @@ class Mortality:
         return [1 - exp(-hazard) for hazard in hazards[:-1]] + [1.0]
 
     def life_expectancy(self, age: int) -> float:
-        """How many years people of an age in months have before them."""
+        """Compute the remaining life expectancy, in years, at an age in months."""
         months, alive = 0.0, 1.0
         for probability in self.monthly()[age:]:
             alive *= 1 - probability
@@ -70,15 +70,15 @@ class Mortality:
 
 @lru_cache(maxsize=256)
 def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[float, ...]:
-    """What a pension of 1 a year is worth, paid for life in twelfths from retirement on.
+    """Compute the value of a pension of 1 a year, paid monthly for life from retirement on.
 
     Args:
-        mortality: By which people die.
+        mortality: The law of mortality.
         steps: The yield, in units of ``STEP``.
-        retirement: The age in months from which it is paid.
+        retirement: The age in months from which the pension is paid.
 
     Returns:
-        Its value by age in months, from ``OLDEST - 1`` *down to* 0: the order in which those born later come last.
+        The values by age in months, from ``OLDEST - 1`` *down to* 0, that is, in the order of birth.
     """
     discount = (1 + STEP * steps) ** (-1 / 12)
     value, values = 0.0, []
@@ -90,18 +90,18 @@ def annuity_factors(mortality: Mortality, steps: int, retirement: int) -> tuple[
 
 @dataclass(frozen=True)
 class Climate:
-    """What the market is like. Rates are by the year.
+    """The parameters of the market. Rates are annual.
 
     Attributes:
         inflation: Mean inflation: the European Central Bank's target.
-        inflation_sd: Its standard deviation in the long run.
-        inflation_memory: What is left of a deviation from the mean after a year.
+        inflation_sd: Its long-run standard deviation.
+        inflation_memory: The share of a deviation from the mean that remains after a year.
         bond_yield: Mean yield of bonds.
-        yield_sd: Its standard deviation in the long run.
-        yield_memory: What is left of a deviation from the mean after a year.
-        equity_premium: By how much the mean log return of equities exceeds the mean yield.
+        yield_sd: Its long-run standard deviation.
+        yield_memory: The share of a deviation from the mean that remains after a year.
+        equity_premium: The excess of the mean log return of equities over the mean yield.
         equity_sd: Standard deviation of that return.
-        correlations: Of the shocks of inflation and yield, inflation and equities, yield and equities.
+        correlations: Of the shocks to inflation and yield, inflation and equities, yield and equities.
     """
 
     inflation: float = 0.02
@@ -116,20 +116,20 @@ class Climate:
 
 
 class Market:
-    """Inflation, yields and returns, month by month.
+    """The market: inflation, yields and returns, in monthly steps.
 
     Attributes:
-        inflation: The present inflation, by the year.
-        bond_yield: The present yield, by the year.
-        price_level: What cost 1 in the first month costs now.
-        equity_return: Of the month that has gone by.
-        bond_return: Of the month that has gone by, for bonds of ``DURATION`` years.
+        inflation: The current annual inflation.
+        bond_yield: The current annual yield.
+        price_level: The current price of what cost 1 in the first month.
+        equity_return: The equity return of the last month.
+        bond_return: The bond return of the last month, for bonds with a duration of ``DURATION`` years.
     """
 
     DURATION = 12.0
 
     def __init__(self, climate: Climate, random: Random) -> None:
-        """Begin where inflation and yield are on average in the long run."""
+        """Create a market, with inflation and yield at their long-run means."""
         self.climate, self.random = climate, random
         self.inflation, self.bond_yield, self.price_level = climate.inflation, climate.bond_yield, 1.0
         self.equity_return = self.bond_return = 0.0
@@ -141,7 +141,7 @@ class Market:
         return min(max(round(self.bond_yield / STEP), -2), 32)
 
     def advance(self) -> None:
-        """Let a month go by."""
+        """Simulate one month."""
         climate, draw = self.climate, self.random.gauss
         first, second, third = draw(0, 1), draw(0, 1), draw(0, 1)
         shocks = [row[0] * first + row[1] * second + row[2] * third for row in self._roots]
@@ -159,17 +159,17 @@ class Market:
 
 
 def _revert(value: float, mean: float, memory: float) -> float:
-    """Where a value is a month later, but for chance."""
+    """Return the expected value a month later."""
     return mean + exp(log(memory) / 12) * (value - mean)
 
 
 def _monthly_sd(long_run: float, memory: float) -> float:
-    """The standard deviation of monthly shocks whose sum has that in the long run."""
+    """Return the standard deviation of monthly shocks that gives the process this long-run standard deviation."""
     return long_run * sqrt(1 - memory ** (1 / 6))
 
 
 def _cholesky(correlations: Sequence[float]) -> tuple[tuple[float, float, float], ...]:
-    """The matrix that makes three independent shocks correlated."""
+    """Return the Cholesky factor, which makes three independent shocks correlated."""
     one, two, three = correlations
     middle = sqrt(1 - one * one)
     cross = (three - one * two) / middle

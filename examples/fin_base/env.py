@@ -1,22 +1,22 @@
-"""The pension fund as environments: which of its decisions become agents, and what they see, may do and are worth.
+"""Environments made from the pension fund: agents for its decisions, with observations, actions and rewards.
 
-The model knows nothing of this: its methods are named as decision points from here, and nothing else of it changes.
+The model itself does not refer to this module: the module names the model's methods as decision points.
 
 - ``COMPANY``, ``MANAGER``, ``REGULATOR``: single agents. ``indexer_0`` and ``planner_0`` decide once a year on
-  indexation and cuts, ``manager_0`` each quarter on the assets, ``regulator_0`` on what recovery plans must contain.
-  Their rewards differ, and partly oppose each other: see ``REWARDS``.
-- ``TEAM``: the same agents, all with the same reward: what ``welfare`` says the members gain.
-- ``PREMIUMS``: each client is an agent, which decides once a year on its own premium *for the company*; one policy can
-  be shared by all. The agent ends when the client retires, leaves or dies.
-- ``FundSim``: the simulation, some years of a fund; its time is in years, so that infos tell how many have gone by.
+  indexation and cuts, ``manager_0`` each quarter on the asset mix, ``regulator_0`` on what recovery plans must contain.
+  Their rewards differ and partly conflict: see ``REWARDS``.
+- ``TEAM``: the same agents with a common reward: the gain in the members' welfare, as ``welfare`` defines it.
+- ``PREMIUMS``: each client is an agent, which decides once a year on its own premium *on behalf of the company*; all
+  these agents can share one policy. The agent ends when the client retires, leaves or dies.
+- ``FundSim``: the simulation: a fund over a number of years. Its time is in years, and so is the time in infos.
 
-``premium_env``, ``board_env``, ``team_env`` and ``mix_env`` make environments of these; the last is goal-based: the
-goal is a coverage, and episodes can be replayed with another. Importing this module registers all of them: see
-``_register``.
+``premium_env``, ``board_env``, ``team_env`` and ``mix_env`` make environments from these. The last one is goal-based:
+the goal is a coverage, and transitions can be relabelled with another goal. Importing this
+module registers all of them: see ``_register``.
 
-Actions that the law forbids are masked: discounts on premiums without the coverage for them, indexation below 110 %,
-more risk in a shortfall. What is not masked can still be denied: a recovery plan that cuts less than the regulator
-demands.
+Masks exclude the actions that the law forbids: discounts on premiums without the coverage for them, indexation below
+110 %, more risk in a shortfall. An action that is not masked can still be denied: a recovery plan that cuts less than
+the regulator demands.
 """
 
 from __future__ import annotations
@@ -53,30 +53,30 @@ from .people import Client
 from .welfare import Account
 
 YEARS: Final = 40
-"""After how many years an episode is truncated."""
+"""The number of years after which an episode is truncated."""
 
 CLIENTS: Final = 1000
-"""How many clients there are in the beginning, unless an environment is told otherwise."""
+"""The default number of clients at the start."""
 
 SURCHARGES: Final = (0.8, 0.9, 1.0, 1.05, 1.15, 1.3)
-"""Premiums that can be asked, by what the client's accrual costs."""
+"""Premiums to choose from, relative to the cost of the client's accrual."""
 
 INDEXATIONS: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Indexations, by the highest that is lawful."""
+"""Indexations to choose from, relative to the highest lawful one."""
 
 CUTS: Final = (0.0, 0.5 / SPREAD, 1 / SPREAD, 3 / SPREAD, 1.0)
-"""Cuts, by the shortfall: those of the company's plans, and those that the regulator demands."""
+"""Cuts to choose from, relative to the shortfall: for the company's plans and for the regulator's demands."""
 
 MIXES: Final = (0.0, 0.2, 0.3, 0.4, 0.6, 0.8)
-"""Shares of equities."""
+"""Shares of equities to choose from."""
 
 
-# -- what it is worth -----------------------------------------------------------------------------
+# -- rewards --------------------------------------------------------------------------------------
 
 
 @difference
 def purchasing_power(*call: Any) -> float:
-    """The logarithm of what a right of 1 from the first month buys."""
+    """The logarithm of the purchasing power of a right that was 1 in the first month."""
     company = company_of(*call)
     return log(max(company.indexed / company.market.price_level, 1e-9))
 
@@ -94,28 +94,28 @@ def welfare(*call: Any, _simulation: FundSim) -> float:
 
 
 def sound(company: Company) -> float:
-    """1 for a company that is not in a shortfall, less ten times by how much it is."""
+    """Return 1 for a company without a shortfall; with one, subtract ten times the gap to the minimum coverage."""
     coverage = company.policy_coverage()
     return 1.0 if coverage >= MINIMUM else 1.0 - 10 * (MINIMUM - coverage)
 
 
 def company_reward(*call: Any) -> float:
-    """Be sound, and let pensions keep their value: a per cent of it is worth a tenth of a sound year."""
+    """Reward soundness, and pensions that keep their value: one per cent of value counts a tenth of a sound year."""
     return sound(company_of(*call)) + 10 * float(purchasing_power(*call))
 
 
 def manager_reward(*call: Any) -> float:
-    """Gain coverage."""
+    """Reward a gain in coverage."""
     return float(gain_of_coverage(*call))
 
 
 def regulator_reward(*call: Any) -> float:
-    """Let there be no shortfall: whatever that does to pensions."""
+    """Reward years without a shortfall, regardless of the pensions."""
     return sound(company_of(*call))
 
 
 def premium_reward(company: Company, client: Client) -> float:
-    """A sound company, less what the client has paid: ten per cent of the wage are a fifth of a sound year."""
+    """Reward soundness less the premium: a premium of ten per cent of the wage costs a fifth of a sound year."""
     return sound(company) - 2 * client.premium
 
 
@@ -125,29 +125,29 @@ REWARDS: Final = {
     "manager_0": manager_reward,
     "regulator_0": regulator_reward,
 }
-"""The company wants to be sound *and* to keep pensions' value, the manager gains, the regulator no shortfall."""
+"""The company: soundness *and* the pensions' value. The manager: gains. The regulator: soundness."""
 
 
-# -- what is decided ------------------------------------------------------------------------------
+# -- decisions ------------------------------------------------------------------------------------
 
 
 def nearest(levels: Sequence[float], value: float) -> int:
-    """The number of the level that a value is nearest to."""
+    """Return the index of the level nearest to a value."""
     return min(range(len(levels)), key=lambda number: abs(levels[number] - value))
 
 
 def ask_premium(action: Any, company: Company, client: Client) -> float:
-    """Ask for a premium that is so and so many times what the accrual costs."""
+    """Map an action to a premium: a multiple of the cost of the accrual."""
     return SURCHARGES[action] * company.cost_rate(client) * (1 + client.extra)
 
 
 def premium_asked(premium: float, company: Company, client: Client) -> int | None:
-    """Which action a premium of the company's rule corresponds to."""
+    """Map a premium of the company's rule to its action."""
     return ACTIONS.get(round(premium / (company.cost_rate(client) * (1 + client.extra)), 6))
 
 
 def lawful_surcharges(company: Company, client: Client) -> NDArray[np.int8]:
-    """Discounts take a high coverage."""
+    """Mask discounts unless coverage is high enough."""
     return ALL_SURCHARGES if company.policy_coverage() >= REQUIRED else NO_DISCOUNTS
 
 
@@ -157,35 +157,35 @@ NO_DISCOUNTS: Final = np.array([level >= 1 for level in SURCHARGES], np.int8)
 
 
 def index(action: Any, company: Company) -> float:
-    """Index by so much of what is lawful."""
+    """Map an action to an indexation: a share of the highest lawful one."""
     return INDEXATIONS[action] * company.lawful_indexation()
 
 
 def indexed(indexation: float, company: Company) -> int:
-    """Which action an indexation of the company's rule is nearest to."""
+    """Map an indexation of the company's rule to the nearest action."""
     most = company.lawful_indexation()
     return nearest(INDEXATIONS, indexation / most) if most > 0 else 0
 
 
 def lawful_indexations(company: Company) -> list[bool]:
-    """None but the first where nothing is lawful."""
+    """Mask all levels but zero where no indexation is lawful."""
     some = company.lawful_indexation() > 0
     return [level == 0 or some for level in INDEXATIONS]
 
 
 def cut(action: Any, *call: Any) -> float:
-    """Cut, or demand to cut, so much of the shortfall."""
+    """Map an action to a cut, or a demanded cut: a share of the shortfall."""
     return CUTS[action] * company_of(*call).shortfall()
 
 
 def was_cut(decided: float, *call: Any) -> int:
-    """Which action a cut of a rule is nearest to."""
+    """Map a cut of a rule to the nearest action."""
     shortfall = company_of(*call).shortfall()
     return nearest(CUTS, decided / shortfall) if shortfall > 0 else 0
 
 
 def lawful_mixes(manager: Manager) -> list[bool]:
-    """No more risk than there is, in a shortfall; and always none."""
+    """Mask shares of equities above the lawful one; a share of zero is always lawful."""
     most = manager.lawful_mix()
     return [level <= most for level in MIXES]
 
@@ -206,7 +206,7 @@ PREMIUMS: Final[dict[Any, Definition]] = {
         },
     )
 }
-"""The premium of each client, by an agent of its own."""
+"""The premiums: one agent per client."""
 
 COMPANY: Final[dict[Any, Definition]] = {
     f"{Company.__module__}.Company.choose_indexation": make_step(
@@ -229,7 +229,7 @@ COMPANY: Final[dict[Any, Definition]] = {
         agent="planner_0",
     ),
 }
-"""What the company decides once a year: indexation in good years, cuts in a shortfall."""
+"""The company's yearly decisions: indexation in good years, cuts in a shortfall."""
 
 MANAGER: Final[dict[Any, Definition]] = {
     f"{Manager.__module__}.Manager.choose_mix": make_step(
@@ -256,7 +256,7 @@ REGULATOR: Final[dict[Any, Definition]] = {
         agent="regulator_0",
     )
 }
-"""What the regulator demands in a shortfall."""
+"""The regulator's demand in a shortfall."""
 
 BOARD: Final[dict[Any, Definition]] = COMPANY | MANAGER | REGULATOR
 """All single agents, each with a reward of its own."""
@@ -264,18 +264,18 @@ BOARD: Final[dict[Any, Definition]] = COMPANY | MANAGER | REGULATOR
 TEAM: Final[dict[Any, Definition]] = {
     point: replace(definition, reward_mapping=welfare) for point, definition in BOARD.items()
 }
-"""The same, with the members' welfare as the reward of all of them."""
+"""The same agents, with the gain in the members' welfare as their common reward."""
 
 GOALS: Final = Box(0.0, 10.0, (1,), np.float32)
 
 
 def reach(achieved: Any, desired: Any, info: Any) -> Any:
-    """How far away the desired coverage is, as a reward: for one step or for many."""
+    """Compute the reward: minus the distance to the desired coverage, for one step or for a batch."""
     return -np.abs(np.asarray(achieved) - np.asarray(desired)).max(axis=-1)
 
 
 def coverage_of(manager: Manager) -> list[float]:
-    """The goal that is achieved: the coverage, up to 10."""
+    """Return the achieved goal: the coverage, at most 10."""
     return [min(manager.company.coverage(), 10.0)]
 
 
@@ -290,18 +290,18 @@ MIX_WITH_GOAL: Final[dict[Any, Definition]] = {
     )
     for point, definition in MANAGER.items()
 }
-"""The asset mix, with the required coverage as its goal."""
+"""The asset mix, with the required coverage as the goal."""
 
 
 # -- the simulation -------------------------------------------------------------------------------
 
 
 class FundSim(SimulationInterface):
-    """Some years of a pension fund, or until it cannot pay all pensions.
+    """A pension fund over a number of years, or until it cannot pay all pensions.
 
     Attributes:
-        fund: The fund of the present episode.
-        account: How its members have lived.
+        fund: The fund of the current episode.
+        account: The account of its members' welfare.
     """
 
     points = BOARD
@@ -310,8 +310,8 @@ class FundSim(SimulationInterface):
         """Make a simulation.
 
         Args:
-            years: After how many years it is truncated.
-            parameters: What the fund is like; None: as the model has it, with ``CLIENTS`` clients.
+            years: The number of years after which an episode is truncated.
+            parameters: The fund's parameters; None: the model's defaults, with ``CLIENTS`` clients.
         """
         self.years = years
         self.parameters = parameters or Parameters(clients=CLIENTS)
@@ -320,16 +320,16 @@ class FundSim(SimulationInterface):
         self._stopped = False
 
     def reset(self, seed: int | None = None) -> None:
-        """Found another fund."""
+        """Create a new fund."""
         self._stopped = False
         self.fund = Fund(seed, self.parameters)
         self.account = Account(self.fund)
 
     def run(self) -> Any:
-        """Let month after month go by.
+        """Simulate months until the last year ends or the fund cannot pay all pensions.
 
         Returns:
-            ``TRUNCATED`` where the fund has paid all pensions to the end.
+            ``TRUNCATED`` if the fund has paid all pensions to the end, else None.
         """
         fund = self.fund
         while fund.world.month < 12 * self.years:
@@ -345,7 +345,7 @@ class FundSim(SimulationInterface):
         return TRUNCATED
 
     def stop(self) -> None:
-        """Ask the loop to end after the present month."""
+        """Ask the loop to end after the current month."""
         self._stopped = True
 
     def time(self) -> float:
@@ -353,25 +353,25 @@ class FundSim(SimulationInterface):
         return self.fund.world.month / 12
 
     def welfare(self) -> float:
-        """The utility of what the members have lived on, and can expect."""
+        """The members' welfare: see the module ``welfare``."""
         return self.account.welfare()
 
     def reseed(self, seed: int) -> None:
-        """Draw anew what lies ahead, of the market and of the people."""
+        """Draw another future, for the market and for the people."""
         fund = self.fund
         fund.world.random.seed(seed)
         fund.market.random.seed(f"{seed}/market")
         fund.people.seed(f"{seed}/people")
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Whose decisions will be called for: those of the company, its manager and its regulator."""
+        """Return the calls to come at a decision point: those of the company, its manager and its regulator."""
         company = self.fund.company
         callers = {"Company": (company,), "Manager": (company.manager,), "Regulator": (company.regulator, company)}
         kind, name = point.split(".")[-2:]
         return [] if name == "set_premium" else [callers[kind]]
 
     def state(self) -> NDArray[np.float32]:
-        """All that is known of the company, and how its rights are spread over the ages, by ten years."""
+        """Return the observation of the company, the distribution of rights over age groups of ten years, and time."""
         company = self.fund.company
         ages = [0.0] * 12
         for client in self.fund.clients:
@@ -388,41 +388,41 @@ STATE_SPACE: Final = Box(np.array([*LOW, *[0] * 13], np.float32), np.array([*HIG
 
 
 def board_env(simulation: Any = FundSim, **options: Any) -> SimulationAECEnv:
-    """Make the environment of the company's, the manager's and the regulator's decisions, with rewards that differ.
+    """Make the environment of the company's, the manager's and the regulator's decisions, with different rewards.
 
     Args:
         simulation: The simulation.
-        **options: As ``simenv_marl.aec_env`` takes them.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return aec_env(simulation, BOARD, **{"state_space": STATE_SPACE, **options})
 
 
 def team_env(simulation: Any = FundSim, **options: Any) -> SimulationAECEnv:
-    """Make the same environment with one reward for all.
+    """Make the same environment with a common reward.
 
     Args:
         simulation: The simulation.
-        **options: As ``simenv_marl.aec_env`` takes them.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return aec_env(simulation, TEAM, **{"state_space": STATE_SPACE, **options})
 
 
 def premium_env(simulation: Any = FundSim, **options: Any) -> SimulationAECEnv:
-    """Make the environment in which each client's premium is decided by an agent of its own.
+    """Make the environment with one agent per client, which decides on the client's premium.
 
     Args:
         simulation: The simulation.
-        **options: As ``simenv_marl.aec_env`` takes them.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return aec_env(simulation, PREMIUMS, **{"state_space": STATE_SPACE, **options})
 
 
 def mix_env(simulation: Any = FundSim, **options: Any) -> SimulationEnv:
-    """Make the goal-based environment of the asset mix alone.
+    """Make the goal-based environment of the asset mix.
 
     Args:
         simulation: The simulation.
-        **options: As ``simenv_marl.single_env`` takes them.
+        **options: The options of ``simenv_marl.single_env``.
     """
     return single_env(simulation, MIX_WITH_GOAL, **options)
 
@@ -439,7 +439,7 @@ def _register() -> None:
         gymnasium.register("fin_base/MixWithGoal-v0", f"{__name__}:mix_env")
     known = getattr(pettingzoo, "aec_registry", None)  # PettingZoo has a registry since 1.26
     for name in ("board", "premium"):
-        if known is not None and f"fin_base/{name}-v0" not in known:
+        if known is not None and f"fin_base/{name}_v0" not in known:
             pettingzoo.register("aec", f"fin_base/{name}_v0", f"{__name__}:{name}_env")
 
 

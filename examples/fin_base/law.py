@@ -1,15 +1,15 @@
-"""What a pension company must and may do: the law, and what is agreed with its clients.
+"""The rules for a pension company: the law, and the terms of its pensions.
 
 The law follows the Dutch financial assessment framework (FTK, in force from 2015), simplified:
 
-- A premium covers the cost of the rights that it buys. A discount takes a coverage well above the required one
+- A premium covers the cost of the rights that it buys. A discount requires a coverage well above the required level
   (Pensions Act, articles 128 and 129; the discount of a fifth from 125 % on is our own round number).
 - The *policy coverage*, by which a fund is judged, is the mean of the coverage over twelve months. Below 110 % there is
-  no indexation. Above the level required in the long run (125 % here), missed indexation may be repaired (by a fifth a
-  year: our number).
+  no indexation. Above the level required in the long run (125 % here), a fund may make up for missed indexation (a
+  fifth of it per year: our own number).
 - The minimum is 104.3 %. A fund that is below it at six yearly measurements in a row has to cut rights. A fund that
-  cannot recover within ten years otherwise has to cut at once; 90 % stands for that here. Cuts may be spread over ten
-  years.
+  cannot recover within ten years without a cut has to cut at once; here, this applies below 90 %. Cuts may be spread
+  over ten years.
 - In a shortfall, a fund may not raise the risk of its assets. Below 100 %, it may not transfer values to other funds.
 
 Sources: Pensioenfederatie, The Financial Assessment Framework; De Brauw, Pension funds with >90 % cover ratio do not
@@ -24,28 +24,28 @@ from __future__ import annotations
 from typing import Final
 
 RETIREMENT: Final = 67 * 12
-"""Age in months from which pensions are paid."""
+"""The retirement age in months."""
 
 LATEST_ENTRY: Final = 60 * 12
-"""Age in months from which no candidate is admitted."""
+"""The age in months from which candidates are no longer admitted."""
 
 ACCRUAL: Final = 0.0175
-"""The share of a yearly wage that a year of membership adds to the yearly pension."""
+"""The accrual rate: the share of the yearly wage that a year of membership adds to the yearly pension."""
 
 MINIMUM, INDEXING, REQUIRED, CRITICAL, TRANSFERABLE = 1.043, 1.10, 1.25, 0.90, 1.0
-"""Coverage: the minimum, that of indexation, that required in the long run, the critical one, that of transfers."""
+"""Levels of coverage: the minimum, for indexation, required in the long run, critical, for transfers."""
 
 MEASUREMENTS: Final = 6
-"""How many yearly measurements below the minimum in a row make a cut compulsory."""
+"""The number of yearly measurements in a row below the minimum that makes a cut compulsory."""
 
 SPREAD: Final = 10
-"""Over how many years a cut is spread."""
+"""The number of years over which a cut is spread."""
 
 HIGHEST_PREMIUM: Final = 0.35
-"""The share of a wage that a client can be asked to pay."""
+"""The highest premium, as a share of the wage."""
 
 EXTRAS: Final = (0.0, 0.25, 0.5)
-"""How much more than the standard a client can pay and accrue."""
+"""Contributions beyond the standard that a client can choose, as shares of the standard; the accrual grows alike."""
 
 DISPOSABLE: Final = 0.3
-"""The share of a wage that is not spent on living."""
+"""The share of a wage that remains after living expenses."""

@@ -1,4 +1,4 @@
-"""What the fund's decisions are told of it."""
+"""Observations of the pension fund for its decisions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OBSERVED: Final = (
     "inflation, in tens of per cent",
     "what has become of a right of 1, in first prices",
 )
-"""What the single agents observe of the company."""
+"""The observation of the company, for the single agents."""
 
 OF_A_CLIENT: Final = (
     "age, by 100 years",
@@ -30,11 +30,11 @@ OF_A_CLIENT: Final = (
     "what the standard accrual costs, by the wage",
     "savings, by the wage",
 )
-"""What is observed of a client, behind the same of the company."""
+"""The observation of a client, which follows that of the company."""
 
 
 def look_at(company: Company) -> tuple[float, ...]:
-    """What ``OBSERVED`` lists."""
+    """Return the numbers that ``OBSERVED`` lists."""
     market = company.market
     return (
         min(company.coverage(), 10.0),
@@ -48,7 +48,7 @@ def look_at(company: Company) -> tuple[float, ...]:
 
 
 def look_at_client(company: Company, client: Client) -> list[float]:
-    """What ``OBSERVED`` and ``OF_A_CLIENT`` list."""
+    """Return the numbers that ``OBSERVED`` and ``OF_A_CLIENT`` list."""
     wage = client.wage
     return [
         *look_at(company),
@@ -62,7 +62,7 @@ def look_at_client(company: Company, client: Client) -> list[float]:
 
 
 def company_of(*call: Any) -> Company:
-    """The company that a decision of a single agent is about: the last argument, or its own."""
+    """Find the company in a single agent's call: the last argument itself, or that argument's company."""
     last = call[-1]
     return last if isinstance(last, Company) else last.company
 

@@ -1,24 +1,24 @@
-"""A pension company and its clients, over decades, month by month. Nothing here knows of reinforcement learning.
+"""A model of a pension company and its clients over decades, in monthly steps. It contains no reinforcement learning.
 
-People join, pay premiums, change jobs, retire, draw a pension, leave with the value of what they have accrued, and
-die. What they have accrued is a right: so many cents a year from retirement on, for life. The company holds assets
-against these rights; its *coverage* is its assets by its *provisions*, what all rights are worth at present yields.
+People join, pay premiums, change jobs, retire, draw a pension, transfer their rights to another fund, and die. A right
+is an accrued yearly pension, paid from retirement on, for life. The company holds assets to pay for these rights. Its
+*coverage* is the ratio of its assets to its *provisions*, the value of all rights at current yields.
 
-**Decisions**, each of them a method with a sensible rule:
+**Decisions**, each of them a method with a plausible rule:
 
 ========================= ==================== =====================================================================
-``Company.set_premium``    client, yearly       which share of the wage a client pays
-``Company.choose_indexation``       yearly      by how much rights grow
-``Company.choose_cut``              yearly      by how much rights are cut, while there is a shortfall
-``Manager.choose_mix``              quarterly   which share of the assets is in equities
+``Company.set_premium``    client, yearly       the premium, as a share of a client's wage
+``Company.choose_indexation``       yearly      the increase of all rights
+``Company.choose_cut``              yearly      the cut of all rights in a shortfall
+``Manager.choose_mix``              quarterly   the share of the assets in equities
 ``Regulator.choose_demand``         yearly      the cut below which a recovery plan is denied
 ``Client.choose_to_join``  once                 whether to become a client
-``Client.choose_extra``    yearly               whether to pay, and accrue, more or less
-``Client.choose_to_leave`` with a new job       whether to take the value along
+``Client.choose_extra``    yearly               the contribution beyond the standard
+``Client.choose_to_leave`` with a new job       whether to transfer the rights to another fund
 ========================= ==================== =====================================================================
 
-``people`` has the clients, ``company`` the company with its manager and its regulator, and ``law`` what they must and
-may do; here is the fund, month by month. Run on its own, it tells how the fund fares, and how fast it was computed::
+``people`` contains the clients, ``company`` the company with its manager and its regulator, and ``law`` the rules for
+them. This module contains the fund. As a script, it prints the fund's results and the speed of the computation::
 
     python -m examples.fin_base.pension --clients 10000 --years 40
 """
@@ -40,16 +40,16 @@ from .people import Admission, Client, Contribution, PensionContract, PremiumCon
 
 @dataclass(frozen=True)
 class Parameters:
-    """What a fund is like in the beginning, and the world around it.
+    """The initial state of a fund, and the world around it.
 
     Attributes:
-        clients: How many clients there are.
-        coverage: What the company's assets are by its provisions.
-        climate: What the market is like.
-        tables: The mortality that the company reckons with.
-        mortality: The mortality by which people die.
-        job_change: The probability that a worker changes jobs in a month.
-        entry: How many candidates there are a year, by the number of clients in the beginning.
+        clients: The number of clients.
+        coverage: The ratio of the company's assets to its provisions.
+        climate: The parameters of the market.
+        tables: The mortality that the company assumes.
+        mortality: The actual mortality.
+        job_change: The monthly probability that a worker changes jobs.
+        entry: The yearly number of candidates, relative to the initial number of clients.
     """
 
     clients: int = 10_000
@@ -65,19 +65,19 @@ class Fund:
     """A pension company, its clients, and the world around them.
 
     Attributes:
-        parameters: What it was like in the beginning.
-        world: The blocks' world: month, ledger, calendar, contracts.
+        parameters: The initial state.
+        world: The shared state: month, ledger, calendar, contracts.
         market: Inflation, yields and returns.
         company: The pension company.
     """
 
     def __init__(self, seed: int | None = None, parameters: Parameters | None = None) -> None:
-        """Found it, with clients of all ages who have paid since they were 25.
+        """Create a fund, with clients of all ages who have paid since they were 25.
 
         Args:
-            seed: Determines all chance. Market and people have generators of their own: what is decided about people
-                does not change the market.
-            parameters: What it is like; None: as the defaults are.
+            seed: The seed of all randomness. Market and people have separate generators, so decisions about people
+                do not change the market.
+            parameters: The initial state; None: the defaults.
         """
         self.parameters = parameters = parameters or Parameters()
         self.world = world = World(seed)
@@ -98,7 +98,7 @@ class Fund:
         calendar.every(12, self.company.conclude_year, start=12)
 
     def _populate(self) -> None:
-        """Make the first clients: as many of each age as one would be who joined at 25 and was mortal since."""
+        """Create the first clients, with the age distribution of people who joined at 25 and died by the mortality."""
         alive, weights = 1.0, []
         for age in range(25 * 12, 100 * 12):
             alive *= 1 - self._deaths[age]
@@ -116,14 +116,14 @@ class Fund:
             self._enter_dates(client)
 
     def _candidate(self, age: int) -> Client:
-        """Make a candidate with a wage that fits the age."""
+        """Create a candidate whose wage depends on the age."""
         draw = self.people
         career = 0.8 + 0.4 * min(1.0, max(0.0, (age / 12 - 25) / 30))
         wage = round(36_000_00 * self.market.price_level * career * draw.lognormvariate(0.0, 0.3))
         return Client(self.company, age, wage, draw.random())
 
     def _enter_dates(self, client: Client) -> None:
-        """Enter into the calendar what has a date: yearly reviews, and retirement."""
+        """Schedule a client's yearly reviews and retirement."""
         calendar, month = self.world.calendar, self.world.month
         calendar.at(month + 12 - client.age % 12, self.review_year, client)
         if client.status != "retired":
@@ -131,11 +131,11 @@ class Fund:
 
     @property
     def clients(self) -> list[Client]:
-        """All clients there are."""
+        """All present clients."""
         return clients_of(self.world)
 
     def advance(self) -> None:
-        """Let a month go by."""
+        """Simulate one month."""
         self.market.advance()
         self.company.invest()
         self._live()
@@ -144,7 +144,7 @@ class Fund:
         self.company.measure()
 
     def _live(self) -> None:
-        """Have people earn, change jobs, and die: one draw for each, as a month has room for one of these."""
+        """Let people earn, change jobs and die; one draw per person and month decides between death and a new job."""
         world, deaths, change = self.world, self._deaths, self.parameters.job_change
         draw, move, outside, month = self.people.random, world.ledger.move, world.outside, world.month
         last = OLDEST - 1
@@ -161,7 +161,7 @@ class Fund:
                     self._change_job(client)
 
     def _change_job(self, client: Client) -> None:
-        """Find a new job: with pension, without, or none for a while."""
+        """Change a client's job: to one with pension, to one without, or to none for a while."""
         draw = self.people
         client.wage = round(client.wage * draw.uniform(0.95, 1.15))
         self.world.counts["changed jobs"] += 1
@@ -173,7 +173,7 @@ class Fund:
         self.world.calendar.at(self.world.month + draw.randrange(6, 60), client.come_back)
 
     def _arrive(self) -> None:
-        """Have candidates decide whether to join."""
+        """Let new candidates decide whether to join."""
         draw, world = self.people, self.world
         self._candidates += self.parameters.entry * self.parameters.clients / 12
         while self._candidates >= 1:
@@ -189,7 +189,7 @@ class Fund:
                 candidate.vanish(world.outside)
 
     def review_year(self, client: Client) -> None:
-        """Have a birthday: spend what is not needed; who works gets a rise, and agrees on the next year's premium."""
+        """Review a client on the birthday: spend surplus savings; workers get a raise and next year's premium."""
         if client.status == "gone":
             return
         world = self.world
@@ -207,10 +207,10 @@ class Fund:
         self.company.review(client)
 
     def run(self, months: int) -> None:
-        """Let months go by, and check the money in the end of each year, and of the run.
+        """Simulate months, and check at the end of each year and of the run that money is conserved.
 
         Args:
-            months: How many.
+            months: The number of months.
         """
         for _ in range(months):
             self.advance()
@@ -220,11 +220,11 @@ class Fund:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print how the fund fares, and how fast that was computed."""
-    parser = argparse.ArgumentParser(description="Let a pension fund be run by its own rules.")
-    parser.add_argument("--clients", type=int, default=10_000, help="in the beginning (default: 10000)")
-    parser.add_argument("--years", type=int, default=40, help="for how long (default: 40)")
-    parser.add_argument("--seed", type=int, help="of all chance (default: another each time)")
+    """Run a fund, and print its results and the speed of the computation."""
+    parser = argparse.ArgumentParser(description="Run a pension fund by its own rules, and print its results.")
+    parser.add_argument("--clients", type=int, default=10_000, help="initial number of clients (default: 10000)")
+    parser.add_argument("--years", type=int, default=40, help="how many years to simulate (default: 40)")
+    parser.add_argument("--seed", type=int, help="seed of all randomness (default: a new one each time)")
     options = parser.parse_args(arguments)
     fund = Fund(options.seed, Parameters(clients=options.clients))
     taken = 0.0

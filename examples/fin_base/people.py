@@ -1,4 +1,4 @@
-"""The clients of a pension company: what they pay and are paid, ask for, and decide."""
+"""The clients of a pension company: their contracts, requests and decisions."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class PremiumContract(Contract):
-    """A client pays a premium each month; each one that is paid adds to the client's rights."""
+    """A contract by which a client pays a premium each month; each payment adds to the client's rights."""
 
     __slots__ = ()
     debtor: Client
 
     def perform(self) -> bool:
-        """Pay, and accrue if that was possible."""
+        """Pay the premium; accrue rights if the client could pay."""
         paid = super().perform()
         if paid:
             self.debtor.accrue(self.debtor.accrual)
@@ -26,13 +26,13 @@ class PremiumContract(Contract):
 
 
 class PensionContract(Contract):
-    """The company pays a pension each month: as much of it as it can."""
+    """A contract by which the company pays a pension each month, as far as its money suffices."""
 
     __slots__ = ()
     debtor: Company
 
     def perform(self) -> bool:
-        """Pay the pension or, where the money does not suffice for all pensions, its share of what there is."""
+        """Pay the pension; if the money does not suffice for all pensions, pay its share of the money."""
         rations = self.debtor.ration()
         if not rations:
             return super().perform()
@@ -42,7 +42,7 @@ class PensionContract(Contract):
 
 
 class Admission(Request):
-    """A candidate asks the company to become a client."""
+    """A candidate's request to become a client."""
 
     __slots__ = ("company",)
     applicant: Client
@@ -52,20 +52,20 @@ class Admission(Request):
         self.company = company
 
     def objection(self) -> str | None:
-        """Candidates who are too old, or clients already, are not admitted."""
+        """Deny candidates who are too old or already clients."""
         client = self.applicant
         if client.age >= LATEST_ENTRY:
             return "too old"
         return None if client.contract is None else "a client already"
 
     def carry_out(self) -> None:
-        """Begin to work and to pay."""
+        """Start to work and to pay premiums."""
         client = self.applicant
         client.enter()
 
 
 class Contribution(Request):
-    """A client asks to pay, and accrue, so and so much more than the standard."""
+    """A client's request to pay and accrue a given share more than the standard."""
 
     __slots__ = ("extra",)
     applicant: Client
@@ -75,7 +75,7 @@ class Contribution(Request):
         self.extra = extra
 
     def objection(self) -> str | None:
-        """Only who works can, and more only as far as it is lawful and can be afforded."""
+        """Deny clients who do not work, and increases that are unlawful or that the client cannot afford."""
         client = self.applicant
         if client.status != "working":
             return "not working"
@@ -87,19 +87,19 @@ class Contribution(Request):
         return "cannot be afforded" if rate > DISPOSABLE else None
 
     def carry_out(self) -> None:
-        """Agree on it; the premium follows from it."""
+        """Set the extra contribution; the next review sets the premium accordingly."""
         client = self.applicant
         client.extra = self.extra
 
 
 class Transfer(Request):
-    """A client asks to take the value of what was accrued to another fund."""
+    """A client's request to transfer the value of the accrued rights to another fund."""
 
     __slots__ = ()
     applicant: Client
 
     def objection(self) -> str | None:
-        """Not while coverage is too low, nor once a pension is drawn, nor where the money is lacking."""
+        """Deny pensioners, transfers while coverage is too low, and values that the company cannot pay."""
         client = self.applicant
         if client.status == "retired":
             return "retired"
@@ -108,7 +108,7 @@ class Transfer(Request):
         return None if client.value() <= client.company.cents else "the money is lacking"
 
     def carry_out(self) -> None:
-        """Pay the value to the other fund, and part."""
+        """Pay the value to the other fund, and remove the client."""
         client = self.applicant
         value = client.value()
         client.vanish(client.world.outside)
@@ -116,7 +116,7 @@ class Transfer(Request):
 
 
 class RecoveryPlan(Request):
-    """The company in a shortfall proposes to the regulator by how much it cuts rights this year."""
+    """A company's proposal to the regulator, in a shortfall: by how much to cut rights this year."""
 
     __slots__ = ("cut", "demand")
     applicant: Company
@@ -126,7 +126,7 @@ class RecoveryPlan(Request):
         self.cut, self.demand = cut, demand
 
     def objection(self) -> str | None:
-        """It has to cut as much as the regulator demands."""
+        """Deny a cut below the regulator's demand."""
         return "cuts too little" if self.cut < self.demand else None
 
     def carry_out(self) -> None:
@@ -136,19 +136,20 @@ class RecoveryPlan(Request):
 
 
 class Client(Entity):
-    """Who accrues a pension, and draws it.
+    """A client of a pension company, or a candidate: accrues a pension and later draws it.
 
     Attributes:
-        company: Whose client it is, or thinks of becoming.
+        company: The client's company, or the one that the candidate may join.
         born: The month of birth, which may be before the first month.
-        wage: Cents a year, of the last job.
+        wage: The yearly wage of the current or last job, in cents.
         status: "candidate", "working", "away" (in a job without pension, or in none), "retired" or "gone".
-        accrued: Cents of pension a year to which it has a right.
-        accrual: Cents by which a month's premium adds to that.
-        extra: How much more than the standard it pays and accrues: one of ``EXTRAS``.
-        premium: The share of the wage that it pays.
-        contract: By which it pays, or is paid.
-        caution: From 0, trusting, to 1.
+        accrued: The accrued right to a yearly pension, in cents.
+        accrual: The cents that a month's premium adds to it.
+        extra: The contribution beyond the standard, as a share of the standard: one of ``EXTRAS``.
+        premium: The premium, as a share of the wage.
+        contract: The contract by which the client pays premiums or draws the pension.
+        caution: From 0 (trusting) to 1 (cautious).
+        disposable: The monthly income after living expenses while working, in cents.
     """
 
     __slots__ = (
@@ -168,7 +169,7 @@ class Client(Entity):
     kind = "client"
 
     def __init__(self, company: Company, age: int, wage: int, caution: float) -> None:
-        """Become a candidate of an age in months."""
+        """Create a candidate of an age in months."""
         super().__init__(company.world)
         self.company, self.born, self.wage, self.caution = company, company.world.month - age, wage, caution
         self.status, self.accrued, self.accrual, self.extra, self.premium = "candidate", 0, 0, 0.0, 0.0
@@ -182,21 +183,21 @@ class Client(Entity):
 
     @property
     def works(self) -> bool:
-        """Whether it pays premiums at present."""
+        """Whether the client currently works and pays premiums."""
         return self.status == "working"
 
     # decisions
 
     def choose_to_join(self) -> bool:
-        """Decide whether to become a client: if the company seems sound enough."""
+        """Decide whether to become a client: yes, if coverage is high enough for the candidate's caution."""
         return self.company.policy_coverage() >= 0.75 + 0.3 * self.caution
 
     def choose_extra(self) -> float:
-        """Decide how much more to pay and accrue.
+        """Choose the contribution beyond the standard.
 
         Returns:
-            One of ``EXTRAS``: from 45 on a step more if there are savings and the company is sound; a step less where
-            a premium could not be paid.
+            One of ``EXTRAS``: from age 45 on, one step more if the client has savings and the company is sound; one
+            step less if the client missed a premium.
         """
         step = EXTRAS.index(self.extra)
         if self.contract is not None and self.contract.missed:
@@ -206,31 +207,31 @@ class Client(Entity):
         return EXTRAS[step]
 
     def choose_to_leave(self) -> bool:
-        """Decide whether to take the value along: if it is little, or the company does not seem sound enough."""
+        """Decide whether to transfer the rights: yes, if they are small, or coverage is too low for the caution."""
         little = self.accrued < 2 * ACCRUAL * self.wage
         return little or self.company.policy_coverage() < 0.85 + 0.3 * self.caution
 
-    # what becomes of it
+    # events
 
     def enter(self) -> None:
-        """Begin to work and pay, for the first time or again."""
+        """Start to work and to pay premiums, for the first time or again."""
         self.status = "working"
         self.contract = PremiumContract(self, self.company, 0, "premium")
         self.company.review(self)
 
     def pause(self) -> None:
-        """Stop working and paying; what was accrued stays."""
+        """Stop working and paying premiums; accrued rights remain."""
         self.end_contract()
         self.status = "away"
 
     def come_back(self) -> None:
-        """Have a job with pension again, unless life has gone on otherwise meanwhile."""
+        """Start a job with pension again, unless the client has retired, died or left meanwhile."""
         if self.status == "away":
             self.enter()
             self.world.counts["came back"] += 1
 
     def retire(self) -> None:
-        """Draw the pension from now on."""
+        """Start to draw the pension."""
         if self.status not in ("working", "away"):
             return
         self.end_contract()
@@ -239,23 +240,23 @@ class Client(Entity):
         self.world.counts["retired"] += 1
 
     def end_contract(self) -> None:
-        """Pay, or be paid, no more."""
+        """Terminate the current contract, if there is one."""
         if self.contract is not None:
             self.contract.terminate()
             self.contract = None
 
     def accrue(self, cents: int) -> None:
-        """Have a right to so many more cents a year, or fewer."""
+        """Add cents a year to the accrued right; a negative number reduces it."""
         if cents:
             self.accrued += cents
             self.company.book_right(self.born, cents)
 
     def value(self) -> int:
-        """What its rights are worth, in cents."""
+        """Return the value of the accrued rights, in cents."""
         return round(self.accrued * self.company.factor(self.age))
 
     def vanish(self, heir: Entity, reason: str = "estate") -> None:
-        """Be a client no more: for death, for another fund, or never having joined. All rights end."""
+        """Remove the client: after death, a transfer, or a candidate's refusal or denial. All rights end."""
         self.end_contract()
         self.accrue(-self.accrued)
         self.status = "gone"
@@ -263,5 +264,5 @@ class Client(Entity):
 
 
 def clients_of(world: World) -> list[Client]:
-    """All clients and candidates there are."""
+    """Return all present clients and candidates of a world."""
     return [entity for entity in world.entities.values() if isinstance(entity, Client)]

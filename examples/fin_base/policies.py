@@ -1,4 +1,4 @@
-"""Policies for the fund's decisions, all of which choose among ordered levels: of equities, indexation, premiums."""
+"""Policies for the fund's decisions. Each decision chooses among ordered levels: of equities, indexation, premiums."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 from .observations import OBSERVED, OF_A_CLIENT
 
 USUAL: Final = np.array([1.2, 1.2, 1.0, 0.4, 0.25, 0.2, 0.9, 0.45, 0.4, 0.5, 0.1, 0.22, 0.15], np.float32)
-"""Values in the middle of what is usually observed, in the order of ``OBSERVED`` and ``OF_A_CLIENT``."""
+"""Typical values of the observations, in the order of ``OBSERVED`` and ``OF_A_CLIENT``."""
 
 SPREAD: Final = np.array([0.3, 0.3, 3.0, 0.2, 0.15, 0.15, 0.2, 0.12, 0.15, 0.3, 0.2, 0.1, 0.1], np.float32)
-"""How far what is usually observed lies apart."""
+"""The typical spread of each observation around ``USUAL``."""
 
 assert len(USUAL) == len(SPREAD) == len(OBSERVED) + len(OF_A_CLIENT)
 
 
 def nearest_lawful(level: int, mask: NDArray[np.int8]) -> int:
-    """The lawful level that is nearest to another; of two, the lower one.
+    """Find the lawful level nearest to another one; of two, the lower one.
 
     Args:
-        level: The level that is wanted.
+        level: The wanted level.
         mask: ``(levels,)``: which levels are lawful.
     """
     if mask[level]:
@@ -36,7 +36,7 @@ def nearest_lawful(level: int, mask: NDArray[np.int8]) -> int:
 
 @dataclass(frozen=True)
 class Constant:
-    """Chooses the same level always, or the nearest lawful one."""
+    """A constant policy: it chooses the same level each time, or the nearest lawful one."""
 
     level: int
 
@@ -47,26 +47,26 @@ class Constant:
 
 @dataclass(frozen=True)
 class Linear:
-    """Weighs what it observes; the logistic function makes a level of the sum.
+    """A linear policy: the logistic function turns a weighted sum of the observations into a level.
 
     Attributes:
-        weights: One for each number observed, in units of ``SPREAD``, and a constant.
+        weights: One weight for each observed number, in units of ``SPREAD``, then a constant.
     """
 
     weights: tuple[float, ...]
 
     @classmethod
     def start(cls, share: float, observed: int) -> Linear:
-        """A policy that does not look at what it observes.
+        """Make a policy that ignores its observations.
 
         Args:
-            share: Which level it chooses, from 0 for the lowest to 1 for the highest.
-            observed: How many numbers are observed.
+            share: The level that it chooses, from 0 for the lowest to 1 for the highest.
+            observed: The number of observed numbers.
         """
         return cls((0.0,) * observed + (log(share / (1 - share)),))
 
     def share(self, observation: NDArray[np.float32]) -> float:
-        """Which level is wanted, from 0 for the lowest to 1 for the highest."""
+        """Compute the wanted level, from 0 for the lowest to 1 for the highest."""
         *weights, constant = self.weights
         observed = len(weights)
         total = float(np.dot((observation - USUAL[:observed]) / SPREAD[:observed], weights)) + constant

@@ -1,9 +1,9 @@
-"""One study of the pension fund: who decides best, and in which worlds?
+"""A study of the pension fund: which policies decide best, and in which worlds?
 
-``python -m examples.fin_base.study`` (or ``make pension``) searches constants and trains policies in one world, and has
-them, the model's rules and a planner run the same funds in eight worlds: a full factorial design of returns, mortality
-and population. What decides between them was chosen beforehand: ``welfare``. What has been learned or run is kept in a
-folder, and is not done again. From the table of all runs come the figures of ``docs/pension.md``.
+``python -m examples.fin_base.study`` (or ``make pension``) searches constant policies and trains others in one world.
+They, the model's rules and a planner then run the same funds in eight worlds: a full factorial design of returns,
+mortality and population. The criterion was chosen beforehand: ``welfare``. A folder keeps the policies and the runs, so
+that a second call computes only what is missing. The table of all runs gives the figures of ``docs/pension.md``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CLIENTS: Final = 200
 LARGE: Final = 10_000
 
 HELD_OUT: Final = 1_000_000
-"""Seeds from here on are for the comparison; all others may be learned from."""
+"""Seeds from this number on are for the comparison; those below it are for learning."""
 
 OUT: Final = Path(__file__).parent / "out" / "study"
 
@@ -44,13 +44,13 @@ POINTS: Final = TEAM | PREMIUMS
 MANAGER, INDEXER = "manager_0", "indexer_0"
 
 RETURNS: Final = {"expected": 0.03, "poor": 0.01}
-"""By how much equities earn more than bonds, by the year."""
+"""The equity premium: the annual excess of the return of equities over that of bonds."""
 
 LIVES: Final = {"as expected": 1.0, "longer": 0.75}
-"""The force of mortality, by that which the company reckons with."""
+"""The force of mortality, relative to the one that the company assumes."""
 
 POPULATION: Final = {"steady": 0.025, "ageing": 0.005}
-"""How many candidates there are a year, by the number of clients in the beginning."""
+"""The yearly number of candidates, relative to the initial number of clients."""
 
 FACTORS: Final[Mapping[str, Sequence[str]]] = {
     "returns": tuple(RETURNS),
@@ -59,10 +59,10 @@ FACTORS: Final[Mapping[str, Sequence[str]]] = {
 }
 
 HOME: Final = {name: levels[0] for name, levels in FACTORS.items()}
-"""The world in which is learned."""
+"""The world in which policies learn."""
 
 Policies = Mapping[str, Any]
-"""Who decides, by agent or decision point; the model's rules decide for all others."""
+"""Policies by agent or decision point; the model's rules decide for all others."""
 
 
 def world(
@@ -75,11 +75,11 @@ def world(
     """Make a fund.
 
     Args:
-        returns: What equities earn: see ``RETURNS``.
-        lives: How long people live: see ``LIVES``.
-        population: Whether clients are followed by others: see ``POPULATION``.
-        clients: How many there are in the beginning.
-        years: For how long it is run.
+        returns: The level of equity returns: see ``RETURNS``.
+        lives: The level of longevity: see ``LIVES``.
+        population: The level of new entrants: see ``POPULATION``.
+        clients: The initial number of clients.
+        years: The number of years after which an episode is truncated.
     """
     parameters = Parameters(
         clients=clients,
@@ -90,16 +90,16 @@ def world(
     return FundSim(years, parameters)
 
 
-# -- learning, at home ----------------------------------------------------------------------------
+# -- learning, in the home world ------------------------------------------------------------------
 
 
 def rate(contenders: Iterable[Policies], seeds: Iterable[int], workers: int) -> NDArray[np.float64]:
-    """The mean welfare that each of some policies comes to.
+    """Compute the mean welfare of each of several policies.
 
     Args:
         contenders: The policies.
-        seeds: What the funds are reset with, the same for all of them.
-        workers: How many processes share the work.
+        seeds: The seeds of the funds, the same for all policies.
+        workers: The number of processes.
     """
     named = {str(number): policies for number, policies in enumerate(contenders)}
     found = evaluate(world, named, seeds=seeds, points=POINTS, metric=FundSim.welfare, workers=workers)
@@ -108,13 +108,13 @@ def rate(contenders: Iterable[Policies], seeds: Iterable[int], workers: int) -> 
 
 
 def best_constants(seeds: int, workers: int) -> dict[str, Constant]:
-    """The constant mix and indexation that do best together."""
+    """Find the best pair of a constant mix and a constant indexation."""
     pairs = [{MANAGER: Constant(mix), INDEXER: Constant(by)} for mix, by in _pairs(MIXES, INDEXATIONS)]
     return pairs[int(np.argmax(rate(pairs, range(seeds), workers)))]
 
 
 def best_premium(seeds: int, workers: int) -> dict[str, Constant]:
-    """The constant surcharge on the premiums of all clients that does best."""
+    """Find the best constant surcharge on the premiums of all clients."""
     surcharges = [{PREMIUM: Constant(level)} for level in range(len(SURCHARGES))]
     return surcharges[int(np.argmax(rate(surcharges, range(seeds), workers)))]
 
@@ -124,13 +124,13 @@ def _pairs(first: Sequence[Any], second: Sequence[Any]) -> Iterable[tuple[int, i
 
 
 def train(start: Mapping[str, Linear], generations: int, seed: int, workers: int) -> dict[str, Linear]:
-    """Train policies together, by evolution of their weights.
+    """Train policies jointly, by evolution of their weights.
 
     Args:
-        start: By agent or decision point, the policy that learning begins with.
-        generations: For how long.
-        seed: Determines everything.
-        workers: How many processes share the work.
+        start: The initial policies, by agent or decision point.
+        generations: The number of generations.
+        seed: The seed of the training.
+        workers: The number of processes.
     """
     sizes = np.cumsum([len(policy.weights) for policy in start.values()])[:-1]
 
@@ -146,13 +146,13 @@ def train(start: Mapping[str, Linear], generations: int, seed: int, workers: int
 
 
 def learned(folder: Path, generations: int, seeds: int, workers: int) -> dict[str, dict[str, Any]]:
-    """Search constants and train policies, or load those that were found before.
+    """Search constants and train policies, or load those found before.
 
     Args:
-        folder: Where they are kept.
-        generations: For how long policies are trained.
-        seeds: How many funds each constant is tried on.
-        workers: How many processes share the work.
+        folder: The folder that keeps the policies.
+        generations: The number of generations of the training.
+        seeds: The number of funds on which each constant is tried.
+        workers: The number of processes.
 
     Returns:
         The contenders, by name.
@@ -179,7 +179,7 @@ def learned(folder: Path, generations: int, seeds: int, workers: int) -> dict[st
 
 
 def planned() -> dict[str, RolloutPolicy]:
-    """Have the indexer try out each indexation for a year, in two futures, before it decides. Nothing is trained."""
+    """Make a planner: the indexer simulates each indexation for a year, in two futures, before it decides."""
     return {INDEXER: RolloutPolicy(base=RULE, futures=2, horizon=1, horizon_by="time")}
 
 
@@ -199,21 +199,21 @@ METRICS: Final = {
     "short": lambda simulation: simulation.fund.world.counts["short"],
     "cuts": lambda simulation: simulation.fund.world.counts["cut"],
 }
-"""What is noted of each fund at its end."""
+"""The metrics of each fund at its end."""
 
 
 def run(folder: Path, rows: Any, contenders: Mapping[str, Policies], seeds: int, workers: int) -> Any:
-    """Run what is missing of a table.
+    """Run the missing runs of a table.
 
     Args:
-        folder: Where its runs are kept.
+        folder: The folder that keeps the runs.
         rows: The worlds.
-        contenders: Who decides, besides the rule.
-        seeds: How many funds there are in each world.
-        workers: How many processes share the work.
+        contenders: The policies to compare with the rule, by name.
+        seeds: The number of funds in each world.
+        workers: The number of processes.
 
     Returns:
-        The table: a row for each fund.
+        The table: one row per fund.
     """
     table = run_experiment(
         world,
@@ -232,15 +232,15 @@ def run(folder: Path, rows: Any, contenders: Mapping[str, Policies], seeds: int,
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Learn, run, and show what came of it."""
-    parser = argparse.ArgumentParser(description="Who decides best for a pension fund, and in which worlds?")
+    """Learn, run, and show the results."""
+    parser = argparse.ArgumentParser(description="Which policies decide best for a pension fund, and in which worlds?")
     parser.add_argument("--seeds", type=int, default=32, help="funds in each world (default: %(default)s)")
     parser.add_argument("--large", type=int, default=8, help="funds of 10,000 clients (default: %(default)s)")
-    parser.add_argument("--generations", type=int, default=24, help="of learning (default: %(default)s)")
+    parser.add_argument("--generations", type=int, default=24, help="generations of learning (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for all of it (default: %(default)s)")
-    parser.add_argument("--figures", type=Path, help="folder for pictures and tables (default: the same)")
-    parser.add_argument("--quick", action="store_true", help="little of everything, to see that it works")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder for all results (default: %(default)s)")
+    parser.add_argument("--figures", type=Path, help="folder for figures and tables (default: the same)")
+    parser.add_argument("--quick", action="store_true", help="a small run, to check that everything works")
     if parser.parse_args(arguments).quick:
         parser.set_defaults(seeds=2, large=0, generations=2, out=OUT.with_name("study-quick"))
     options = parser.parse_args(arguments)
@@ -255,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         without_plans = {name: found[name] for name in ("trained pair", "trained premiums", "both trained")}
         large = run(options.out / "large", rows, without_plans, options.large, options.workers)
 
-    from . import study_figures  # here, for no process that forks is to carry what draws
+    from . import study_figures  # imported here, so that forked processes do not load the plotting libraries
 
     study_figures.show(table, large, found, options.figures or options.out)
 

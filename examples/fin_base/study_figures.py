@@ -1,4 +1,4 @@
-"""Pictures and tables of the pension study, made of its tables of runs and of what was learned."""
+"""Figures and tables of the pension study, made from its tables of runs and its trained policies."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ COLOURS: Final = {
 }
 
 DRAWN: Final = 64
-"""How many funds the pictures of years are drawn from."""
+"""The number of funds in the figures over years."""
 
 
 # -- tables ---------------------------------------------------------------------------------------
 
 
 def compared(table: Any) -> str:
-    """Who does how well in one world, by how much better than the rule, and what becomes of the fund."""
+    """Tabulate each contender's welfare in one world, the difference to the rule, and the outcomes of the funds."""
     summary = _against_rule(table).summary("welfare")
     others = table.groupby("contender")[["right", "coverage", "premium", "short", "cuts"]].mean()
     rows = []
@@ -53,7 +53,7 @@ def compared(table: Any) -> str:
 
 
 def everywhere(table: Any) -> str:
-    """By how much each contender is better than the rule, in each world."""
+    """Tabulate how much better than the rule each contender is, in each world."""
     rows = []
     for levels, own in table.groupby(list(FACTORS), sort=False):
         summary = _against_rule(own).summary("welfare")
@@ -64,7 +64,7 @@ def everywhere(table: Any) -> str:
 
 
 def moved(table: Any) -> str:
-    """By how much each factor moves the mean welfare that a contender comes to."""
+    """Tabulate the effect of each factor on the mean welfare of each contender."""
     rows = []
     for name in dict.fromkeys(table.contender):
         found = effects(table, of="welfare", contender=name).main["mean"].groupby("factor", sort=False)
@@ -73,7 +73,7 @@ def moved(table: Any) -> str:
 
 
 def sizes(at_home: Any, large: Any) -> str:
-    """By how much contenders are better than the rule in small and in large funds, on the same seeds."""
+    """Tabulate how much better than the rule contenders are in small and in large funds, on the same seeds."""
     few = at_home[at_home.seed.isin(set(large.seed)) & at_home.contender.isin(set(large.contender))]
     small, big = (_against_rule(own).summary("welfare") for own in (few, large))
     rows = [(name, *(_difference(own.loc[name], "+.0f") for own in (small, big))) for name in big.index[1:]]
@@ -95,11 +95,11 @@ def _markdown(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
 
 
-# -- pictures -------------------------------------------------------------------------------------
+# -- figures --------------------------------------------------------------------------------------
 
 
 def draw_worlds(table: Any) -> Figure:
-    """Draw by how much each contender is better than the rule in each world, with intervals."""
+    """Draw how much better than the rule each contender is in each world, with intervals."""
     rows = []
     for levels, own in table.groupby(list(FACTORS), sort=False):
         for name, found in _against_rule(own).summary("welfare").iterrows():
@@ -121,7 +121,7 @@ def draw_worlds(table: Any) -> Figure:
 
 
 def draw_learned(found: Mapping[str, Policies]) -> Figure:
-    """Draw what the trained policies do, all else being as usual, beside the model's rules."""
+    """Draw the decisions of the trained policies beside the model's rules, with all other observations typical."""
     figure = _figure(11, 3.4)
     mix, by, premium = figure.subplots(1, 3)
     coverage = np.linspace(0.8, 1.8, 101)
@@ -157,26 +157,26 @@ def draw_learned(found: Mapping[str, Policies]) -> Figure:
 
 
 def _surcharge(policy: Any, age: int, coverage: float) -> float:
-    """What a policy asks of a client of an age who is otherwise as usual."""
+    """Compute the surcharge of a policy for a client of an age who is otherwise typical."""
     observed = USUAL.copy()
     names = (*OBSERVED, *OF_A_CLIENT)
     observed[0] = observed[1] = coverage
     observed[names.index("age, by 100 years")] = age / 100
     observed[names.index("rights, by the wage")] = 0.0175 * (age - 25)
-    # the cost of an accrual falls with the years until retirement: at 2.5 % a year, 14 years' worth from 67 on
+    # the cost of an accrual is discounted by the years until retirement, at 2.5 % a year; from 67 on it is 14 pensions
     observed[names.index("what the standard accrual costs, by the wage")] = 0.0175 * 14 * 1.025 ** (age - 67)
     lowest = SURCHARGES[0] if coverage >= REQUIRED else 1.0
     return max(SURCHARGES[round(policy.share(observed) * (len(SURCHARGES) - 1))], lowest)
 
 
 def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
-    """Draw how rights and coverage develop over the years: medians, and the middle eight of ten funds."""
+    """Draw rights and coverage over the years: medians, and the range from the 10 % to the 90 % quantile."""
     figure = _figure(9.5, 3.4)
     rights, coverages = figure.subplots(1, 2)
     for name, policies in (("rule", {}), ("trained pair", found["trained pair"])):
         funds = [simulate(world(), policies, seed=HELD_OUT + seed, points=POINTS) for seed in range(seeds)]
         for axes, of in ((rights, "right"), (coverages, "coverage")):
-            # a fund that could not pay all pensions has ended before; nothing is left of it
+            # a fund that could not pay all pensions ended early; its later years count as 0
             values = np.zeros((seeds, funds[0].years))
             for row, fund in zip(values, funds, strict=True):
                 row[: len(fund.account.years)] = [getattr(year, of) for year in fund.account.years]
@@ -198,18 +198,18 @@ def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
 
 def _figure(width: float, height: float) -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
     return figure
 
 
 def show(table: Any, large: Any, found: Mapping[str, Policies], folder: Path) -> None:
-    """Write all pictures and tables into a folder, and print the tables.
+    """Write all figures and tables to a folder, and print the tables.
 
     Args:
         table: The table of runs in all worlds.
         large: The table of runs with 10,000 clients, or None.
-        found: What was learned.
-        folder: Is made if need be.
+        found: The constant and trained policies, by name.
+        folder: The folder to write to; created if it is missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
     at_home = table[(table[list(HOME)] == list(HOME.values())).all(axis=1)]

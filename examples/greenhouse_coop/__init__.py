@@ -1,8 +1,8 @@
-"""A greenhouse, in which watering and ventilation learn to cooperate.
+"""A greenhouse in which watering and ventilation learn to cooperate.
 
-The showcase of the Sim-Env paper (supplements S1 and S2), taken one agent further, in three modules::
+The example of the Sim-Env paper (supplements S1 and S2), extended by a second agent, in three modules::
 
-    model    the domain model, which stands on its own and knows nothing of reinforcement learning
-    env      the environments: what is observed, decided and rewarded
-    train    what two agents learn in them, and what it is worth
+    model    the domain model, which is independent of reinforcement learning
+    env      the environments: observations, actions and rewards
+    train    training and evaluation of two agents
 """

@@ -1,24 +1,24 @@
-"""The greenhouse as environments: two of its decisions become agents that share one reward.
+"""Environments made from the greenhouse: two of its decisions become agents that share one reward.
 
-After supplement S2 of the Sim-Env paper, and the two agents that its outlook promises: ``waterer_0`` decides how
-many litres are poured, ``ventilator_0`` how much air is exchanged. The model knows nothing of either: its functions
-are named as decision points from here, and stay what they are for everyone else.
+This follows supplement S2 of the Sim-Env paper, with the two agents that its outlook suggests: ``waterer_0`` decides
+how many litres to pour, ``ventilator_0`` how much air to exchange. The model itself does not refer to this module: the
+module names the model's functions as decision points, and they stay unchanged for all other uses.
 
-- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, bare and in PettingZoo's wrappers.
-- ``parallel_env``: both agents, as a PettingZoo parallel environment, a round a day.
+- ``raw_env`` and ``env``: both agents, as a PettingZoo AEC environment, without and with PettingZoo's wrappers.
+- ``parallel_env``: both agents, as a PettingZoo parallel environment, with one round per day.
 - ``joint_env``: one agent that takes both decisions, as a Gymnasium environment; its reward is the sum of the two.
-- ``watering_env``: the waterer alone, as a Gymnasium environment; ventilation runs its rule.
-- ``ventilation_env``: the ventilator alone; watering runs its rule.
+- ``watering_env``: the waterer alone, as a Gymnasium environment; ventilation follows its rule.
+- ``ventilation_env``: the ventilator alone; watering follows its rule.
 
 Importing this module registers them: ``pettingzoo.make("aec", "greenhouse_coop/coop_v0")``, the same with
 ``"parallel"``, and ``gymnasium.make`` of ``"greenhouse_coop/Watering-v0"``, ``"greenhouse_coop/Ventilation-v0"`` and
 ``"greenhouse_coop/Joint-v0"``.
 
-Both agents are rewarded alike, once a day: with the share of the plants that are alive, less a thousandth for each
-litre poured since their decision of the day before. As it is one reward, the return of the team is the return of
-*one* of its agents and not the sum: say, of the ventilator, whose return is the sum over all days. (The waterer, who
-is asked after the plants have had their day, is not rewarded for the first day, when all plants are alive, but for
-the last one twice: its return is less by the share of the plants that are dead in the end.)
+Both agents get the same reward once a day: the share of living plants, less a thousandth per litre poured since their
+decision of the day before. As the reward is shared, the return of the team is the return of *one* agent, not the sum:
+here the ventilator's, whose return is the sum over all days. (The waterer decides after the plants' daily update. It
+gets no reward for the first day, when all plants are alive, and two for the last day, so its return is less by the
+share of plants that are dead in the end.)
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from simenv_marl import (
 from .model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, POT_CAPACITY, Greenhouse
 
 DAYS: Final = 100
-"""After how many days an episode is truncated."""
+"""The number of days after which an episode is truncated."""
 
 MOST_WATER: Final = 1000.0
-"""Litres that the waterer can pour in a day."""
+"""The most litres that the waterer can pour in a day."""
 
 OBSERVED: Final = (
     "temperature, between its bounds",
@@ -63,21 +63,21 @@ OBSERVED: Final = (
     "water in the pots of living plants: its mean, by what a pot holds",
     "the same, each pot counted by what its plant lacks in health: are the weak too dry or too wet?",
 )
-"""What both agents observe."""
+"""The observation of both agents."""
 
 
-# -- what is observed, decided and rewarded -------------------------------------------------------
+# -- observations, actions, rewards ---------------------------------------------------------------
 
 
 def observe(greenhouse: Greenhouse) -> NDArray[np.float32]:
-    """Observe what ``OBSERVED`` lists.
+    """Observe the greenhouse, as ``OBSERVED`` lists it.
 
-    All of it is clipped to [0, 1], whatever it has come to: nothing in the model bounds the humidity, and bad enough
-    decisions drive it, and the water along with it, as far as to infinity.
+    All values are clipped to [0, 1], because the model does not bound the humidity: bad decisions can drive it, and the
+    water with it, to infinity.
     """
     living = 0
     water = lack = water_by_lack = 0.0
-    for plant in greenhouse.pots:  # once through all, because this takes most of the time of a decision
+    for plant in greenhouse.pots:  # a single pass, because it takes most of the time of a decision
         if plant.health > 0:
             missing = 1 - plant.health
             living += 1
@@ -97,33 +97,33 @@ def observe(greenhouse: Greenhouse) -> NDArray[np.float32]:
 
 
 def _unit(value: float) -> float:
-    """Clip to [0, 1]; what is not even a number becomes 0."""
+    """Clip to [0, 1]; NaN becomes 0."""
     return 1.0 if value > 1.0 else value if value > 0.0 else 0.0
 
 
 @difference
 def _water_since(greenhouse: Greenhouse) -> float:
-    """Litres poured since the agent that is being rewarded was last asked."""
+    """Litres poured since the previous decision of the agent that gets the reward."""
     return greenhouse.water_use
 
 
 def reward(greenhouse: Greenhouse) -> float:
-    """The reward of the day that has gone by since the agent's decision before."""
+    """Compute the reward for the day since the agent's previous decision."""
     return greenhouse.alive / len(greenhouse.pots) - float(_water_since(greenhouse)) / 1000
 
 
 def to_fraction(action: Any) -> float:
-    """The action as a python number, which keeps NumPy's slower ones out of the model."""
+    """Convert an action to a Python float, as NumPy's scalars would slow down the model."""
     return min(max(float(action.item() if isinstance(action, np.ndarray) else action), 0.0), 1.0)
 
 
 def to_litres(action: Any) -> float:
-    """What the waterer's action decides: litres to pour."""
+    """Map the waterer's action to litres."""
     return MOST_WATER * to_fraction(action)
 
 
 def exchange_air(action: Any, greenhouse: Greenhouse) -> None:
-    """What the ventilator's action does in place of the model's fixed 20 %: exchange that fraction of the air."""
+    """Exchange the fraction of the air that the ventilator's action says, in place of the model's fixed 20 %."""
     fraction = to_fraction(action)
     greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
 
@@ -150,7 +150,8 @@ VENTILATION: Final[dict[Any, Definition]] = {
         observation_space_mapping=observe,
         action_space=ACTION_SPACE,
         apply=exchange_air,
-        rule_action_mapping=lambda nothing, greenhouse: [0.2],  # the fixed 20 %, which the model decides by doing
+        # the rule is a fixed 20 %, which the model's function applies and does not return
+        rule_action_mapping=lambda nothing, greenhouse: [0.2],
         reward_mapping=reward,
         agent="ventilator_0",
     )
@@ -162,10 +163,10 @@ VENTILATION: Final[dict[Any, Definition]] = {
 
 
 class GreenhouseSim(SimulationInterface):
-    """Runs a greenhouse for a hundred days, or until its plants are dead.
+    """The simulation of a greenhouse for a hundred days, or until its plants are dead.
 
     Attributes:
-        greenhouse: The greenhouse of the present episode.
+        greenhouse: The greenhouse of the current episode.
     """
 
     points = WATERING | VENTILATION
@@ -176,38 +177,38 @@ class GreenhouseSim(SimulationInterface):
         self._stopped = False
 
     def reset(self, seed: int | None = None) -> None:
-        """Furnish a new greenhouse."""
+        """Create a new greenhouse."""
         self.greenhouse = Greenhouse(seed)
         self._stopped = False
 
     def run(self) -> Any:
-        """Let day after day go by.
+        """Simulate days until the last one, or until all plants are dead.
 
         Returns:
-            ``TRUNCATED`` where plants have lived to see the last day.
+            ``TRUNCATED`` if plants are alive after the last day, else None.
         """
         greenhouse = self.greenhouse
         while not self._stopped and greenhouse.day < DAYS:
             anyone = greenhouse.alive > 0
             greenhouse.update_day()
-            if not anyone:  # as in the paper, only who comes in the next morning finds them dead
+            if not anyone:  # as in the paper, deaths end the episode on the next day
                 return None
         return TRUNCATED if greenhouse.alive else None
 
     def reseed(self, seed: int) -> None:
-        """Draw the weather that lies ahead anew."""
+        """Draw another future of the weather."""
         self.greenhouse.random.seed(seed)
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Whose decision will be called for: either is the greenhouse's."""
+        """Return the call to come at a decision point: both points belong to the greenhouse."""
         return [(self.greenhouse,)]
 
     def stop(self) -> None:
-        """Ask the loop to end after the present day."""
+        """Ask the loop to end after the current day."""
         self._stopped = True
 
     def render(self, mode: str) -> str:
-        """Tell how the plants fare, in the words of the model."""
+        """Return the line that the model prints about its plants."""
         greenhouse = self.greenhouse
         alive = greenhouse.alive
         return f"day {greenhouse.day} alive: {alive}, dead: {len(greenhouse.pots) - alive}"
@@ -217,19 +218,19 @@ class GreenhouseSim(SimulationInterface):
 
 
 def watering_env(**options: Any) -> SimulationEnv:
-    """Make the environment of the waterer alone, while ventilation runs its rule.
+    """Make the environment of the waterer alone, while ventilation follows its rule.
 
     Args:
-        **options: As ``simenv_marl.single_env`` takes them.
+        **options: The options of ``simenv_marl.single_env``.
     """
     return single_env(GreenhouseSim, WATERING, **options)
 
 
 def ventilation_env(**options: Any) -> SimulationEnv:
-    """Make the environment of the ventilator alone, while watering runs its rule.
+    """Make the environment of the ventilator alone, while watering follows its rule.
 
     Args:
-        **options: As ``simenv_marl.single_env`` takes them.
+        **options: The options of ``simenv_marl.single_env``.
     """
     return single_env(GreenhouseSim, VENTILATION, **options)
 
@@ -238,40 +239,40 @@ def raw_env(**options: Any) -> SimulationAECEnv:
     """Make the environment of both agents.
 
     Args:
-        **options: As ``simenv_marl.aec_env`` takes them.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return aec_env(GreenhouseSim, **options)
 
 
 def env(**options: Any) -> OrderEnforcingWrapper[str, Any, Any]:
-    """Make the environment of both agents in PettingZoo's wrappers, which tell mistakes and clip actions.
+    """Make the environment of both agents in PettingZoo's wrappers, which report wrong use and clip actions.
 
     Args:
-        **options: As ``simenv_marl.aec_env`` takes them.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(raw_env(**options)))
 
 
 def parallel_env(**options: Any) -> SimulationParallelEnv:
-    """Make the environment of both agents in which they decide day by day, and see nothing of each other's decision.
+    """Make the parallel environment, in which both agents decide each day without seeing each other's decision.
 
     Args:
-        **options: As ``simenv_marl.parallel_env`` takes them.
+        **options: The options of ``simenv_marl.parallel_env``.
     """
     return simenv_marl.parallel_env(GreenhouseSim, **options)
 
 
 def joint_env(**options: Any) -> SimulationJointEnv:
-    """Make the environment of one agent that takes both decisions; ``flatten=True`` makes one vector of them.
+    """Make the environment of one agent that takes both decisions; ``flatten=True`` makes them one vector.
 
     Args:
-        **options: As ``simenv_marl.joint_env`` takes them.
+        **options: The options of ``simenv_marl.joint_env``.
     """
     return simenv_marl.joint_env(GreenhouseSim, **options)
 
 
 def _register() -> None:
-    """Tell the registries of Gymnasium and PettingZoo, unless they know already."""
+    """Register the environments with Gymnasium and PettingZoo, unless they are registered already."""
     for name, entry_point in (
         ("Watering", "watering_env"),
         ("Ventilation", "ventilation_env"),
@@ -280,7 +281,7 @@ def _register() -> None:
         if f"greenhouse_coop/{name}-v0" not in gymnasium.registry:
             gymnasium.register(f"greenhouse_coop/{name}-v0", f"{__name__}:{entry_point}")
     for kind, entry_point in (("aec", "env"), ("parallel", "parallel_env")):
-        known = getattr(pettingzoo, f"{kind}_registry", None)  # younger than the oldest PettingZoo that will do
+        known = getattr(pettingzoo, f"{kind}_registry", None)  # missing in the oldest supported PettingZoo
         if known is not None and "greenhouse_coop/coop-v0" not in known:
             pettingzoo.register(kind, "greenhouse_coop/coop_v0", f"{__name__}:{entry_point}")
 

@@ -1,12 +1,12 @@
-"""A network learns from the model's own rule what that does, and ventilates greenhouses in its place.
+"""Behaviour cloning: a network learns the model's own ventilation rule, and ventilates greenhouses in its place.
 
-``python -m examples.greenhouse_coop.imitate`` has the rule ventilate some greenhouses, writes down what it has decided
-as a Minari data set, clones its behaviour from that by TorchRL, and compares the two in greenhouses that neither has
-seen: decision by decision, by return, and in the model's own loop. It needs ``pip install "simenv-marl[minari]"
-torchrl``.
+``python -m examples.greenhouse_coop.imitate`` lets the rule ventilate some greenhouses, records its decisions as a
+Minari data set, and clones its behaviour with TorchRL. It then compares rule and clone in held-out greenhouses:
+decision by decision, by return, and in the model's own loop. It needs ``pip install "simenv-marl[minari]" torchrl``.
 
-The rule is that of the paper's plugin, the warmer the faster: a fixed 20 % would be learnt too soon. The waterer pours
-what the plants can take, for all of them die within days of the model's rule, and there would be little to see.
+The rule is that of the paper's plugin, which exchanges more air at higher temperatures; a fixed 20 % would be too easy
+to learn. The waterer pours a constant amount that the plants can take, because with the model's rule all plants die
+within days.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ from .model import Greenhouse
 from .variants import AIR_EXCHANGE
 
 HELD_OUT: Final = 1_000_000
-"""Seeds from here on are for the comparison; those below are learnt from."""
+"""Seeds from this number on are for the comparison; those below it are for learning."""
 
 WATERER, VENTILATOR = "waterer_0", "ventilator_0"
 
 DATASET: Final = "greenhouse/ventilator-rule-v0"
 
 TOLERANCE: Final = 0.01
-"""By how much actions may differ that are taken for the same: one per cent of the air."""
+"""Actions that differ by at most this much count as equal: one per cent of the air."""
 
 
-# -- the model, and what is decided in it ---------------------------------------------------------
+# -- the model and its decisions ------------------------------------------------------------------
 
 
 @make_step(
@@ -75,12 +75,12 @@ TOLERANCE: Final = 0.01
     agent="ventilator_0",
 )
 def choose_air_exchange(greenhouse: Greenhouse) -> float:
-    """Decide which fraction of the air is replaced: more of it at higher temperatures (paper, section 4, step 3)."""
+    """Choose the fraction of air to replace: more at higher temperatures (paper, section 4, step 3)."""
     return (greenhouse.temp - 15) / 20
 
 
 def decided_air_exchange(greenhouse: Greenhouse) -> None:
-    """Exchange as much air as was decided."""
+    """Exchange the chosen fraction of the air."""
     fraction = choose_air_exchange(greenhouse)
     greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
 
@@ -95,22 +95,22 @@ WARM: Final = Variant(
 
 
 def sparing(observations: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Water by the day: sixty litres."""
+    """Pour sixty litres a day."""
     return np.full((len(observations), 1), 60 / MOST_WATER, np.float32)
 
 
 # -- learning -------------------------------------------------------------------------------------
 
 Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""Decides for many at once."""
+"""Maps a batch of observations to a batch of actions."""
 
 
 def clone(dataset: minari.MinariDataset, steps: int) -> Policy:
-    """Learn from a data set what to do.
+    """Train a policy by behaviour cloning.
 
     Args:
-        dataset: What was decided, on which observations.
-        steps: How many batches to learn from.
+        dataset: The recorded observations and actions.
+        steps: The number of training batches.
     """
     episodes = list(dataset)
     data = TensorDict(
@@ -142,10 +142,10 @@ def clone(dataset: minari.MinariDataset, steps: int) -> Policy:
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
-    """Record, learn, compare.
+    """Record the rule's decisions, clone them, and compare.
 
     Returns:
-        In which share of the decisions both agree, and the mean return with each.
+        The share of decisions in which both agree, and the mean return with each.
     """
     parser = argparse.ArgumentParser(description="Clone the rule that ventilates.")
     parser.add_argument("--episodes", type=int, default=50, help="greenhouses to learn from (default: %(default)s)")
@@ -154,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     options = parser.parse_args(arguments)
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    # Leave this out to keep the data set.
+    # a temporary folder; leave this line out to keep the data set
     with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, MINARI_DATASETS_PATH=folder):
         record_dataset({VENTILATOR: DATASET}, WARM, {WATERER: sparing, VENTILATOR: RULE}, seeds=range(options.episodes))
         learned = clone(minari.load_dataset(DATASET), options.steps)
@@ -168,7 +168,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     results = {"agreement": compared.agreement}
     for title, ventilate in (("rule", RULE), ("imitation", learned)):
         collected = collect_episodes(WARM, {WATERER: sparing, VENTILATOR: ventilate}, seeds=unseen)
-        values = collected[VENTILATOR].returns  # of the team: both agents are rewarded for the same
+        values = collected[VENTILATOR].returns  # the team's return, as both agents get the same reward
         results[title] = float(values.mean())
         print(f"{title}: return {values.mean():.2f} ± {values.std():.2f}")
     for title, alone in (("rule", RULE), ("imitation", one_by_one(learned))):
@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
 
 
 def one_by_one(policy: Policy) -> Callable[[Any], Any]:
-    """What a policy of many decides of one."""
+    """Turn a policy for batches into one for single observations."""
     return lambda observation: policy(observation[None])[0]
 
 

@@ -1,24 +1,25 @@
-"""From plans to a policy that decides at once: a network learns from a planner, which plans over the network.
+"""Expert iteration: a network learns from a planner, and the planner uses the network as its base policy.
 
-``python -m examples.greenhouse_coop.imitate_plans`` does so in rounds (expert iteration; Anthony, Tian and Barber,
-2017), until a budget of simulated days is spent, and lets the network keep the greenhouses of ``make demo`` without
-planning. It needs ``pip install "simenv-marl[many]" torch``.
+``python -m examples.greenhouse_coop.imitate_plans`` does so in rounds (Anthony, Tian and Barber, 2017) until a budget
+of simulated days is spent. Then the network runs the greenhouses of ``make demo`` without planning. It needs
+``pip install "simenv-marl[many]" torch``.
 
-The planner knows all of the greenhouse, since it tries out. The network sees six numbers of it. A network that imitates
-what the planner has poured goes to ruin: the planner pours as late as each plant can bear, and the network cannot tell
-when that is. So it learns what every candidate was worth, and pours what is worth most by what it sees:
+The planner uses the full state of the greenhouse, because it simulates branches. The network sees six numbers. A
+network that imitates the planner's actions fails: the planner pours as late as each plant can bear, and the network
+cannot see when that is. So the network learns the value of every candidate, and pours what is best given its
+observation:
 
-- The network acts, and in a tenth of its decisions an amount is drawn in its place, so that it is in greenhouses as it
-  is going to have them (Ross, Gordon and Bagnell, 2011).
-- In a quarter of its decisions, ``action_values`` tries out all candidates, with the network as the base.
-- The network gives each candidate a probability, and is taught to make the expected worth as great as possible. What it
-  pours is the expected amount.
+- The network acts, so that it learns in the states that it reaches itself (Ross, Gordon and Bagnell, 2011). In a tenth
+  of its decisions, a random amount replaces its own.
+- In a quarter of its decisions, ``action_values`` tries out all candidates, with the network as the base policy.
+- The network gives each candidate a probability, and is trained to maximise the expected value. It pours the expected
+  amount.
 
-``--plainly`` has the planner demonstrate at the same price, and imitates what it has poured, by the cloning of the
-module ``imitate``, for comparison.
+``--plainly`` is for comparison: the planner gives demonstrations for the same budget, and the network imitates its
+actions by the behaviour cloning of the module ``imitate``.
 
-All simulated days are counted: those of the episodes, as many as they had, and those of the branches, which are
-candidates times futures times the horizon, or the days that are left. Ventilation is at full, as in question 5a of the
+The budget counts all simulated days: the days of the episodes, and for the branches the number of candidates times
+futures times the horizon, or the remaining days if they are fewer. Ventilation runs at 100 %, as in question 5a of the
 experiment.
 """
 
@@ -44,23 +45,23 @@ from .plan import BEST, HELD_OUT, LITRES, VENTILATOR, WATERER, Constant, days_le
 CANDIDATES: Final = np.array(LITRES, np.float32) / np.float32(MOST_WATER)
 
 HORIZON: Final = 4
-"""For how many days candidates are tried out: as many as a healthy plant survives in a dry pot."""
+"""The planner's horizon in days: as long as a healthy plant survives in a dry pot."""
 
 EPISODES: Final = 4
-"""How many greenhouses are kept in a round."""
+"""The number of greenhouses (episodes) per round."""
 
 ASKED: Final = 0.25
-"""In which share of its decisions it is found out what candidates are worth."""
+"""The share of decisions in which the planner values all candidates."""
 
 DRAWN: Final = 0.1
-"""In which share of its decisions another amount is poured than the network would."""
+"""The share of decisions in which a random amount replaces the network's."""
 
 TAUGHT, KEPT = 4, 2
-"""How many are taught in each round, each from other beginnings, and how many of them decide, by their mean: those
-that have learnt best what they were taught. Some come to pour the same whatever they see, and stay with that."""
+"""The number of networks trained per round, each from another initialisation, and the number of those with the lowest
+loss, whose mean decides. Some networks collapse to a constant amount and stay there."""
 
 FIRST: Final = Constant(LITRES[len(LITRES) // 2] / MOST_WATER)
-"""Who waters before anything was learnt: the candidate in the middle."""
+"""The waterer before any learning: the middle candidate."""
 
 
 # -- policies -------------------------------------------------------------------------------------
@@ -68,12 +69,12 @@ FIRST: Final = Constant(LITRES[len(LITRES) // 2] / MOST_WATER)
 
 @dataclass(frozen=True)
 class Network:
-    """Pours the expected amount, for one observation or for many, without the library that has taught it.
+    """A network that pours the expected amount, for one observation or a batch, without the library that trained it.
 
-    It is a base in branches, and a process that has imported a large library is forked slowly.
+    Branches use it as the base policy, and forks are slow in a process that has imported a large library.
 
     Attributes:
-        layers: By network, the weights and biases of each layer.
+        layers: For each network, the weights and biases of each layer.
     """
 
     layers: tuple[tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...], ...]
@@ -98,14 +99,14 @@ class Network:
 
 @dataclass(frozen=True)
 class Learner:
-    """Waters as it has learnt, at times as it is drawn, and finds out at times what candidates are worth.
+    """A waterer that acts by its base policy or at random, and sometimes values all candidates.
 
-    Its extras are what they are worth, ``values``, whether that was found out, ``asked``, and the ``days`` of branches.
+    Its extras are the candidates' ``values``, whether it has computed them (``asked``), and the ``days`` in branches.
 
     Attributes:
-        base: How it waters, and how branches go on.
-        seed: With the observation, determines what is drawn.
-        horizon: For how many days candidates are tried out.
+        base: The policy that acts, also in branches.
+        seed: With the observation, the seed of the random draws.
+        horizon: The number of days for which candidates are tried out.
     """
 
     base: Any
@@ -134,15 +135,15 @@ class Learner:
 
 
 def teach(observations: NDArray[np.float32], values: NDArray[np.float64], steps: int, seed: int) -> Network:
-    """Teach networks to prefer what is worth most.
+    """Train networks to prefer the candidates with the highest value.
 
     Args:
         observations: ``(decisions, 6)``.
-        values: ``(decisions, candidates)``: what each candidate was worth.
-        steps: For how many batches.
-        seed: Determines how they begin, and the batches.
+        values: ``(decisions, candidates)``: the value of each candidate.
+        steps: The number of training batches.
+        seed: The seed of the initial weights and the batches.
     """
-    import torch  # here, and not in the processes that fork
+    import torch  # imported here, because processes that fork should not load it
 
     torch.set_num_threads(1)
     seen = torch.as_tensor(observations)
@@ -175,12 +176,12 @@ def teach(observations: NDArray[np.float32], values: NDArray[np.float64], steps:
 
 @dataclass
 class Course:
-    """How learning has gone.
+    """The result of a training run.
 
     Attributes:
-        policy: What was learnt.
-        days: How many were simulated.
-        rounds: After each round, the days so far and the mean return with the policy, where that was asked for.
+        policy: The trained policy.
+        days: The number of simulated days.
+        rounds: After each round, the days so far and the mean return of the policy; empty unless requested.
     """
 
     policy: Any
@@ -189,15 +190,15 @@ class Course:
 
 
 def iterate(budget: int, seed: int, *, steps: int = 1500, workers: int = 2, watched: Sequence[int] = ()) -> Course:
-    """Learn from plans over what was learnt.
+    """Run expert iteration.
 
     Args:
-        budget: How many days may be simulated. There is no round more that would go beyond it if it was as long as
-            the longest so far.
-        seed: Determines everything.
-        steps: For how many batches networks are taught in each round.
-        workers: How many processes plan.
-        watched: Seeds of greenhouses on which each round is judged. Nothing is learnt from them.
+        budget: The number of days to simulate at most. The last round is the one after which another round, as long
+            as the longest so far, would exceed the budget.
+        seed: The seed of the run.
+        steps: The number of training batches in each round.
+        workers: The number of processes that plan.
+        watched: Seeds of greenhouses for the evaluation after each round; they are not used for training.
     """
     rng = np.random.default_rng(seed)
     course = Course(FIRST, 0, [])
@@ -221,13 +222,13 @@ def iterate(budget: int, seed: int, *, steps: int = 1500, workers: int = 2, watc
 
 
 def imitate_plainly(budget: int, seed: int, *, steps: int = 3000, workers: int = 2) -> Course:
-    """Have the planner demonstrate, and imitate what it has poured: for comparison.
+    """Imitate the actions of a planner's demonstrations, for comparison.
 
     Args:
-        budget: How many days may be simulated.
-        seed: Determines everything.
-        steps: For how many batches the network is taught.
-        workers: How many processes plan.
+        budget: The number of days to simulate at most.
+        seed: The seed of the run.
+        steps: The number of training batches.
+        workers: The number of processes that plan.
     """
     import minari
     import torch
@@ -249,24 +250,24 @@ def imitate_plainly(budget: int, seed: int, *, steps: int = 3000, workers: int =
 
 
 def worth(policy: Any, seeds: Sequence[int]) -> float:
-    """The mean return with a policy that does not plan."""
+    """Compute the mean return of a policy that does not plan."""
     return float(keep({WATERER: policy, VENTILATOR: BEST[VENTILATOR]}, seeds).returns.mean())
 
 
 def main(arguments: Sequence[str] | None = None) -> list[float]:
-    """Learn, and tell what the policies are worth without planning.
+    """Train policies, and print their returns without planning.
 
     Returns:
-        What each was worth in the end.
+        The final mean return of each policy.
     """
-    parser = argparse.ArgumentParser(description="Learn from plans.")
+    parser = argparse.ArgumentParser(description="Train a network from plans by expert iteration.")
     parser.add_argument("--budget", type=int, default=60_000, help="days to simulate (default: %(default)s)")
-    parser.add_argument("--learners", type=int, nargs="+", default=[0, 1, 2], help="their seeds (default: 0 1 2)")
+    parser.add_argument("--learners", type=int, nargs="+", default=[0, 1, 2], help="seeds of learners (default: 0 1 2)")
     parser.add_argument("--steps", type=int, default=1500, help="batches in each round (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--watch", action="store_true", help="judge each round, on other greenhouses")
-    parser.add_argument("--plainly", action="store_true", help="imitate what was poured, for comparison")
+    parser.add_argument("--watch", action="store_true", help="evaluate each round, on other greenhouses")
+    parser.add_argument("--plainly", action="store_true", help="imitate the planner's actions, for comparison")
     options = parser.parse_args(arguments)
     watched = range(HELD_OUT + 10_000, HELD_OUT + 10_008) if options.watch else ()
     found = []

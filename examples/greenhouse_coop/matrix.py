@@ -1,8 +1,8 @@
-"""The paper's own matrix: who waters, and what becomes of that with other numbers of plants, climates and plugins.
+"""The paper's matrix of experiments: policies that water, over numbers of plants, climates and plugins.
 
-``python -m examples.greenhouse_coop.matrix`` (or ``make matrix``) trains waterers, and has them, the model's rule and a
-planner keep the same greenhouses in every combination of the factors, which are those of ``variants.greenhouse``. What
-has been run is in a folder, and is not run again. From the table of all runs come the figures of
+``python -m examples.greenhouse_coop.matrix`` (or ``make matrix``) trains waterers. They, the model's rule and a planner
+then run the same greenhouses in every combination of the factors, which are those of ``variants.greenhouse``. A folder
+keeps the runs, so that a second call runs only what is missing. The table of all runs gives the figures of
 ``docs/greenhouse-matrix.md``.
 """
 
@@ -25,7 +25,7 @@ from .train import OUT, Constant, Linear, Team, learn
 from .variants import CLIMATES, EXCHANGES, House, greenhouse
 
 Levels = Mapping[str, Sequence[Any]]
-"""Of each factor."""
+"""The levels of each factor."""
 
 FACTORS: Final[Levels] = {
     "plants": (100, 200, 400),
@@ -34,16 +34,16 @@ FACTORS: Final[Levels] = {
 }
 
 HOME: Final = {"plants": 200, "climate": "mild", "exchange": "fixed"}
-"""The row that is the paper's greenhouse, as its code has it."""
+"""The row of the paper's greenhouse, as in its code."""
 
 SCHOOLS: Final[Mapping[str, Levels]] = {
     "learned at home": {name: (level,) for name, level in HOME.items()},
     "learned all over": FACTORS,
 }
-"""Where is learned: in the paper's greenhouse alone, and in those of all rows."""
+"""The training sets: the paper's greenhouse alone, or the greenhouses of all rows."""
 
 FIRST: Final = {WATERER: Constant(0.06)}
-"""Where learning begins: with sixty litres a day."""
+"""The initial policy: sixty litres a day."""
 
 GENERATIONS: Final = 30
 
@@ -55,10 +55,10 @@ def train(school: Levels, generations: int, seed: int, workers: int) -> Linear:
     """Train a waterer by evolution (CMA-ES).
 
     Args:
-        school: The levels of each factor that it learns in. All candidates of a generation meet the same greenhouses.
-        generations: For how long.
-        seed: Determines everything.
-        workers: How many processes play.
+        school: The levels of each factor to train on. All candidates of a generation get the same greenhouses.
+        generations: The number of generations.
+        seed: The seed of the training.
+        workers: The number of processes.
     """
     rows = rows_of(school).to_dict("records")
 
@@ -75,13 +75,13 @@ def train(school: Levels, generations: int, seed: int, workers: int) -> Linear:
 
 
 def learned(folder: Path, learners: int, generations: int, workers: int) -> dict[str, Linear]:
-    """Train the waterers, or load those that were trained before.
+    """Train the waterers, or load those trained before.
 
     Args:
-        folder: Where their weights are kept.
-        learners: How many of each school.
-        generations: For how long they learn.
-        workers: How many processes play.
+        folder: The folder of their weights.
+        learners: The number of learners per training set.
+        generations: The number of generations.
+        workers: The number of processes.
     """
     found = {}
     for name, school in SCHOOLS.items():
@@ -100,30 +100,30 @@ def learned(folder: Path, learners: int, generations: int, workers: int) -> dict
 
 
 def share_alive(simulation: House) -> float:
-    """Which share of the plants is alive in the end."""
+    """Compute the share of plants alive at the end."""
     return simulation.greenhouse.alive / simulation.plants
 
 
 def litres_a_pot(simulation: House) -> float:
-    """How much was poured into each pot, on average, in a day."""
+    """Compute the mean litres per pot and day."""
     kept = simulation.greenhouse
     return kept.water_use / simulation.plants / kept.day
 
 
 def rows_of(levels: Levels) -> Any:
-    """Each combination of the levels of the factors."""
+    """Make a table of all combinations of the levels of the factors."""
     return design({name: list(own) for name, own in levels.items()})
 
 
 def run(folder: Path, levels: Levels, waterers: Mapping[str, Any], seeds: int, workers: int) -> Any:
-    """Run what is missing of the matrix.
+    """Run the missing runs of the matrix.
 
     Args:
-        folder: Where all of it is kept.
-        levels: Those of each factor.
-        waterers: Who waters, beside the rule.
-        seeds: How many greenhouses are kept in each row.
-        workers: How many processes share the work.
+        folder: The folder that keeps the runs.
+        levels: The levels of each factor.
+        waterers: The policies to compare with the rule, by name.
+        seeds: The number of greenhouses in each row.
+        workers: The number of processes.
 
     Returns:
         The table of all runs.
@@ -141,19 +141,19 @@ def run(folder: Path, levels: Levels, waterers: Mapping[str, Any], seeds: int, w
 
 
 def main(arguments: Sequence[str] | None = None) -> Any:
-    """Run the matrix, and show what came of it.
+    """Run the matrix, and show the results.
 
     Returns:
         The table of all runs.
     """
-    parser = argparse.ArgumentParser(description="Who waters best, and where?")
+    parser = argparse.ArgumentParser(description="Which policies water best, and where?")
     parser.add_argument("--seeds", type=int, default=8, help="greenhouses in each row (default: %(default)s)")
-    parser.add_argument("--learners", type=int, default=5, help="of each school (default: %(default)s)")
+    parser.add_argument("--learners", type=int, default=5, help="learners per training set (default: %(default)s)")
     parser.add_argument("--generations", type=int, default=GENERATIONS, help="of learning (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT / "matrix", help="folder for all of it (default: %(default)s)")
-    parser.add_argument("--figures", type=Path, help="folder for pictures and tables (default: the same)")
-    parser.add_argument("--quick", action="store_true", help="little of everything, to see that it works")
+    parser.add_argument("--out", type=Path, default=OUT / "matrix", help="folder for results (default: %(default)s)")
+    parser.add_argument("--figures", type=Path, help="folder for figures and tables (default: the same)")
+    parser.add_argument("--quick", action="store_true", help="a small run, to check that everything works")
     if parser.parse_args(arguments).quick:
         parser.set_defaults(seeds=2, learners=1, generations=2, out=OUT / "matrix-quick")
     options = parser.parse_args(arguments)
@@ -163,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> Any:
     contenders = {**waterers, "planned": PortionPlanner()}
     table = run(options.out / "runs", factors, contenders, options.seeds, options.workers)
 
-    from . import matrix_figures  # here, for no process that forks is to carry what draws
+    from . import matrix_figures  # imported here, so that forked processes do not load the plotting libraries
 
     matrix_figures.show(table, options.figures or options.out)
     return table

@@ -1,4 +1,4 @@
-"""Pictures and tables of the matrix: what pandas, seaborn, statsmodels and the library make of one tidy table."""
+"""Figures and tables of the matrix, made from one tidy table with pandas, seaborn, statsmodels and the library."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from .matrix import FACTORS, HOME, SCHOOLS
 AT_HOME, ALL_OVER = SCHOOLS
 
 NUMBER: Final = " 0123456789"
-"""What the name of a learner ends with, after that of its school."""
+"""The characters of the number that ends a learner's name, after the name of its training set."""
 
 COLOURS: Final = {"rule": "#8c8c8c", AT_HOME: "#d1812c", ALL_OVER: "#7fb3d3", "planned": "#1b6f5f"}
 
 
 def averaged(table: Any) -> Any:
-    """The team's rows, with the learners of each school as one contender, whose values are their means."""
+    """Select the team's rows, and average the learners of each training set to one contender."""
     team = table[table.agent == "team"]
     keys = [*FACTORS, "contender", "seed", "agent", "status"]
     values = ["return", "length", "alive", "litres"]
@@ -40,9 +40,9 @@ def averaged(table: Any) -> Any:
 
 
 def compared(means: Any) -> str:
-    """Who does how well with how many plants, and by how much better than those who have learned at home.
+    """Tabulate each contender's results by number of plants, and the difference to those who learned at home.
 
-    What is compared is the mean over all climates and exchanges, seed by seed: intervals are over seeds.
+    The comparison is of means over all climates and exchanges, seed by seed: intervals are over seeds.
     """
     rows = []
     for plants, own in means.groupby("plants"):
@@ -62,7 +62,7 @@ def _between(found: Any, name: str, form: str) -> str:
 
 
 def moved(means: Any) -> str:
-    """For each contender, by how much the means of its returns at the levels of a factor lie apart at most."""
+    """Tabulate, for each contender and factor, the range of its mean returns over the levels of the factor."""
     rows = []
     for name in dict.fromkeys(means.contender):
         levels = effects(means, contender=name).main["mean"].groupby("factor", sort=False)
@@ -71,7 +71,7 @@ def moved(means: Any) -> str:
 
 
 def learners(table: Any) -> str:
-    """What each learner has come to: in the greenhouse of the paper, and with each number of plants."""
+    """Tabulate each learner's mean return, in the greenhouse of the paper and with each number of plants."""
     team = table[(table.agent == "team") & table.contender.str.startswith(tuple(SCHOOLS))]
     home = team[(team[list(HOME)] == list(HOME.values())).all(axis=1)].groupby("contender")["return"].mean()
     by_plants = team.pivot_table(index="contender", columns="plants", values="return", sort=False)
@@ -80,7 +80,7 @@ def learners(table: Any) -> str:
 
 
 def shares(means: Any) -> str:
-    """Which share of the variance of returns is due to what, by an analysis of variance."""
+    """Tabulate the shares of the variance of returns, by an analysis of variance."""
     varied = [name for name in (*FACTORS, "contender") if means[name].nunique() > 1]
     formula = f'Q("return") ~ ({" + ".join(f"C({name})" for name in varied)}) ** 2 + C(seed)'
     found = anova_lm(ols(formula, means).fit(), typ=2)
@@ -94,11 +94,11 @@ def _markdown(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
 
 
-# -- pictures -------------------------------------------------------------------------------------
+# -- figures --------------------------------------------------------------------------------------
 
 
 def draw_returns(means: Any, table: Any) -> Any:
-    """Draw the whole matrix: a panel for each climate and exchange, in it thin lines for each learner."""
+    """Draw the whole matrix: a panel for each climate and exchange, with a thin line for each learner."""
     grid = seaborn.catplot(
         means, x="plants", y="return", hue="contender", row="climate", col="exchange", kind="point", palette=COLOURS,
         height=2.1, aspect=1.35, margin_titles=True, markersize=5, linewidth=1.6, err_kws={"linewidth": 1.2}, seed=0,
@@ -117,12 +117,12 @@ def draw_returns(means: Any, table: Any) -> Any:
     place = sorted(set(means.plants)).index(HOME["plants"])
     grid.axes_dict[HOME["climate"], HOME["exchange"]].axvspan(place - 0.2, place + 0.2, color="#efe3d3", zorder=0)
     seaborn.move_legend(grid, "upper center", bbox_to_anchor=(0.45, 1.03), ncols=len(COLOURS), title=None)
-    pyplot.close(grid.figure)  # it is saved, and not shown
+    pyplot.close(grid.figure)  # saved, not shown
     return grid.figure
 
 
 def draw_behind(means: Any) -> Any:
-    """Draw by how much learners are behind the planner on the same seeds, in each row, and how sure that is."""
+    """Draw how far learners are behind the planner on the same seeds, in each row, with intervals."""
     rows = []
     for levels, own in means.groupby(list(FACTORS), sort=False):
         summary = Evaluation(own, "planned", 0.95).summary()
@@ -146,7 +146,7 @@ def draw_behind(means: Any) -> Any:
 
 
 def draw_factors(means: Any) -> Any:
-    """Draw what each factor does to each contender: means over the other factors, seed by seed."""
+    """Draw the effect of each factor on each contender: means over the other factors, seed by seed."""
     figure = _figure(9.5, 3.2)
     for axes, factor in zip(figure.subplots(1, len(FACTORS), sharey=True), FACTORS, strict=True):
         by_seed = means.groupby([factor, "contender", "seed"], sort=False, as_index=False)["return"].mean()
@@ -165,16 +165,16 @@ def draw_factors(means: Any) -> Any:
 
 def _figure(width: float, height: float) -> Any:
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
     return figure
 
 
 def show(table: Any, folder: Path) -> None:
-    """Write all pictures and tables into a folder, and print the tables.
+    """Write all figures and tables to a folder, and print the tables.
 
     Args:
-        table: What ``matrix.run`` has returned.
-        folder: Is made if need be.
+        table: The table that ``matrix.run`` returns.
+        folder: The folder to write to; created if it is missing.
     """
     means = averaged(table)
     folder.mkdir(parents=True, exist_ok=True)

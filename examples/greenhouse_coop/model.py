@@ -1,9 +1,9 @@
-"""The domain model: a greenhouse whose plants are watered by a rule that means too well.
+"""The domain model: a greenhouse whose rule overwaters the plants.
 
-After supplement S1 of the Sim-Env paper, with its parameters and its order of events. Nothing here knows of
-reinforcement learning, of environments or of anyone who would decide otherwise than the rules below.
+This follows supplement S1 of the Sim-Env paper, with its parameters and its order of events. The model contains no
+reinforcement learning and no environments: only the rules below decide.
 
-Run on its own, it tells how the plants fare day by day::
+As a script, it prints the numbers of living and dead plants day by day::
 
     python -m examples.greenhouse_coop.model
 """
@@ -19,29 +19,29 @@ AIR_VOLUME = 2400.0  # cubic metres
 SATURATION = 0.20  # kilograms of water that a cubic metre of air can hold
 OUTSIDE_HUMIDITY = 0.6  # relative
 LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE = 15, 35  # degrees Celsius
-POT_CAPACITY = 3.0  # litres; more of it drowns the plant
+POT_CAPACITY = 3.0  # litres; more water drowns the plant
 
 
 class Greenhouse:
-    """A room full of potted plants, and the weather in it.
+    """A greenhouse with potted plants and weather.
 
-    Its random numbers are its own: houses of the same seed fare alike, whatever else goes on around them.
+    It has its own random number generator, so greenhouses with the same seed develop alike, whatever else runs.
 
     Attributes:
         pots: The plants.
-        day: How many days have gone by.
+        day: The number of past days.
         temp: Temperature in degrees Celsius.
         humidity: Relative humidity of the air inside.
-        outside_humidity: Relative humidity of the air outside, which never changes.
+        outside_humidity: Relative humidity of the air outside; constant.
         size: Volume of the air inside, in cubic metres.
-        water_use: Litres that have been poured so far.
+        water_use: Litres poured so far.
     """
 
     def __init__(self, seed: int | None = None) -> None:
-        """Furnish a greenhouse.
+        """Create a greenhouse.
 
         Args:
-            seed: Determines plants and weather; None: they are different each time.
+            seed: The seed of plants and weather; None: a new one each time.
         """
         self.random = Random(seed)
         self.pots = [Plant(self) for _ in range(PLANTS)]
@@ -54,11 +54,11 @@ class Greenhouse:
 
     @property
     def alive(self) -> int:
-        """How many plants are alive."""
+        """The number of living plants."""
         return len([plant for plant in self.pots if plant.health > 0])
 
     def update_day(self) -> None:
-        """Let a day go by."""
+        """Simulate one day."""
         self.update_temperature()
         self.update_humidity()
         self.update_air_exchange()
@@ -68,15 +68,15 @@ class Greenhouse:
         self.day += 1
 
     def update_temperature(self) -> None:
-        """Make it up to two degrees warmer or colder, within bounds."""
+        """Change the temperature by up to two degrees, within bounds."""
         temp = self.temp + int(self.random.random() * 5) - 2
         self.temp = min(max(temp, LOWEST_TEMPERATURE), HIGHEST_TEMPERATURE)
 
     def update_humidity(self) -> None:
-        """Let water evaporate from the pots into the air: the more, the warmer and the drier that is."""
+        """Let water evaporate from the pots into the air: the warmer and drier the air, the more."""
         portion = self.temp / 100 * (1 - self.humidity)
         vapour = 0.0
-        # No min() or max() where something is done for every plant: they would take half of the day's time.
+        # no min() or max() in the loop over plants, because they would take half of the run time
         for plant in self.pots:
             loss = portion * plant.water
             rest = plant.water - loss
@@ -85,19 +85,19 @@ class Greenhouse:
         self.humidity = (self.humidity * SATURATION + vapour / self.size) / SATURATION
 
     def update_air_exchange(self) -> None:
-        """Replace a fifth of the air by air from outside."""
+        """Replace a fifth of the air with outside air."""
         self.humidity = 0.8 * self.humidity + 0.2 * self.outside_humidity
 
     def choose_water_amount(self) -> float:
-        """Decide how many litres to pour today.
+        """Choose how many litres to pour today.
 
         Returns:
-            A litre for each pot, every day, which is more than any plant can take.
+            A litre per pot each day, which is more than any plant can take.
         """
         return 200
 
     def water_plants(self) -> None:
-        """Pour what was decided, in equal parts."""
+        """Pour the chosen amount, in equal parts."""
         amount = self.choose_water_amount()
         portion = amount / len(self.pots)
         for plant in self.pots:
@@ -106,19 +106,19 @@ class Greenhouse:
 
 
 class Plant:
-    """A plant in its pot.
+    """A potted plant.
 
     Attributes:
-        greenhouse: Where it stands.
+        greenhouse: The plant's greenhouse.
         water: Litres in its pot.
-        health: From 1, in full bloom, to 0, dead, from where none comes back.
+        health: From 1 (full health) to 0 (dead), which is final.
         req_water: Litres that it takes from its pot in a day.
     """
 
     __slots__ = ("__weakref__", "greenhouse", "health", "req_water", "water")
 
     def __init__(self, greenhouse: Greenhouse) -> None:
-        """Pot a plant, of a health and a thirst of its own."""
+        """Create a plant with random health and water demand."""
         draw = greenhouse.random.random
         self.greenhouse = greenhouse
         self.water = 2.0
@@ -126,7 +126,7 @@ class Plant:
         self.req_water = 0.1 + 0.3 * draw()
 
     def update_day(self) -> None:
-        """Drink, and feel better or worse for what is left in the pot."""
+        """Take water from the pot, then update the health by what is left."""
         rest = self.water - self.req_water
         self.water = rest if rest > 0 else 0.0
         self.update_health()
@@ -144,10 +144,10 @@ class Plant:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print how the plants fare."""
-    parser = argparse.ArgumentParser(description="Let the greenhouse be run by its own rules.")
-    parser.add_argument("--days", type=int, default=10, help="for how many days (default: 10)")
-    parser.add_argument("--seed", type=int, help="of plants and weather (default: different each time)")
+    """Print the numbers of living and dead plants day by day."""
+    parser = argparse.ArgumentParser(description="Run the greenhouse by its own rules.")
+    parser.add_argument("--days", type=int, default=10, help="how many days to simulate (default: 10)")
+    parser.add_argument("--seed", type=int, help="seed of plants and weather (default: a new one each time)")
     options = parser.parse_args(arguments)
     greenhouse = Greenhouse(options.seed)
     for day in range(options.days):

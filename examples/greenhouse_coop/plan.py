@@ -1,12 +1,12 @@
-"""The greenhouse, kept by plans: nothing is trained.
+"""Planning in the greenhouse, without training.
 
-``python -m examples.greenhouse_coop.plan`` (or ``make plan``) has the waterer try out nine amounts of water each day,
-in branches of a few days whose weather is drawn anew, before it pours the best of them. Once the model's own rule goes
-on in the branches, and once the best constant amount. It prints a table and draws a picture.
+``python -m examples.greenhouse_coop.plan`` (or ``make plan``) lets the waterer try out nine amounts of water each day,
+in branches of a few days with newly drawn weather, before it pours the best one. One planner continues its branches
+with the model's own rule, another with the best constant amount. The script prints a table and draws a figure.
 
-Branches run on all cores, so the greenhouses are kept one after the other. What a branch costs is mostly the start of
-its process, which is the dearer the more the process has imported: what the picture needs is imported when all
-greenhouses have been kept.
+Branches run on all cores, so the greenhouses run one after another. The cost of a branch is mostly the start of its
+process, which grows with the number of imported modules. So the script imports the plotting libraries only after all
+greenhouses have run.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from .model import PLANTS, Greenhouse
 WATERER, VENTILATOR = "waterer_0", "ventilator_0"
 
 HELD_OUT: Final = 1_000_000
-"""The greenhouses of ``make demo``: seeds from here on."""
+"""The seeds of the greenhouses of ``make demo`` start here."""
 
 LITRES: Final = tuple(range(0, 161, 20))
-"""What the waterer tries out each day."""
+"""The amounts that the waterer tries out each day, in litres."""
 
 EXCHANGES: Final = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""What the ventilator tries out, where it plans as well."""
+"""The fractions of air that the ventilator tries out, where it plans as well."""
 
 OUT: Final = Path(__file__).parent / "out"
 
@@ -44,7 +44,7 @@ OUT: Final = Path(__file__).parent / "out"
 
 @dataclass(frozen=True)
 class Constant:
-    """Chooses the same always, for one observation or for many."""
+    """A constant policy, for one observation or a batch."""
 
     value: float
 
@@ -54,37 +54,37 @@ class Constant:
 
 
 BEST: Final = {WATERER: Constant(0.084), VENTILATOR: Constant(1.0)}
-"""The best constant pair that ``make demo`` finds: 84 litres, and all of the air."""
+"""The best constant pair that ``make demo`` finds: 84 litres, and a full exchange of the air."""
 
 
 def days_left(env: Any) -> float:
-    """What is still to come, at most: each plant that is alive is worth as much as it brings if it stays so."""
+    """Return an upper bound of the future reward: all living plants stay alive until the end."""
     greenhouse: Greenhouse = env.unwrapped.simulation.greenhouse
     return greenhouse.alive / len(greenhouse.pots) * (DAYS - greenhouse.day)
 
 
 def share_alive(env: Any) -> float:
-    """What is still to come, valued too low: as if there was one more day."""
+    """Return a low estimate of the future reward: as if there were one more day."""
     greenhouse: Greenhouse = env.unwrapped.simulation.greenhouse
     return greenhouse.alive / len(greenhouse.pots)
 
 
 class CountingPlanner(RolloutPolicy):
-    """A planner that says beside each action how many days its branches have simulated, as the extra ``days``."""
+    """A planner that reports, as the extra ``days`` of each action, how many days its branches have simulated."""
 
     def __init__(self, actions: Sequence[float], horizon: int, **options: Any) -> None:
         """Make a planner.
 
         Args:
-            actions: The candidates, as numbers.
-            horizon: For how many days they are tried out.
-            **options: As ``RolloutPolicy`` takes them.
+            actions: The candidate actions, as numbers.
+            horizon: The number of days for which they are tried out.
+            **options: The options of ``RolloutPolicy``.
         """
         super().__init__([np.array([action], np.float32) for action in actions], horizon=horizon, **options)
         self._horizon = horizon
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
-        """Decide. Within a branch of another planner, where nothing is tried out, there is the action alone."""
+        """Choose an action. In a branch of another planner, this tries nothing out and returns the action alone."""
         values = self.choose(_environment)
         if not values.counts.any():
             return values.best
@@ -95,38 +95,38 @@ class CountingPlanner(RolloutPolicy):
 def water_planner(
     base: Any = RULE, horizon: int = 3, futures: int = 2, rest: Callable[[Any], float] | None = days_left
 ) -> CountingPlanner:
-    """A waterer that plans.
+    """Make a waterer that plans.
 
     Args:
-        base: What is poured in branches from the second day on: ``RULE`` or a policy.
-        horizon: For how many days an amount is tried out.
-        futures: How much weather it is tried out in, on average.
-        rest: What comes after these days.
+        base: The waterer in branches from the second day on: ``RULE`` or a policy.
+        horizon: The number of days for which an amount is tried out.
+        futures: The number of futures (draws of the weather) per amount, on average.
+        rest: The terminal value, which stands for the time after the horizon.
     """
     litres = [amount / MOST_WATER for amount in LITRES]
     return CountingPlanner(litres, horizon, base=base, futures=futures, terminal_value=rest)
 
 
 PORTIONS: Final = tuple(tenths / 10 for tenths in range(7))
-"""Litres for each pot that ``PortionPlanner`` tries out."""
+"""The litres per pot that ``PortionPlanner`` tries out."""
 
 
 @dataclass(frozen=True)
 class PortionPlanner:
-    """A waterer that plans for any number of pots: it tries out portions for a pot, for one day, in one future.
+    """A waterer that plans for any number of pots: it tries out portions per pot, for one day, in one future.
 
-    What comes after that day is ``days_left``, so that nothing but the portion itself is decided in a branch.
+    The terminal value after that day is ``days_left``, so the portion itself is the only decision in a branch.
 
     Attributes:
-        portions: What it tries out.
-        base: What is poured where it is the base of another planner.
+        portions: The portions to try out, in litres per pot.
+        base: The policy that pours where this planner is the base of another one.
     """
 
     portions: tuple[float, ...] = PORTIONS
     base: Any = RULE
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
-        """Decide."""
+        """Choose an action."""
         pots = len(_environment.simulation.greenhouse.pots)
         actions = [np.array([portion * pots / MOST_WATER], np.float32) for portion in self.portions]
         planner = RolloutPolicy(actions, base=self.base, futures=1, horizon=1, terminal_value=days_left)
@@ -134,22 +134,22 @@ class PortionPlanner:
 
 
 def air_planner(base: Any = RULE, horizon: int = 3, futures: int = 2) -> CountingPlanner:
-    """A ventilator that plans, likewise."""
+    """Make a ventilator that plans, with the arguments of ``water_planner``."""
     return CountingPlanner(EXCHANGES, horizon, base=base, futures=futures, terminal_value=days_left)
 
 
-# -- keeping greenhouses --------------------------------------------------------------------------
+# -- running greenhouses --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Kept:
-    """How greenhouses have fared.
+    """The results of greenhouses.
 
     Attributes:
-        returns: ``(seeds,)``: the return of the team, which is the ventilator's.
+        returns: ``(seeds,)``: the team's return, which is the ventilator's.
         alive: ``(seeds, days + 1)``: the plants alive at the beginning of each day and at the end.
-        poured: ``(seeds, days)``: litres.
-        simulated: Days in branches, for an episode.
+        poured: ``(seeds, days)``: the litres poured.
+        simulated: The mean number of days in branches per episode.
     """
 
     returns: NDArray[np.float64]
@@ -159,12 +159,12 @@ class Kept:
 
 
 def keep(policies: Mapping[str, Any], seeds: Sequence[int], *, progress: bool = False) -> Kept:
-    """Keep greenhouses.
+    """Run greenhouses with policies.
 
     Args:
-        policies: Who decides; ``RULE`` for those whom no policy leads.
-        seeds: Of the greenhouses.
-        progress: Whether to show a bar.
+        policies: Policies by agent; agents without one follow their rule.
+        seeds: The seeds of the greenhouses.
+        progress: Whether to show a progress bar.
     """
     team = {WATERER: RULE, VENTILATOR: RULE} | dict(policies)
     found = collect_episodes(GreenhouseSim, team, seeds=seeds, batch_size=1, progress=progress)
@@ -179,7 +179,7 @@ def keep(policies: Mapping[str, Any], seeds: Sequence[int], *, progress: bool = 
 
 
 def teams(futures: int) -> dict[str, Mapping[str, Any]]:
-    """Who is compared, by title."""
+    """Return the teams to compare, by title."""
     air = {VENTILATOR: BEST[VENTILATOR]}
     return {
         "rule": {},
@@ -190,11 +190,11 @@ def teams(futures: int) -> dict[str, Mapping[str, Any]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, Kept]:
-    """Keep greenhouses, and show how they have fared as a table and as a picture."""
-    parser = argparse.ArgumentParser(description="Keep a greenhouse by plans.")
-    parser.add_argument("--seeds", type=int, default=32, help="greenhouses to keep (default: %(default)s)")
-    parser.add_argument("--futures", type=int, default=2, help="for each amount of water (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="folder for the picture (default: beside this file)")
+    """Run greenhouses with each team, and show the results as a table and a figure."""
+    parser = argparse.ArgumentParser(description="Run a greenhouse by plans, without training.")
+    parser.add_argument("--seeds", type=int, default=32, help="number of greenhouses (default: %(default)s)")
+    parser.add_argument("--futures", type=int, default=2, help="futures per amount of water (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder for the figure (default: beside this file)")
     options = parser.parse_args(arguments)
     kept = {}
     for title, policies in teams(options.futures).items():

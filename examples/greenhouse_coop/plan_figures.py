@@ -1,7 +1,7 @@
-"""What plans of the greenhouse are worth, against what they cost and how far they reach, in pictures.
+"""Figures of the value of plans for the greenhouse, by their cost and their horizon.
 
-``python -m examples.greenhouse_coop.plan_figures`` draws ``plan-budget.png`` and ``plan-horizon.png``, and writes the
-table ``plan.md``, into ``docs/figures``. It takes some ten minutes on two cores.
+``python -m examples.greenhouse_coop.plan_figures`` writes the figures ``plan-budget.png`` and ``plan-horizon.png`` and
+the table ``plan.md`` to ``docs/figures``. It takes about ten minutes on two cores.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from .plan import (
 FIGURES: Final = Path(__file__).parents[2] / "docs" / "figures"
 
 BEST_TRAINED: Final = 84.9
-"""What the best has come to that was ever trained here: CMA-ES, by ``make demo``."""
+"""The best mean return of a trained policy: CMA-ES, by ``make demo``."""
 
 Make = Callable[[int, int], Mapping[str, Any]]
-"""Makes a team whose plans reach so far, in so many futures."""
+"""Makes a team from a horizon in days and a number of futures."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line in a picture.
+    """A line in a figure.
 
     Attributes:
-        title: What it is of.
-        make: Makes its teams.
-        style: How it is drawn.
+        title: The label of the line.
+        make: The function that makes its teams.
+        style: The style of the line, as Matplotlib's keyword arguments.
     """
 
     title: str
@@ -53,7 +53,7 @@ class Line:
 
 
 def water(base: Any, rest: Any) -> Make:
-    """Watering is planned, ventilation is at full."""
+    """Return a maker of teams with planned watering and ventilation at 100 %."""
     return lambda horizon, futures: {
         WATERER: water_planner(base, horizon, futures, rest),
         VENTILATOR: BEST[VENTILATOR],
@@ -61,7 +61,7 @@ def water(base: Any, rest: Any) -> Make:
 
 
 def both(horizon: int, futures: int) -> Mapping[str, Any]:
-    """Both are planned over the model's own rules."""
+    """Make a team in which both agents plan over the model's own rules."""
     return {WATERER: water_planner(RULE, horizon, futures), VENTILATOR: air_planner(RULE, horizon, futures)}
 
 
@@ -76,11 +76,11 @@ LINES: Final = (
 )
 
 Point = tuple[str, int, int, Kept]
-"""The title of a line, the horizon, the futures, and how the greenhouses have fared."""
+"""The title of a line, the horizon, the number of futures, and the results."""
 
 
 def sweep(lines: Sequence[Line], horizons: Sequence[int], futures: Sequence[int], seeds: Sequence[int]) -> list[Point]:
-    """Keep greenhouses with plans of each kind, and say how they fare."""
+    """Run greenhouses with plans of each kind, and print the mean returns."""
     found = []
     for line in lines:
         for horizon in horizons:
@@ -95,16 +95,16 @@ def draw(points: Sequence[Point], along: Callable[[Point], float], label: str, p
     """Draw the mean return of each line.
 
     Args:
-        points: What was found.
-        along: What a point's place is on the axis.
-        label: The axis' name.
-        path: Where to put the picture.
+        points: The results.
+        along: The function that returns a point's position on the x axis.
+        label: The label of the x axis.
+        path: The file to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # here, for no process that forks is to carry it
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # imported here, so that forks do not load it
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
     axes = figure.add_subplot()
     for line in LINES:
         own = [point for point in points if point[0] == line.title]
@@ -139,12 +139,12 @@ def table(points: Sequence[Point]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Keep greenhouses, draw both pictures and write the table."""
-    parser = argparse.ArgumentParser(description="Draw what plans are worth.")
+    """Run greenhouses, draw both figures and write the table."""
+    parser = argparse.ArgumentParser(description="Draw the value of plans by their cost and their horizon.")
     parser.add_argument("--seeds", type=int, default=3, help="greenhouses for each point (default: %(default)s)")
     parser.add_argument("--horizons", type=int, nargs="+", default=[1, 2, 3, 6, 12], metavar="DAYS")
     parser.add_argument("--futures", type=int, nargs="+", default=[1, 2, 4, 8], metavar="NUMBER")
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for it all (default: %(default)s)")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for the results (default: %(default)s)")
     options = parser.parse_args(arguments)
     seeds = range(HELD_OUT, HELD_OUT + options.seeds)
     reaching = sweep(LINES, options.horizons, [1], seeds)

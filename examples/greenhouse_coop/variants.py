@@ -1,12 +1,11 @@
-"""Variants of the greenhouse: what an experiment changes about the model, from outside and under a name.
+"""Variants of the greenhouse: named changes that an experiment makes to the model from outside.
 
-The Sim-Env paper extends its greenhouse twice. ``WARM_EXCHANGE`` is its ``new_air_exchange``: the warmer it is, the
-faster the air is exchanged. ``VENTILATED`` is what it says could be done in the same way: the air exchange becomes
-one that relies on a newly defined decision function, and so a second agent arrives by a plugin. The model, and
-environments that are made without these variants, know nothing of them. ``greenhouse`` has both of them, the number of
-plants and the climate as factors of an experiment.
+The Sim-Env paper extends its greenhouse twice. ``WARM_EXCHANGE`` is the paper's ``new_air_exchange``: the warmer it is,
+the faster the air is exchanged. ``VENTILATED`` is the extension that the paper suggests: the air exchange calls a newly
+defined decision function, so that a plugin adds a second agent. The model, and environments without these variants,
+stay unchanged. ``greenhouse`` makes the air exchange, the number of plants and the climate factors of an experiment.
 
-Run on its own, it tells how the plants fare in each variant, and what each was made of::
+As a script, the module prints the plants' numbers in each variant, and the provenance of the last one::
 
     python -m examples.greenhouse_coop.variants
 """
@@ -25,10 +24,10 @@ from .model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, OUTSIDE_HUMIDITY, PL
 from .plan import BEST, VENTILATOR
 
 AIR_EXCHANGE = f"{Greenhouse.__module__}.Greenhouse.update_air_exchange"
-"""What the plugins replace."""
+"""The function that the plugins replace."""
 
 TEMPERATURE = f"{Greenhouse.__module__}.Greenhouse.update_temperature"
-"""What the plugin of the climate replaces."""
+"""The function that the climate's plugin replaces."""
 
 
 def new_air_exchange(greenhouse: Greenhouse) -> None:
@@ -46,27 +45,27 @@ def new_air_exchange(greenhouse: Greenhouse) -> None:
     agent="ventilator_0",
 )
 def choose_air_exchange(greenhouse: Greenhouse) -> float:
-    """Decide which fraction of the air is replaced: a decision that the model does not know.
+    """Choose the fraction of air to replace: a decision that the model does not contain.
 
     Returns:
-        A fifth, as the model has it.
+        A fifth, as in the model.
     """
     return 0.2
 
 
 def decided_air_exchange(greenhouse: Greenhouse) -> None:
-    """Exchange as much air as was decided."""
+    """Exchange the chosen fraction of the air."""
     fraction = choose_air_exchange(greenhouse)
     greenhouse.humidity = (1 - fraction) * greenhouse.humidity + fraction * greenhouse.outside_humidity
 
 
 BASE = Variant("base", GreenhouseSim, points=WATERING)
-"""The model as it is, watered by an agent."""
+"""The unchanged model, watered by an agent."""
 
 WARM_EXCHANGE = Variant(
     "warm_exchange", GreenhouseSim, points=WATERING, plugins=[(new_air_exchange, AIR_EXCHANGE, "instead")]
 )
-"""Watered by an agent, while the air is exchanged the faster the warmer it is."""
+"""Watered by an agent; the warmer it is, the faster the air is exchanged."""
 
 VENTILATED = Variant(
     "ventilated",
@@ -74,32 +73,32 @@ VENTILATED = Variant(
     points={**WATERING, choose_air_exchange: None},
     plugins=[(decided_air_exchange, AIR_EXCHANGE, "instead")],
 )
-"""Two agents: one of them decides what the plugin asks."""
+"""Two agents: the waterer, and one for the plugin's decision."""
 
 
-# -- the same as factors --------------------------------------------------------------------------
+# -- variants as factors --------------------------------------------------------------------------
 
 
 def new_temperature(greenhouse: Greenhouse) -> None:
-    """Draw each day's temperature anew between its bounds, as the paper's text has it; its code lets it walk."""
+    """Draw each day's temperature uniformly between its bounds, as in the paper's text; in its code, it is a walk."""
     greenhouse.temp = greenhouse.random.randint(LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE)
 
 
 class House(GreenhouseSim):
-    """A greenhouse with any number of plants, in air of any humidity."""
+    """The simulation of a greenhouse with any number of plants and any outside humidity."""
 
     def __init__(self, plants: int = PLANTS, outside_humidity: float = OUTSIDE_HUMIDITY) -> None:
         """Make a simulation.
 
         Args:
-            plants: How many plants there are.
+            plants: The number of plants.
             outside_humidity: Relative humidity of the air outside.
         """
         super().__init__()
         self.plants, self.outside_humidity = plants, outside_humidity
 
     def reset(self, seed: int | None = None) -> None:
-        """Furnish a new greenhouse: with the model's own plants, fewer of them, or some more."""
+        """Create a new greenhouse: with the model's own plants, fewer of them, or additional ones."""
         super().reset(seed)
         greenhouse = self.greenhouse
         del greenhouse.pots[self.plants :]
@@ -119,14 +118,14 @@ EXCHANGES: Final[Mapping[str, Variant]] = {
     "warm": WARM_EXCHANGE,
     "decided": replace(VENTILATED, policies={VENTILATOR: BEST[VENTILATOR]}),
 }
-"""What becomes of the air: a fixed fifth of it is exchanged; more on warm days; or what was decided, which is all."""
+"""The air exchange: a fixed fifth of the air; more on warm days; or a decision, here for all of the air."""
 
 
 def greenhouse(plants: int, climate: str, exchange: str) -> Variant:
-    """Make the greenhouse of a row of an experiment.
+    """Make the variant for a row of an experiment.
 
     Args:
-        plants: How many plants there are.
+        plants: The number of plants.
         climate: One of ``CLIMATES``.
         exchange: One of ``EXCHANGES``.
     """
@@ -142,7 +141,7 @@ def greenhouse(plants: int, climate: str, exchange: str) -> Variant:
 
 
 def main() -> None:
-    """Print how the plants fare in each variant with its rules, and what the last one was made of."""
+    """Print the plants' numbers in each variant with its rules, and the provenance of the last one."""
     for variant in (BASE, WARM_EXCHANGE, VENTILATED):
         print(f"{variant.name:15}", simulate(variant, seed=1).render("ansi"))
     print(json.dumps(provenance(VENTILATED, seed=1), indent=2))

@@ -8,20 +8,20 @@ import java.util.SplittableRandom;
 import simenv.SimEnv;
 
 /**
- * A market town, week by week. Farms sow wheat and sell the harvest to a granary; shops bake bread of it and sell that
- * to households. Those that run out of money give up, and where there is something to earn others begin.
+ * A market town, in weekly steps. Farms sow wheat and sell the harvest to a granary; shops bake bread from it and sell
+ * the bread to households. Farms and shops that run out of money give up, and new ones enter while there are profits.
  *
- * <p>Two kinds of decisions: how much a farm sows, some weeks before it is known what the harvest will be worth, and at
- * what price a shop sells its bread.
+ * <p>There are two kinds of decisions: how much a farm sows, some weeks before the price of the harvest is known, and
+ * at what price a shop sells its bread.
  */
 public final class Market {
     static final List<String> POINTS = List.of("farm.sow", "shop.price");
     static final int HOUSEHOLDS = 80;
     static final int GROWING = 4; // weeks
     static final int MOST = 20; // farms, shops, and plots of a farm
-    static final double PLOT = 1.5; // what seed for one costs
-    static final double UPKEEP = 4; // of a farm, a week
-    static final double RENT = 8; // of a shop, a week
+    static final double PLOT = 1.5; // the price of seed for a plot
+    static final double UPKEEP = 4; // of a farm, per week
+    static final double RENT = 8; // of a shop, per week
 
     private static Market running;
 
@@ -87,7 +87,7 @@ public final class Market {
         return new SimEnv.End(result, !shops.isEmpty());
     }
 
-    /** Every household looks into two shops, and buys where bread is cheaper, if it can. */
+    /** Each household visits two shops, and buys a loaf at the cheaper one, if it can. */
     private void sell() {
         for (int i = 0; i < HOUSEHOLDS; i++) {
             double budget = chance.nextDouble(1.2, 3.5);
@@ -102,7 +102,7 @@ public final class Market {
         }
     }
 
-    /** Where there is something to earn, others try. */
+    /** New farms and shops enter while there are profits. */
     private void begin() {
         if (farms.size() < MOST && wheatPrice > 0.9 && chance.nextDouble() < 0.2) {
             farms.add(new Farm());
@@ -131,7 +131,7 @@ public final class Market {
         }
     }
 
-    /** Sows, waits for the harvest, sells it, and sows again. */
+    /** A farm, which sows, waits for the harvest, sells it, and sows again. */
     private final class Farm {
         final String name = "farm_" + ++founded;
         double money = 60;
@@ -153,12 +153,12 @@ public final class Market {
             ripe = week + GROWING;
         }
 
-        /** How many plots to sow. */
+        /** Chooses the number of plots to sow. */
         int sow() {
             return SimEnv.decideInt("farm.sow", name, this::look, this::sowByRule);
         }
 
-        /** Takes it that wheat will be worth what it is worth today. */
+        /** Expects today's price of wheat for the harvest. */
         int sowByRule() {
             return (int) Math.min(MOST, Math.max(0, 40 * (wheatPrice - PLOT / 4) - 6));
         }
@@ -178,12 +178,12 @@ public final class Market {
         }
 
         void earn(double amount) {
-            money = Math.min(150, money + amount); // what is more, the family spends
+            money = Math.min(150, money + amount); // the family spends the surplus
             earned += amount;
         }
     }
 
-    /** Bakes about as much as it has sold, and finds a price for it. */
+    /** A shop, which bakes about as much as it sold last, and adapts its price. */
     private final class Shop {
         final String name = "shop_" + ++founded;
         double money = 40;
@@ -207,12 +207,12 @@ public final class Market {
             earn(-baked * cost);
         }
 
-        /** At what price to sell. */
+        /** Chooses the price of a loaf. */
         double choosePrice() {
             return SimEnv.decideDouble("shop.price", name, this::look, this::priceByRule);
         }
 
-        /** Asks for more where all was sold, for less where much was not. */
+        /** Raises the price if all loaves were sold, lowers it if many were not. */
         double priceByRule() {
             double change = sold == baked ? 1.04 : sold < 0.8 * baked ? 0.96 : 1;
             return Math.max(1.1 * wheatPrice, change * price);
@@ -237,7 +237,7 @@ public final class Market {
         }
 
         void earn(double amount) {
-            money = Math.min(100, money + amount); // what is more, the owner spends
+            money = Math.min(100, money + amount); // the owner spends the surplus
             earned += amount;
         }
     }

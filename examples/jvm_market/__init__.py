@@ -1,1 +1,1 @@
-"""A market town in Java: a model beyond a pair of pipes, as environments."""
+"""A market town in Java: environments from a model in another process, connected by pipes."""

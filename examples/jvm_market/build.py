@@ -1,4 +1,4 @@
-"""What turns the sources in Java into classes, or says what is missing for it."""
+"""Compile the Java sources, or report what is missing."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from typing import Final
 HERE: Final = Path(__file__).parent
 
 CLIENT: Final = HERE.parents[1] / "clients" / "java" / "SimEnv.java"
-"""The client, which every model in Java is compiled with."""
+"""The client, which every Java model is compiled with."""
 
 SOURCES: Final = (CLIENT, *sorted(HERE.glob("*.java")))
-"""Those of this example."""
+"""The sources of this example."""
 
 OUT: Final = HERE / "out"
-"""Where its classes are."""
+"""The folder of its classes."""
 
 VERSION: Final = 17
-"""The oldest Java that serves."""
+"""The oldest supported version of Java."""
 
 
 def java() -> tuple[str, str]:
-    """Find the commands that run and compile Java.
+    """Find the commands ``java`` and ``javac``.
 
     Returns:
-        Both.
+        The paths of both.
 
     Raises:
-        RuntimeError: One is missing, or too old.
+        RuntimeError: A command is missing or too old.
     """
     remedy = f"install a JDK of version {VERSION} or newer (Debian: apt-get install openjdk-17-jdk-headless)"
     found = []
@@ -42,27 +42,27 @@ def java() -> tuple[str, str]:
             raise RuntimeError(f"{name} is not found on the PATH; {remedy}")
         found.append(command)
     said = subprocess.run([found[1], "-version"], capture_output=True, text=True, timeout=60)
-    version = (said.stdout + said.stderr).removeprefix("javac ").strip()  # older ones say it on stderr
+    version = (said.stdout + said.stderr).removeprefix("javac ").strip()  # older versions print it to stderr
     if not version.split(".")[0].isdecimal() or int(version.split(".")[0]) < VERSION:
         raise RuntimeError(f"{found[1]} is of version {version}; {remedy}")
     return found[0], found[1]
 
 
 def build(out: Path = OUT, sources: Iterable[Path] = SOURCES) -> Path:
-    """Compile sources, unless they are compiled already.
+    """Compile sources, unless the classes are up to date.
 
     Args:
         out: The folder of the classes.
-        sources: All files.
+        sources: The source files.
 
     Returns:
-        The folder.
+        The folder of the classes.
 
     Raises:
-        RuntimeError: There is no JDK, or the sources do not compile; with the words of the compiler.
+        RuntimeError: There is no JDK, or the sources do not compile; the message contains the compiler's output.
     """
     sources = list(sources)
-    with sources[0].open() as locked:  # for those that want to build it at the same time
+    with sources[0].open() as locked:  # parallel builds wait here
         fcntl.flock(locked, fcntl.LOCK_EX)
         done = out / "done"
         if not done.exists() or done.stat().st_mtime < max(source.stat().st_mtime for source in sources):
@@ -71,7 +71,7 @@ def build(out: Path = OUT, sources: Iterable[Path] = SOURCES) -> Path:
 
 
 def _compile(sources: list[Path], out: Path) -> None:
-    """Compile, and take the classes into use when they are whole."""
+    """Compile, and move the classes into place once they are complete."""
     _, javac = java()
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".java-") as folder:

@@ -1,17 +1,16 @@
-"""A market town in Java as environments: what farms sow and what shops ask for bread become decisions of agents.
+"""Environments made from a market town in Java: farms decide how much to sow, shops decide on their price of bread.
 
-The model, ``Market.java``, keeps its own main loop in a JVM of its own, in which farms and shops begin and give up. It
-knows the client ``clients/java/SimEnv.java`` and nothing else of environments, and runs without them: ``java
-market.Market 7``.
+The model, ``Market.java``, has its own main loop in its own JVM; farms and shops enter and leave the market. The client
+``clients/java/SimEnv.java`` is its only connection to environments, and it runs without them: ``java market.Market 7``.
 
 - ``market``: the simulation.
-- ``plain``: what comes out of the model where it runs without an environment.
-- ``raw_env`` and ``env``: all farms and shops, as a PettingZoo AEC environment, bare and in PettingZoo's wrapper.
+- ``plain``: the result of the model when it runs without an environment.
+- ``raw_env`` and ``env``: all farms and shops, as a PettingZoo AEC environment, without and with PettingZoo's wrapper.
 - ``parallel_env``: the same as a PettingZoo parallel environment.
 
-Farms (``farm_1``, ...) sow some plots of wheat every fourth week, a ``Discrete``; shops (``shop_9``, ...) set a price
-every week, a ``Box``. Each is rewarded with what it has earned since its last decision. The episode is truncated after
-two years, and ends when there is no shop any more.
+Farms (``farm_1``, ...) choose a number of plots of wheat every fourth week, a ``Discrete``; shops (``shop_9``, ...) set
+a price every week, a ``Box``. The reward of each is its earnings since its last decision. The episode is truncated
+after two years, and terminates when no shop is left.
 """
 
 from __future__ import annotations
@@ -32,32 +31,32 @@ from simenv_marl import Definition, ProcessSimulation, SimulationAECEnv, Simulat
 from .build import build, java
 
 WEEKS: Final = 104
-"""After how many weeks an episode is truncated."""
+"""The number of weeks after which an episode is truncated."""
 
 PLOTS: Final = 20
-"""How many a farm has."""
+"""The number of plots of a farm."""
 
 PRICES: Final = (0.5, 4.0)
-"""The least and the most that a loaf may cost."""
+"""The lowest and the highest price of a loaf."""
 
 SOW, PRICE = "farm.sow", "shop.price"
-"""The decision points, as the model names them."""
+"""The decision points, with the model's names."""
 
-# -- what is observed, decided and rewarded -------------------------------------------------------
+# -- observations, actions, rewards ---------------------------------------------------------------
 
 
 def farm_sees(c: Any) -> NDArray[np.float32]:
-    """Its money, its plots last time, what wheat is worth, what is in the granary, and how many farms there are."""
+    """Observe a farm's money and plots last time, the price of wheat, the granary's stock, and the number of farms."""
     return np.array([c.money, c.plots, c.wheat_price, c.granary, c.farms], np.float32)
 
 
 def shop_sees(c: Any) -> NDArray[np.float32]:
-    """Its money, its last price, what it has baked and sold then, what wheat is worth, and how many shops there are."""
+    """Observe a shop's money, last price, loaves baked and sold, the price of wheat, and the number of shops."""
     return np.array([c.money, c.price, c.baked, c.sold, c.wheat_price, c.shops], np.float32)
 
 
 def points() -> dict[str, Definition]:
-    """Define both decision points, for ``points=``."""
+    """Return the definitions of both decision points, for ``points=``."""
     return {
         SOW: make_step(
             observation_space=Box(-1e3, 1e4, (5,), np.float32),
@@ -82,13 +81,13 @@ def points() -> dict[str, Definition]:
 
 
 def command(weeks: int = WEEKS) -> list[str]:
-    """Say how the model is started, and compile it where it is not yet.
+    """Return the command that starts the model, and compile the model if necessary.
 
     Args:
-        weeks: After how many an episode is truncated.
+        weeks: The number of weeks after which an episode is truncated.
 
     Returns:
-        The program and its arguments. The JVM is kept small, as there may be many of them.
+        The program and its arguments. The JVM's memory is small, as there may be many JVMs.
 
     Raises:
         RuntimeError: There is no JDK.
@@ -98,10 +97,10 @@ def command(weeks: int = WEEKS) -> list[str]:
 
 
 def market(weeks: int = WEEKS) -> ProcessSimulation:
-    """Make the simulation; the attribute ``result`` of it is what came out of its last episode.
+    """Make the simulation; its attribute ``result`` holds the result of the last episode.
 
     Args:
-        weeks: After how many an episode is truncated.
+        weeks: The number of weeks after which an episode is truncated.
     """
     return ProcessSimulation(command(weeks), points())
 
@@ -110,11 +109,11 @@ def plain(seed: int, weeks: int = WEEKS) -> dict[str, Any]:
     """Run the model without an environment.
 
     Args:
-        seed: Of its generator.
-        weeks: After how many it ends.
+        seed: The seed of the model.
+        weeks: The number of weeks after which the run is truncated.
 
     Returns:
-        ``truncated`` and ``result``, with all digits.
+        ``truncated`` and ``result``, in full precision.
     """
     said = subprocess.run([*command(weeks), str(seed)], capture_output=True, check=True, timeout=60)
     ended: dict[str, Any] = json.loads(said.stdout)
@@ -128,14 +127,14 @@ def raw_env(weeks: int = WEEKS, **options: Any) -> SimulationAECEnv:
     """Make the AEC environment of all farms and shops.
 
     Args:
-        weeks: After how many an episode is truncated.
-        **options: As of ``simenv_marl.aec_env``.
+        weeks: The number of weeks after which an episode is truncated.
+        **options: The options of ``simenv_marl.aec_env``.
     """
     return simenv_marl.aec_env(market(weeks), **options)
 
 
 def env(weeks: int = WEEKS, **options: Any) -> pettingzoo.AECEnv:
-    """Make the same in PettingZoo's wrapper."""
+    """Make the same environment in PettingZoo's wrapper."""
     return OrderEnforcingWrapper(raw_env(weeks, **options))
 
 
@@ -143,7 +142,7 @@ def parallel_env(weeks: int = WEEKS, **options: Any) -> SimulationParallelEnv:
     """Make the parallel environment of all farms and shops.
 
     Args:
-        weeks: After how many an episode is truncated.
-        **options: As of ``simenv_marl.parallel_env``.
+        weeks: The number of weeks after which an episode is truncated.
+        **options: The options of ``simenv_marl.parallel_env``.
     """
     return simenv_marl.parallel_env(market(weeks), **options)

@@ -1,1 +1,1 @@
-"""Senders in ns-3 that share a bottleneck, and learn at which rate to send."""
+"""Senders in ns-3 that share a bottleneck and learn their sending rates."""

@@ -1,20 +1,20 @@
-"""Senders in a simulated network, each of which is an agent: the simulator is ns-3, a process of its own.
+"""Environments made from senders in a simulated network: each sender is an agent. The simulator is ns-3, in C++.
 
-``senders.cpp`` is the model, and knows nothing of environments: who sends decides on a rate where an acknowledgement or
-a timer says so, by a rule like TCP's. It asks through the client ``clients/cpp/simenv.hpp``.
+``senders.cpp`` is the model, which runs in a process of its own and does not depend on environments: at an
+acknowledgement or a timeout, a sender chooses its rate by a rule like TCP's. The model asks for decisions through the
+client ``clients/cpp/simenv.hpp``.
 
 - ``program``: the compiled model.
 - ``senders``: the simulation.
-- ``raw_env`` and ``parallel_env``: its PettingZoo environments.
+- ``raw_env`` and ``parallel_env``: the PettingZoo environments.
 
-**What a sender decides.** By what to multiply its rate, up to twice and down to half of it: the power of two that is
-its action.
+**Actions.** A sender chooses the factor of its rate, from one half to two: the action is its exponent to base two.
 
-**What it sees.** Its rate; how much longer the latest round trip took than the shortest so far; which share of the
-packets was lost that were sent at this rate; whether it was a timer that went off.
+**Observations.** A sender sees its rate, the ratio of the latest round-trip time to the shortest so far, the share of
+lost packets among those sent at this rate, and whether the decision comes from a timeout.
 
-**What it is rewarded for.** Each second brings the logarithm of what arrives, so that a share that goes from the rich
-to the poor is a gain; and each 0.1 s for which packets have to queue costs as much as to halve that.
+**Rewards.** Each second brings the logarithm of the throughput, so that capacity that moves from a fast sender to a
+slow one is a gain. Each 0.1 s of queueing delay costs as much as half the throughput.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MODULES: Final = ("ns3-internet", "ns3-point-to-point", "ns3-traffic-control")
 
 
 def missing() -> str:
-    """What is not installed that compiling the model takes; empty where nothing is missing."""
+    """Name the missing tools and libraries for compiling the model; empty if nothing is missing."""
     tools = [tool for tool in ("g++", "pkg-config") if shutil.which(tool) is None]
     if tools:
         return f"{' and '.join(tools)} (Debian: apt-get install g++ pkg-config)"
@@ -53,16 +53,16 @@ def missing() -> str:
 
 
 def program(folder: Path = HERE / "out") -> Path:
-    """Compile the model, where it was not or has changed since.
+    """Compile the model, unless the program is up to date.
 
     Args:
-        folder: Where the program lies.
+        folder: The folder of the program.
 
     Returns:
-        The program.
+        The path of the program.
 
     Raises:
-        RuntimeError: Something is missing, or it does not compile.
+        RuntimeError: A tool or library is missing, or the model does not compile.
     """
     target = folder / "senders"
     if target.exists() and all(source.stat().st_mtime < target.stat().st_mtime for source in SOURCES):
@@ -72,7 +72,7 @@ def program(folder: Path = HERE / "out") -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     command = ["pkg-config", "--cflags", "--libs", *MODULES]
     flags = shlex.split(subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout)
-    made = folder / f"senders.{os.getpid()}"  # which takes its place when it is whole
+    made = folder / f"senders.{os.getpid()}"  # takes its place once it is complete
     command = ["g++", "-std=c++17", "-O2", f"-I{SOURCES[1].parent}", str(SOURCES[0]), *flags, "-o", str(made)]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=600)
     if done.returncode:
@@ -80,7 +80,7 @@ def program(folder: Path = HERE / "out") -> Path:
     return made.replace(target)
 
 
-# -- what is observed, decided and rewarded -------------------------------------------------------
+# -- observations, actions, rewards ---------------------------------------------------------------
 
 OBSERVED: Final = (
     "the rate: how often 1 Mbit/s has to be doubled",
@@ -91,13 +91,13 @@ OBSERVED: Final = (
 
 
 def observe(call: Any) -> NDArray[np.float32]:
-    """Observe what ``OBSERVED`` lists."""
+    """Observe a sender, as ``OBSERVED`` lists it."""
     values = np.log2(call.rate / 1e6), np.log2(call.rtt / call.least_rtt), call.loss, call.timer
     return np.array(values, np.float32)
 
 
 def to_factor(action: Any) -> float:
-    """What an action decides: by what to multiply the rate."""
+    """Map an action to a factor of the rate."""
     return float(2.0 ** np.asarray(action, float).item())
 
 
@@ -105,7 +105,7 @@ _elapsed = difference(attrgetter("time"))
 
 
 def reward(call: Any) -> float:
-    """What the time since the sender's latest decision was worth to it."""
+    """Compute the reward for the time since the sender's previous decision."""
     arrived = call.rate * (1 - call.loss)
     queueing = call.rtt - call.least_rtt
     return float(_elapsed(call) * (math.log2(1 + arrived / 1e5) - 10 * queueing))
@@ -121,22 +121,22 @@ POINTS: Final[dict[str, Definition]] = {
         agent=attrgetter("entity"),
     )
 }
-"""The decision point of the model, and what it is to an environment."""
+"""The decision point of the model, with its definition."""
 
 
 # -- environments ---------------------------------------------------------------------------------
 
 
 def senders() -> ProcessSimulation:
-    """The simulation. Options of ``reset``: ``seconds`` of simulated time, and how many ``hosts`` there are."""
+    """Make the simulation. Options of ``reset``: the simulated ``seconds``, and the number of ``hosts``."""
     return ProcessSimulation([str(program())], POINTS)
 
 
 def raw_env(**options: Any) -> SimulationAECEnv:
-    """All senders, one after the other as they decide: an AEC environment."""
+    """Make the AEC environment, in which senders decide one after another."""
     return aec(senders, **options)
 
 
 def parallel_env(**options: Any) -> SimulationParallelEnv:
-    """All senders, in rounds: a parallel environment."""
+    """Make the parallel environment, in which senders decide in rounds."""
     return parallel(senders, **options)

@@ -1,10 +1,11 @@
-// Senders that share a bottleneck, simulated by ns-3. They join and leave; each decides on its rate when an
-// acknowledgement or a timer says so.
+// Senders that share a bottleneck, simulated with ns-3. Senders join and leave; each chooses its rate at
+// acknowledgements and timeouts.
 //
-//     senders [SEED [OPTIONS]]      e.g. senders 7 '{"seconds": 20}', which prints the result
+//     senders [SEED [OPTIONS]]      prints the result, e.g. senders 7 '{"seconds": 20}'
 //
-// Each sender has a host of its own, with a link of its own delay to a router. A link leads from there to the receiver,
-// who acknowledges each packet. Its rate changes every few seconds, and its queue drops what does not fit in.
+// Each sender has its own host, with a link to a router; each of these links has another delay. The bottleneck is the
+// link from the router to the receiver, which acknowledges each packet. The bottleneck's rate changes every few
+// seconds, and its queue drops packets when it is full.
 
 #include <ns3/core-module.h>
 #include <ns3/internet-module.h>
@@ -28,9 +29,9 @@ namespace {
 constexpr const char* POINT = "sender.rate";
 constexpr uint32_t PACKET = 1000;                                          // bytes
 constexpr double FIRST_RATE = 2e5, LOWEST_RATE = 2e4, HIGHEST_RATE = 1e7;  // bit/s
-constexpr double PATIENCE = 0.3;  // seconds without an acknowledgement, and a timer goes off
+constexpr double PATIENCE = 0.3;  // the timeout: seconds without an acknowledgement
 
-/// What is told of an episode: a sum over all that is done, in which no difference can hide; and delays.
+/// The record of an episode: a checksum over all events, which reveals any difference, and queueing delays.
 class Record {
   public:
     template <class T> void Add(const T& value) {
@@ -53,13 +54,13 @@ class Record {
     int m_acknowledged = 0;
 };
 
-/// What stands in each packet, and comes back in its acknowledgement.
+/// The header of each packet, which its acknowledgement returns.
 struct Stamp {
     uint32_t number;
     double sent;
 };
 
-/// Sends at a rate, and changes it.
+/// A sender, which adapts its rate.
 class Sender {
   public:
     Sender(simenv::Client& client, Record& record, std::string name, Ptr<Node> host, const Address& receiver)
@@ -80,7 +81,7 @@ class Sender {
     }
     Sender(const Sender&) = delete;
 
-    /// Tells how it fares, where it will not be asked again.
+    /// Reports the final state, after the last decision.
     void Tell() const { m_client.update(POINT, m_name, [&] { return State(false); }, Simulator::Now().GetSeconds()); }
 
   private:
@@ -100,7 +101,7 @@ class Sender {
             m_least = std::min(m_least, m_rtt);
             m_record.Acknowledged(stamp.sent, m_rtt, m_least);
             if (stamp.number < m_mark) continue;
-            m_lost += stamp.number - std::max(m_expected, m_mark);  // nothing overtakes on this way
+            m_lost += stamp.number - std::max(m_expected, m_mark);  // packets stay in order on this path
             m_expected = stamp.number + 1;
             ++m_arrived;
             if (stamp.sent >= m_decided + m_rtt) Decide(false);
@@ -148,7 +149,7 @@ class Sender {
     uint32_t m_sent = 0, m_expected = 0, m_mark = 0, m_lost = 0, m_arrived = 0;
 };
 
-/// The network, and who comes and goes in it.
+/// The network, and the senders that join and leave it.
 class Network {
   public:
     Network(simenv::Client& client, const simenv::Episode& episode)
@@ -188,7 +189,7 @@ class Network {
             if (sender) sender->Tell();
     }
 
-    /// Draws the chance that lies ahead anew.
+    /// Seeds all future random draws.
     void Seed(uint64_t seed) {
         RngSeedManager::SetRun(seed);
         int64_t stream = 0;
@@ -208,7 +209,7 @@ class Network {
     Ipv4InterfaceContainer Addresses(Ipv4AddressHelper& addresses, const NetDeviceContainer& devices) {
         const Ipv4InterfaceContainer interfaces = addresses.Assign(devices);
         addresses.NewNetwork();
-        TrafficControlHelper().Uninstall(devices);  // the devices' own queues are all that there is
+        TrafficControlHelper().Uninstall(devices);  // only the devices' own queues remain
         return interfaces;
     }
 

@@ -1,9 +1,9 @@
-"""One policy for all senders, trained against the rule of the model.
+"""Train one shared policy for all senders, and compare it with the model's rule.
 
-``python -m examples.ns3_senders.train`` compiles the model, trains a linear policy by evolution (CMA-ES), and lets it
-meet the model's rule on seeds that neither was chosen by. It takes a few minutes on two cores.
+``python -m examples.ns3_senders.train`` compiles the model, trains a linear policy by evolution (CMA-ES), and compares
+it with the model's rule on held-out seeds. It takes a few minutes on two cores.
 
-The same options bring the same result, on any number of processes.
+The same options give the same result, with any number of processes.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ POINT: Final = next(iter(POINTS))
 GENERATIONS, POPULATION, EPISODES_EACH = 20, 10, 8
 
 HELD_OUT: Final = 1_000_000
-"""Seeds from here on are for the final comparison; all others may be learnt from."""
+"""Seeds from this number on are for the final comparison; those below it are for learning."""
 
 
 @dataclass(frozen=True)
 class Linear:
-    """Weighs what a sender sees; the hyperbolic tangent makes an action of the sum.
+    """A linear policy: the hyperbolic tangent turns a weighted sum of the observation into an action.
 
     Attributes:
-        weights: One for each part of the observation, and one more.
+        weights: One weight for each number of the observation, then a constant.
     """
 
     weights: tuple[float, ...]
@@ -49,7 +49,7 @@ class Linear:
 def compare(
     contenders: dict[str, dict[str, Linear]], seeds: Any, workers: int, baseline: str | None = None
 ) -> Evaluation:
-    """Have policies meet the same seeds."""
+    """Compare policies on the same seeds."""
     metrics = {name: lambda simulation, name=name: simulation.result[name] for name in ("megabits", "queueing")}
     return evaluate(senders, contenders, seeds=seeds, metric=metrics, workers=workers, baseline=baseline)
 
@@ -58,10 +58,10 @@ def learn(generations: int, workers: int, seed: int = 0, episodes: int = EPISODE
     """Train a policy.
 
     Args:
-        generations: For how long.
-        workers: In how many processes.
-        seed: Draws everything that is drawn.
-        episodes: By how many each candidate of a generation is judged.
+        generations: The number of generations.
+        workers: The number of processes.
+        seed: The seed of the training.
+        episodes: The number of episodes per candidate.
     """
     rng = np.random.default_rng(seed)
 
@@ -76,11 +76,11 @@ def learn(generations: int, workers: int, seed: int = 0, episodes: int = EPISODE
 
 
 def main() -> None:
-    """The command line."""
+    """Train a policy, and print the comparison."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--generations", type=int, default=GENERATIONS, help="for how long to train (%(default)s)")
-    parser.add_argument("--seeds", type=int, default=64, help="how many for the comparison (%(default)s)")
-    parser.add_argument("--workers", type=int, default=2, help="in how many processes (%(default)s)")
+    parser.add_argument("--generations", type=int, default=GENERATIONS, help="generations of training (%(default)s)")
+    parser.add_argument("--seeds", type=int, default=64, help="seeds for the comparison (%(default)s)")
+    parser.add_argument("--workers", type=int, default=2, help="number of processes (%(default)s)")
     arguments = parser.parse_args()
     program()
     policy = learn(arguments.generations, arguments.workers)

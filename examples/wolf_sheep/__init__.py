@@ -1,1 +1,1 @@
-"""Mesa's wolves and sheep, unmodified, with one policy that all sheep share."""
+"""Mesa's unmodified wolf-sheep model, with one policy shared by all sheep."""

@@ -1,28 +1,29 @@
-"""Mesa's model of wolves, sheep and grass, as it stands in the package: where a sheep goes becomes its decision.
+"""Environments made from Mesa's own model of wolves, sheep and grass: each sheep decides where to go.
 
-Nothing in the model is changed or decorated; ``Sheep.move`` is named as a decision point from here, and each sheep is
-an agent, from its birth to its death. The wolves, and all else about the sheep, follow the model.
+The model is unchanged and undecorated. This module names ``Sheep.move`` as a decision point, and each sheep is an
+agent from its birth to its death. The wolves, and the rest of the sheep's behaviour, follow the model.
 
-- ``Meadow``: the simulation, some ticks of the model with Mesa's default parameters.
-- ``sheep_points``: the decision point, for sheep that see so and so far.
-- ``numbers``: how many sheep, wolves and grown patches of grass there were after each tick.
+- ``Meadow``: the simulation: the model over a number of ticks, with Mesa's default parameters.
+- ``sheep_points``: the decision point, for sheep with a given range of sight.
+- ``numbers``: the numbers of sheep, wolves and grown patches of grass after each tick.
 
-**What a sheep decides.** It has to go to one of the four cells beside its own, as by the model's rule. (By the rule it
-stays where it is if there are wolves on all four; a sheep that is sent cannot.)
+**Actions.** A sheep goes to one of the four neighbouring cells, as by the model's rule. (By the rule it stays where it
+is if there are wolves on all four; the actions do not include staying.)
 
-**What it sees.** Its energy, and of each cell up to ``sight`` steps away, its own included: whether the grass is
-grown, how many wolves stand there, and how many other sheep. The rule looks one step far. But wolves move after all
-sheep have, to a cell beside theirs: whether a sheep is eaten depends on the wolves that are beside it once it has
-moved, and those may be two steps away before.
+**Observations.** A sheep sees its energy, and for each cell up to ``sight`` steps away, its own included: whether the
+grass is grown, the number of wolves, and the number of other sheep. The rule looks one step ahead. But wolves move
+after all sheep, to a neighbouring cell: the danger comes from wolves next to a sheep after its move, which may be two
+steps away before it.
 
-**What it is rewarded for.** Each turn that it has lived to see is worth 1, the last included. That is all there is to
-its success in this model: in each tick that it survives it has the same chance of a lamb, so who lives longest has
-most offspring. Energy is not rewarded, being only a means: a lamb, which takes half of it, would be a punishment. As
-the reward never varies, everything depends on how a trajectory ends. One that death has ended is worth nothing any
-more; one that the last tick cuts off would have gone on, and has to be valued by what the sheep then sees.
+**Rewards.** Each turn of a sheep's life brings a reward of 1, the last turn included. This measures success in this
+model: a sheep has the same chance of a lamb in each tick that it survives, so the longest lives bring the most
+offspring. Energy is only a means and brings no reward: otherwise a lamb, which takes half of it, would be a punishment.
+As the reward is constant, everything depends on how a trajectory ends. After a death (termination), the value is zero.
+After the last tick (truncation), the sheep would have lived on, so its last observation determines the value
+(bootstrapping).
 
-The reward is each sheep's own. Whether the herd fares well if each of them looks after itself is not said thereby: what
-one has eaten, the others lack.
+The reward is individual. It does not imply that the herd does well if each sheep maximises its own reward: what one
+sheep eats, the others cannot.
 """
 
 from __future__ import annotations
@@ -39,26 +40,26 @@ from numpy.typing import NDArray
 from simenv_marl import TRUNCATED, Definition, SimulationInterface, make_step, reseed_generators
 
 TICKS: Final = 200
-"""After how many ticks an episode is truncated."""
+"""The number of ticks after which an episode is truncated."""
 
 SIGHT: Final = 2
-"""How many steps a sheep can see."""
+"""The range of a sheep's sight, in steps."""
 
 DIRECTIONS: Final = ((-1, 0), (0, 1), (1, 0), (0, -1))
-"""Where each action leads."""
+"""The step of each action."""
 
 MOVE: Final = "mesa.examples.advanced.wolf_sheep.agents.Sheep.move"
 """The decision point."""
 
-# -- what is observed, decided and rewarded -------------------------------------------------------
+# -- observations, actions, rewards ---------------------------------------------------------------
 
 
 @cache
 def ways(sight: int) -> tuple[tuple[int, tuple[int, int]], ...]:
-    """The ways to the cells that are seen: for each but the own one, the number of the cell before it, and a step."""
+    """List the paths to the visible cells: for each but the own one, the index of the previous cell, and a step."""
     found = [(0, 0)]
     steps = []
-    for number, (row, column) in enumerate(found):  # which grows meanwhile: the nearest are found first
+    for number, (row, column) in enumerate(found):  # the list grows in the loop: a breadth-first search
         for direction in DIRECTIONS:
             cell = (row + direction[0], column + direction[1])
             if abs(cell[0]) + abs(cell[1]) <= sight and cell not in found:
@@ -69,7 +70,7 @@ def ways(sight: int) -> tuple[tuple[int, tuple[int, int]], ...]:
 
 @cache
 def cells(sight: int) -> tuple[tuple[int, int], ...]:
-    """Where the cells lie that are seen, in the order in which they are observed: the own cell, then by distance."""
+    """List the visible cells as offsets, in the order of the observation: the own cell, then by distance."""
     found = [(0, 0)]
     for number, direction in ways(sight):
         found.append((found[number][0] + direction[0], found[number][1] + direction[1]))
@@ -77,7 +78,7 @@ def cells(sight: int) -> tuple[tuple[int, int], ...]:
 
 
 def look(sheep: Any, sight: int = SIGHT) -> NDArray[np.float32]:
-    """Observe its energy; for each of its ``cells`` the grass, for each the wolves, for each the other sheep."""
+    """Observe the sheep's energy, then the grass of all ``cells``, then their wolves, then their other sheep."""
     around = [sheep.cell]
     for number, direction in ways(sight):
         around.append(around[number].connections[direction])
@@ -114,7 +115,7 @@ def sheep_moves(sight: int = SIGHT) -> Definition:
 
 
 def sheep_points(sight: int = SIGHT) -> dict[Any, Definition]:
-    """The decision point of sheep that see so and so far, for ``points=``."""
+    """Return the decision point of sheep with a given range of sight, for ``points=``."""
     return {MOVE: sheep_moves(sight)}
 
 
@@ -122,25 +123,25 @@ def sheep_points(sight: int = SIGHT) -> dict[Any, Definition]:
 
 
 class Meadow(SimulationInterface):
-    """Some ticks of wolves and sheep.
+    """The wolf-sheep model over a number of ticks.
 
     Attributes:
-        model: Mesa's model, of the present episode.
-        ticks: For how long it runs.
-        only_with_sheep: Whether it ends when there are no sheep any more.
-        parameters: What is to be different from Mesa's defaults.
+        model: Mesa's model in the current episode.
+        ticks: The number of ticks after which an episode is truncated.
+        only_with_sheep: Whether an episode ends when the last sheep dies.
+        parameters: The parameters that differ from Mesa's defaults.
     """
 
     points = sheep_points()
 
     def __init__(self, ticks: int = TICKS, *, only_with_sheep: bool = False, **parameters: Any) -> None:
-        """Say what meadow it is.
+        """Make a simulation.
 
         Args:
-            ticks: For how long it runs.
-            only_with_sheep: Whether it is to end when there are no sheep any more: there is nothing left to learn, but
-                the wolves would take their time to starve.
-            **parameters: Of Mesa's model: ``initial_wolves``, ``grass_regrowth_time`` and so on.
+            ticks: The number of ticks after which an episode is truncated.
+            only_with_sheep: Whether an episode ends when the last sheep dies. After that there is nothing to learn, but
+                it takes the wolves many ticks to starve.
+            **parameters: Parameters of Mesa's model: ``initial_wolves``, ``grass_regrowth_time`` and so on.
         """
         self.ticks = ticks
         self.only_with_sheep = only_with_sheep
@@ -149,21 +150,21 @@ class Meadow(SimulationInterface):
         self._runner: Any = None
 
     def reset(self, seed: int | None = None) -> None:
-        """Let other animals loose on another meadow."""
+        """Create a new model."""
         if hasattr(wolf_sheep, "WolfSheepScenario"):  # from Mesa 3.5 on
             self.model = wolf_sheep.WolfSheep(wolf_sheep.WolfSheepScenario(rng=seed, **self.parameters))
             self._runner = self.model
             return
-        from mesa.experimental.devs import ABMSimulator  # before
+        from mesa.experimental.devs import ABMSimulator  # before Mesa 3.5
 
         self._runner = ABMSimulator()
         self.model = wolf_sheep.WolfSheep(simulator=self._runner, seed=seed, **self.parameters)
 
     def run(self) -> Any:
-        """Let the ticks go by.
+        """Run the ticks.
 
         Returns:
-            ``TRUNCATED`` at the last tick: by itself, the model would go on for ever.
+            ``TRUNCATED`` after the last tick, because the model itself has no end; None without sheep.
         """
         for _ in range(self.ticks):
             if self.only_with_sheep and not self.sheep:
@@ -172,24 +173,24 @@ class Meadow(SimulationInterface):
         return TRUNCATED
 
     def reseed(self, seed: int) -> None:
-        """Draw anew what the animals leave to chance: all of them, and the grass, draw from the model's generators."""
+        """Draw another future: all animals and the grass draw from the model's generators."""
         reseed_generators(self, seed)
 
     def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Whose decisions will be called for: those of all sheep that are alive."""
+        """Return the calls to come: one for each living sheep."""
         return [(sheep,) for sheep in self.sheep]
 
     @property
     def sheep(self) -> Any:
-        """All sheep that are alive."""
+        """All living sheep."""
         return self.model.agents_by_type.get(Sheep, ())
 
 
 def numbers(simulation: Meadow) -> dict[str, NDArray[np.int64]]:
-    """What the model has counted, before the first tick and after each.
+    """Return the model's counts before the first tick and after each tick.
 
     Returns:
-        By kind, "sheep", "wolves" and "grass", ``(ticks + 1,)``.
+        An array of shape ``(ticks + 1,)`` for each kind: "sheep", "wolves" and "grass".
     """
     counted = simulation.model.datacollector.model_vars
     return {kind.lower(): np.array(counts, np.int64) for kind, counts in counted.items()}

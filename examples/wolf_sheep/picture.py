@@ -1,7 +1,7 @@
-"""Pictures and a table of what ``train`` and ``results`` have written down.
+"""Figures and a table of the results of ``train`` and ``results``.
 
-``python -m examples.wolf_sheep.picture`` draws ``docs/figures/shared-policy-training.png`` (how training went) and
-``docs/figures/shared-policy.png`` (what the policies are worth), and prints the table. Nothing is trained or played.
+``python -m examples.wolf_sheep.picture`` draws ``docs/figures/shared-policy-training.png`` (the learning curves) and
+``docs/figures/shared-policy.png`` (the evaluation of the policies), and prints the table. It runs no simulation.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ STYLES: Final[dict[str, dict[str, Any]]] = {
     "trained, one step of sight": {"color": "#6aa5cf", "linestyle": "-"},
     "trained, two steps of sight": {"color": "#1b6f5f", "linestyle": "-"},
 }
-"""How each is drawn: grey where nobody thinks, green and blue where somebody has learnt."""
+"""The line style of each policy: grey for the rule and random moves, green and blue for trained policies."""
 
 LEARNERS: Final = {1: "trained, one step of sight", 2: "trained, two steps of sight"}
 
 
-# -- how training went ----------------------------------------------------------------------------
+# -- learning curves ------------------------------------------------------------------------------
 
 
 def draw_training(course: Sequence[Mapping[str, str]], results: Mapping[str, Any], path: Path) -> None:
-    """Draw how training went.
+    """Draw the learning curves.
 
     Args:
         course: The rows that ``train`` has written.
-        results: What ``results`` has written: of the rule.
-        path: Where to put it.
+        results: The results that ``results`` has written, for the line of the rule.
+        path: The file to write.
     """
     figure = Figure(figsize=(10, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
     left, right = figure.subplots(1, 2)
     for axes, what, title in (
         (left, "sheep", "Sheep on the meadow, on average over 100 ticks"),
@@ -66,7 +66,7 @@ def draw_training(course: Sequence[Mapping[str, str]], results: Mapping[str, Any
 
 
 def _draw_course(axes: Axes, course: Sequence[Mapping[str, str]], what: str, name: str) -> None:
-    """A line for each training."""
+    """Draw one line per training run."""
     label: str | None = name
     for seed in sorted({row["seed"] for row in course}, key=int):
         own = [row for row in course if row["seed"] == seed]
@@ -75,11 +75,11 @@ def _draw_course(axes: Axes, course: Sequence[Mapping[str, str]], what: str, nam
         label = None
 
 
-# -- what the policies are worth ------------------------------------------------------------------
+# -- evaluation -----------------------------------------------------------------------------------
 
 
 def draw_results(results: Mapping[str, Any], path: Path) -> None:
-    """Draw how many sheep and wolves there were under each policy, and how long sheep lived."""
+    """Draw the numbers of sheep and wolves under each policy, and the lengths of the sheep's lives."""
     figure = Figure(figsize=(11, 6.4), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
@@ -130,8 +130,8 @@ def table(results: Mapping[str, Any]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw both, and print the table."""
-    parser = argparse.ArgumentParser(description="Draw what has become of the sheep.")
+    """Draw both figures, and print the table."""
+    parser = argparse.ArgumentParser(description="Draw the results of the sheep's policies.")
     parser.add_argument("--figures", type=Path, default=FIGURES, help="folder with the results (default: %(default)s)")
     folder = parser.parse_args(arguments).figures
     results = json.loads((folder / "shared-policy.json").read_text())

@@ -1,9 +1,9 @@
-"""One sheep of a herd plans over the model's own rule: how long does it live, beside the others?
+"""One sheep of a herd plans over the model's own rule: how long does it live, compared with the others?
 
 ``python -m examples.wolf_sheep.plan`` lets one sheep in each of many herds try out the four directions at each turn, in
-branches of a few turns in which all animals follow the rule and all chance is drawn anew. Nothing is learnt. The sheep
-is compared with the others that were there from the beginning of its herd, which follow the rule, and with itself by
-the rule on the same meadow.
+branches of a few turns in which all animals follow the rule and all random numbers are drawn anew. There is no
+training. The comparison is with the other initial sheep of its herd, which follow the rule, and with the same sheep
+under the rule on the same meadow.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from simenv_marl import RULE, RolloutPolicy, collect_episodes
 from .env import MOVE, Meadow, sheep_points
 
 TICKS: Final = 40
-"""How long a herd is watched."""
+"""The number of ticks per herd."""
 
 
 @dataclass(frozen=True)
 class Lives:
-    """How long sheep have lived, in turns.
+    """The lengths of sheep's lives, in turns.
 
     Attributes:
         own: ``(herds,)``: the sheep that plans.
-        same: ``(herds,)``: the same one by the rule.
-        others: ``(herds,)``: the others of its herd that were there from the beginning, in the mean.
+        same: ``(herds,)``: the same sheep under the rule.
+        others: ``(herds,)``: the mean over the other initial sheep of its herd.
     """
 
     own: NDArray[np.float64]
@@ -43,12 +43,12 @@ class Lives:
 
 
 def lives(seed: int, planner: Any, ticks: int) -> tuple[int, int, float]:
-    """How long a sheep lives that plans, how long by the rule, and how long the others of its herd.
+    """Measure the lives of a sheep that plans, of the same sheep under the rule, and of the others of its herd.
 
     Args:
-        seed: Of the meadow; determines which sheep it is.
-        planner: Its policy.
-        ticks: How long they are watched.
+        seed: The seed of the meadow; it also selects the sheep.
+        planner: The policy of the sheep that plans.
+        ticks: The number of ticks.
     """
     meadow = Meadow(ticks)
     meadow.reset(seed)
@@ -66,14 +66,14 @@ def lives(seed: int, planner: Any, ticks: int) -> tuple[int, int, float]:
 
 
 def watch(herds: Sequence[int], *, horizon: int, futures: int, ticks: int = TICKS, workers: int = 2) -> Lives:
-    """Watch herds.
+    """Measure the lives in several herds.
 
     Args:
-        herds: Their seeds.
-        horizon: For how many turns a direction is tried out.
-        futures: In how many futures.
-        ticks: How long they are watched.
-        workers: How many processes share the work.
+        herds: The seeds of the herds.
+        horizon: The number of turns for which a direction is tried out.
+        futures: The number of futures in which it is tried out.
+        ticks: The number of ticks per herd.
+        workers: The number of processes.
     """
     planner = RolloutPolicy(horizon=horizon, futures=futures)
     work = partial(lives, planner=planner, ticks=ticks)
@@ -84,12 +84,12 @@ def watch(herds: Sequence[int], *, horizon: int, futures: int, ticks: int = TICK
 
 
 def main(arguments: Sequence[str] | None = None) -> Lives:
-    """Watch herds, and tell how long sheep have lived."""
+    """Run herds, and print the lengths of the sheep's lives."""
     parser = argparse.ArgumentParser(description="Let one sheep of a herd plan.")
-    parser.add_argument("--herds", type=int, default=200, help="default: %(default)s")
-    parser.add_argument("--horizon", type=int, default=6, help="turns that are tried out (default: %(default)s)")
-    parser.add_argument("--futures", type=int, default=2, help="for each direction (default: %(default)s)")
-    parser.add_argument("--ticks", type=int, default=TICKS, help="how long they are watched (default: %(default)s)")
+    parser.add_argument("--herds", type=int, default=200, help="number of herds (default: %(default)s)")
+    parser.add_argument("--horizon", type=int, default=6, help="turns to simulate per branch (default: %(default)s)")
+    parser.add_argument("--futures", type=int, default=2, help="futures per direction (default: %(default)s)")
+    parser.add_argument("--ticks", type=int, default=TICKS, help="ticks per herd (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
     options = parser.parse_args(arguments)
     found = watch(

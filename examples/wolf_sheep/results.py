@@ -1,8 +1,8 @@
-"""What the trained policies are worth, on meadows that none of them has seen.
+"""Evaluation of the trained policies on held-out meadows.
 
-``python -m examples.wolf_sheep.results`` lets the policies of ``train`` and those that they are compared with lead the
-sheep, and writes what has become of them to ``docs/figures/shared-policy.json``. It needs TorchRL (the extra
-``clients``); ``python -m examples.wolf_sheep.picture``, which shows it, does not.
+``python -m examples.wolf_sheep.results`` evaluates the policies of ``train`` and several baselines, and writes the
+results to ``docs/figures/shared-policy.json``. It needs TorchRL (the extra ``clients``);
+``python -m examples.wolf_sheep.picture``, which draws the results, does not.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from .train import TICKS as TRAINED_FOR
 RESULTS: Final = Path(__file__).parents[2] / "docs" / "figures" / "shared-policy.json"
 
 LIVES: Final = 60
-"""How many turns of a life are told."""
+"""The number of turns in survival curves."""
 
 UNTRAINED: Final = 3
-"""How many policies that have learnt nothing are among those that are compared."""
+"""The number of untrained policies in the comparison."""
 
 Policy = Callable[[NDArray[np.float32]], Any]
 
 
-# -- whom the trained are compared with -----------------------------------------------------------
+# -- baselines ------------------------------------------------------------------------------------
 
 
 def by_rule(observations: NDArray[np.float32]) -> list[Any]:
-    """Leave it to the model."""
+    """Follow the model's rule."""
     return [RULE] * len(observations)
 
 
 def at_random(seed: int) -> Policy:
-    """Make a policy that goes anywhere."""
+    """Make a random policy."""
     generator = np.random.default_rng(seed)
     return lambda observations: generator.integers(len(DIRECTIONS), size=len(observations))
 
 
 def by_hand(observations: NDArray[np.float32]) -> Any:
-    """Go where the fewest wolves are beside the cell; of such cells where there is grass; else to the first.
+    """Go to the cell with the fewest wolves next to it; of several, to one with grass; else to the first.
 
-    It takes two steps of sight, and is what one comes to who has read the model: wolves go to cells beside their own.
-    So sheep are in danger beside a wolf, and in none in the same cell, which is the one that the model's rule avoids.
+    This needs two steps of sight, and follows from the model's code: wolves move to neighbouring cells. So a sheep is
+    in danger next to a wolf, and safe in the wolf's own cell, which is the cell that the model's rule avoids.
     """
     seen = cells(2)
     grass, wolves, _ = np.split(observations[:, 1:], 3, axis=1)
@@ -69,10 +69,10 @@ def by_hand(observations: NDArray[np.float32]) -> Any:
 
 
 def play(policy: Policy, sight: int, seeds: Sequence[int], **parameters: Any) -> Trajectories:
-    """Let all sheep be led by a policy.
+    """Run meadows in which all sheep follow a policy.
 
     Returns:
-        What the sheep have lived through, with the ``numbers`` of each meadow as what was collected.
+        The trajectories of the sheep, with the ``numbers`` of each meadow as ``collected``.
     """
     found = collect_episodes(
         lambda: Meadow(**parameters),
@@ -85,16 +85,15 @@ def play(policy: Policy, sight: int, seeds: Sequence[int], **parameters: Any) ->
 
 
 def lives(lengths: NDArray[np.int64], died: NDArray[np.bool_], turns: int = LIVES) -> NDArray[np.float64]:
-    """Estimate which share of the sheep live for at least so many turns, some of whose lives were cut off.
+    """Estimate the survival curve of sheep by Kaplan and Meier's method, as some lives are censored.
 
     Args:
-        lengths: How many turns each has had.
-        died: Whether it has died of the last one; the others have seen the end of the episode (the estimate is Kaplan
-            and Meier's).
-        turns: For how many turns to tell it.
+        lengths: The number of turns of each sheep.
+        died: Whether each sheep died in its last turn; the others lived until the end of the episode.
+        turns: The number of turns of the curve.
 
     Returns:
-        ``(turns + 1,)``: for each number of turns, the share that survive them.
+        ``(turns + 1,)``: the share of sheep that survive each number of turns.
     """
     shares = [1.0]
     for turn in range(1, turns + 1):
@@ -104,11 +103,10 @@ def lives(lengths: NDArray[np.int64], died: NDArray[np.bool_], turns: int = LIVE
 
 
 def summary(played: Sequence[Trajectories]) -> dict[str, Any]:
-    """Sum up what has become of the sheep, and of the wolves.
+    """Summarise the results for sheep and wolves.
 
     Args:
-        played: What the same sheep have lived through on the same meadows, with each of several policies that were
-            trained alike; or with one.
+        played: The trajectories on the same meadows under each of several policies of the same training; or one.
     """
     counts = {
         kind: np.array([one[kind] for found in played for one in found.collected or ()]) for kind in ("sheep", "wolves")
@@ -135,12 +133,12 @@ def summary(played: Sequence[Trajectories]) -> dict[str, Any]:
 
 
 def compare(folder: Path, seeds: Sequence[int], **parameters: Any) -> dict[str, Any]:
-    """Let all policies lead the sheep of the same meadows.
+    """Evaluate all policies on the same meadows.
 
     Args:
-        folder: Where the trained policies are; as many as there are.
-        seeds: Of the meadows.
-        **parameters: As ``Meadow`` takes them.
+        folder: The folder of the trained policies; all of them take part.
+        seeds: The seeds of the meadows.
+        **parameters: The parameters of ``Meadow``.
     """
     contenders: dict[str, Sequence[tuple[Policy, int]]] = {
         "the model's rule": [(by_rule, SIGHT)],
@@ -164,17 +162,17 @@ def compare(folder: Path, seeds: Sequence[int], **parameters: Any) -> dict[str, 
 
 
 def write(results: Mapping[str, Any], path: Path) -> None:
-    """Write them, a line for each list of numbers."""
+    """Write the results as JSON, with one line for each list of numbers."""
     text = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), json.dumps(results, indent=1))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text + "\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Compare, and write down the results."""
-    parser = argparse.ArgumentParser(description="Compare the policies that lead the sheep.")
-    parser.add_argument("--meadows", type=int, default=16, help="to compare on (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=OUT, help="where the policies are (default: beside this file)")
+    """Evaluate all policies, and write the results."""
+    parser = argparse.ArgumentParser(description="Evaluate the sheep's policies on held-out meadows.")
+    parser.add_argument("--meadows", type=int, default=16, help="number of meadows (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder of the policies (default: beside this file)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="file to write (default: %(default)s)")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)

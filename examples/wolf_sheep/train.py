@@ -1,12 +1,12 @@
-"""One policy for all sheep, trained by PPO with TorchRL's losses on what ``collect_episodes`` returns.
+"""Train one shared policy for all sheep, by PPO with TorchRL's losses on the trajectories of ``collect_episodes``.
 
-``python -m examples.wolf_sheep.train`` trains it from several seeds, for sheep that see as far as by the model's rule
-and for sheep that see a step farther. Policies go to ``out/`` beside this file; how they came about goes to
+``python -m examples.wolf_sheep.train`` trains it with several seeds, for sheep with the sight of the model's rule and
+for sheep that see one step farther. It writes the policies to ``out/`` beside this file and the learning curves to
 ``docs/figures/shared-policy-training.csv``. It needs TorchRL (the extra ``clients``).
 
-Hundreds of sheep, most of them born in mid-episode, are no more trouble here than one: the policy is asked for all
-decisions that wait for it, and each sheep's life is one trajectory. The same seed brings the same policy, on the same
-machine with the same versions.
+Hundreds of sheep, most of them born during the episode, need no more code than one: each call of the policy answers all
+waiting decisions, and each sheep's life is one trajectory. The same seed gives the same policy, on the same machine
+with the same versions.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from simenv_marl import Trajectories, collect_episodes
 from .env import DIRECTIONS, MOVE, Meadow, cells, sheep_points
 
 HELD_OUT: Final = 1_000_000
-"""Seeds from here on are for the final comparison; all others may be learnt from."""
+"""Seeds from this number on are for the final comparison; those below it are for learning."""
 
 SIGHTS: Final = (1, 2)
-"""How far sheep see: as by the model's rule, and one step farther."""
+"""The ranges of sight, in steps: that of the model's rule, and one step farther."""
 
 TICKS: Final = 100
-"""How long the episodes are that are learnt from: half of those in the comparison."""
+"""The length of training episodes, half of that in the comparison."""
 
 OUT: Final = Path(__file__).parent / "out"
 CURVES: Final = Path(__file__).parents[2] / "docs" / "figures" / "shared-policy-training.csv"
@@ -55,15 +55,15 @@ MINIBATCH: Final = 2048
 
 
 class Compressed(nn.Module):
-    """Makes numbers that one can count with of those that are observed: energies and flocks may be large."""
+    """A layer that compresses the range of the observations, as energies and flocks may be large."""
 
     def forward(self, observations: Any) -> Any:
-        """Compress them."""
+        """Compress the observations."""
         return observations.clamp(min=0).log1p()
 
 
 def network(sight: int, outputs: int) -> Any:
-    """A network from what sheep observe to so many numbers."""
+    """Make a network from sheep's observations to a number of outputs."""
     inputs = 1 + 3 * len(cells(sight))
     return nn.Sequential(
         Compressed(), nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs)
@@ -71,20 +71,20 @@ def network(sight: int, outputs: int) -> Any:
 
 
 class Herd:
-    """What all sheep share: a policy, and an estimate of what their lives are still worth.
+    """The shared networks of all sheep: a policy and a value function.
 
     Attributes:
-        sight: How far they see.
+        sight: The range of sight, in steps.
         logits: The policy's network.
-        values: The network of the estimate.
+        values: The value network.
     """
 
     def __init__(self, sight: int, seed: int) -> None:
-        """Know nothing yet.
+        """Make untrained networks.
 
         Args:
-            sight: How far they see.
-            seed: Determines the weights, and what is drawn when exploring.
+            sight: The range of sight, in steps.
+            seed: The seed of the weights and of exploration.
         """
         self.sight = sight
         with torch.random.fork_rng():
@@ -92,7 +92,7 @@ class Herd:
             self.logits = network(sight, len(DIRECTIONS))
             self.values = network(sight, 1)
             with torch.no_grad():
-                self.logits[-1].weight *= 0.01  # all directions alike, to begin with
+                self.logits[-1].weight *= 0.01  # equal probabilities at first
         self._generator = torch.Generator().manual_seed(seed)
 
     def explore(self, observations: NDArray[np.float32]) -> tuple[Any, dict[str, Any]]:
@@ -108,13 +108,13 @@ class Herd:
             return self.logits(torch.from_numpy(observations)).argmax(-1)
 
     def save(self, path: Path) -> None:
-        """Write it to a file."""
+        """Write the networks to a file."""
         path.parent.mkdir(parents=True, exist_ok=True)
         torch.save({"logits": self.logits.state_dict(), "values": self.values.state_dict()}, path)
 
     @classmethod
     def load(cls, path: Path, sight: int) -> Self:
-        """Read it from a file."""
+        """Read the networks from a file."""
         herd = cls(sight, 0)
         saved = torch.load(path, weights_only=True)
         herd.logits.load_state_dict(saved["logits"])
@@ -157,8 +157,8 @@ class Learner:
         """Make the losses.
 
         Args:
-            herd: Who learns.
-            seed: Determines in which order it is told what it has lived through.
+            herd: The networks to train.
+            seed: The seed of the order of minibatches.
         """
         actor = ProbabilisticActor(
             TensorDictModule(herd.logits, ["observation"], ["logits"]),
@@ -192,16 +192,16 @@ class Learner:
 
 @dataclass(frozen=True)
 class Progress:
-    """How it went with a herd in the episodes of one update, while it explored.
+    """The statistics of the episodes of one update, with exploration.
 
     Attributes:
-        sight: How far they see.
-        seed: Of the training.
+        sight: The range of sight, in steps.
+        seed: The seed of the training run.
         update: The number of the update.
-        decisions: From how many decisions they had learnt before.
-        sheep: How many sheep there were, on average over all ticks.
-        life: How many turns there are for each death: how long a sheep can expect to live.
-        survived: The share of the episodes in which there were sheep at the end.
+        decisions: The number of decisions in earlier updates.
+        sheep: The mean number of sheep over all ticks.
+        life: The number of turns per death: the life expectancy of a sheep.
+        survived: The share of episodes with sheep at the end.
     """
 
     sight: int
@@ -226,13 +226,13 @@ def train(
     """Train a policy.
 
     Args:
-        sight: How far sheep see.
-        seed: Determines everything.
-        decisions: After how many decisions to stop.
-        each: From about how many to learn at a time.
-        ticks: How long an episode is.
-        tell: Called after each update.
-        **parameters: Of Mesa's model, where they are not to be its defaults.
+        sight: The range of sight, in steps.
+        seed: The seed of the training run.
+        decisions: The number of decisions after which training stops.
+        each: The approximate number of decisions per update.
+        ticks: The length of an episode.
+        tell: A function that is called after each update.
+        **parameters: The parameters that differ from the defaults of Mesa's model.
     """
     herd = Herd(sight, seed)
     learner = Learner(herd, seed)
@@ -259,26 +259,26 @@ def train(
         )
         tell(course[-1])
         lived += len(found)
-        # The longer they live the fewer episodes it takes; some all the same, for the sake of their variety.
+        # longer lives need fewer episodes per update; the minimum keeps some variety
         number = int(np.clip(each * number / len(found), 8, 64))
     return herd, course
 
 
-# -- all of it ------------------------------------------------------------------------------------
+# -- command line ---------------------------------------------------------------------------------
 
 
 def path_of(sight: int, seed: int, folder: Path = OUT) -> Path:
-    """Where a policy is kept."""
+    """Return the file of a policy."""
     return folder / f"sight-{sight}-seed-{seed}.pt"
 
 
 def policies_of(sight: int, folder: Path = OUT) -> list[Path]:
-    """All policies that are kept for sheep that see so far, in the order of their seeds."""
+    """Return the files of all policies for a range of sight, in the order of their seeds."""
     return sorted(folder.glob(f"sight-{sight}-seed-*.pt"), key=lambda path: int(path.stem.rpartition("-")[2]))
 
 
 def write(course: Iterable[Progress], path: Path = CURVES) -> None:
-    """Write how training went."""
+    """Write the learning curves as CSV."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Progress)], lineterminator="\n")
@@ -291,14 +291,14 @@ def write(course: Iterable[Progress], path: Path = CURVES) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train all of them."""
-    parser = argparse.ArgumentParser(description="Train one policy for all sheep.")
-    parser.add_argument("--seeds", type=int, default=3, help="how often to train (default: %(default)s)")
-    parser.add_argument("--decisions", type=int, default=300_000, help="to learn from (default: %(default)s)")
-    parser.add_argument("--ticks", type=int, default=TICKS, help="of an episode (default: %(default)s)")
-    parser.add_argument("--sight", type=int, nargs="+", default=SIGHTS, help="how far sheep see (default: 1 2)")
+    """Train all policies."""
+    parser = argparse.ArgumentParser(description="Train one shared policy for all sheep.")
+    parser.add_argument("--seeds", type=int, default=3, help="number of training runs (default: %(default)s)")
+    parser.add_argument("--decisions", type=int, default=300_000, help="decisions per training (default: %(default)s)")
+    parser.add_argument("--ticks", type=int, default=TICKS, help="ticks per episode (default: %(default)s)")
+    parser.add_argument("--sight", type=int, nargs="+", default=SIGHTS, help="ranges of sight (default: 1 2)")
     parser.add_argument("--out", type=Path, default=OUT, help="folder for the policies (default: beside this file)")
-    parser.add_argument("--curves", type=Path, default=CURVES, help="file for the course (default: %(default)s)")
+    parser.add_argument("--curves", type=Path, default=CURVES, help="file for learning curves (default: %(default)s)")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     course: list[Progress] = []

@@ -203,11 +203,11 @@ def test_it_is_told_beside_what_the_rules_do(library, made):
 def test_policies_that_cannot_be_loaded_say_why(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match="LIBRARY-QUESTION-SEED"):
         back_in_the_model.load(tmp_path / "mine.zip")
-    with pytest.raises(SystemExit, match=r"experiment\.sb3 learns it"):
+    with pytest.raises(SystemExit, match=r"experiment\.sb3 trains it"):
         back_in_the_model.load(tmp_path / "sb3-1-0.zip")
     (tmp_path / "sb3-1-0.zip").touch()
     monkeypatch.setitem(sys.modules, "examples.greenhouse_coop.experiment.sb3", None)
-    with pytest.raises(SystemExit, match="needs stable-baselines3, which this Python has not"):
+    with pytest.raises(SystemExit, match="needs stable-baselines3, which is not installed here"):
         back_in_the_model.load(tmp_path / "sb3-1-0.zip")
 
 

@@ -1,16 +1,15 @@
-"""What has been learnt, at work in the model's own loop.
+"""Run trained policies in the model's own loop.
 
-``python -m examples.greenhouse_coop.experiment.back_in_the_model FILE ...`` loads policies that the scripts of the
-libraries have left, and lets ``simenv_marl.simulate`` run the greenhouse with them, beside one that is run by its
-rules. No environment is made, and nobody steps: the simulation runs its own loop, and what counts is what a gardener
-would count.
+``python -m examples.greenhouse_coop.experiment.back_in_the_model FILE ...`` loads policies that the libraries' scripts
+have saved, and lets ``simenv_marl.simulate`` run the greenhouse with them, and once with its rules. There is no
+environment and no stepping: the simulation runs its own loop, and the results are plants and litres, not rewards.
 
     ``sb3-3-0.zip``      stable-baselines3
     ``torchrl-4a-0.pt``  TorchRL
-    ``rllib-4a-0``       RLlib; a folder
+    ``rllib-4a-0``       RLlib (a folder)
 
-Each asks for the library that has made it, and for nothing else that learns. RLlib stands in an environment of its own,
-so its policies have to be shown by that one's Python.
+Each policy needs the library that made it, and no other learning library. RLlib is installed in a virtual environment
+of its own, so run its policies with that environment's Python.
 """
 
 from __future__ import annotations
@@ -32,41 +31,41 @@ from .questions import FINAL, QUESTIONS
 from .runs import RUNS, Run
 
 LIBRARIES: Final = {"sb3": "stable-baselines3", "torchrl": "torchrl", "rllib": "ray[rllib]"}
-"""Which distribution a library's policies need."""
+"""The distribution that each library's policies need."""
 
 
 def load(path: Path) -> tuple[str, Team]:
     """Load a policy.
 
     Args:
-        path: What a script has left of a run: ``LIBRARY-QUESTION-SEED``, with a suffix or without.
+        path: The policy that a script saved for a run: ``LIBRARY-QUESTION-SEED``, with or without a suffix.
 
     Returns:
-        What to call it, and who decides.
+        The title of the policy, and the team.
     """
     library, _, rest = path.stem.partition("-")
     question, _, seed = rest.partition("-")
     if library not in LIBRARIES or question not in QUESTIONS or not seed.isdecimal():
-        raise SystemExit(f"{path} is not named LIBRARY-QUESTION-SEED as policies are: sb3-3-0.zip, for instance")
+        raise SystemExit(f"{path} is not named LIBRARY-QUESTION-SEED as policies are, for instance sb3-3-0.zip")
     if not path.exists():
-        raise SystemExit(f"{path} does not exist: python -m {__package__}.{library} learns it")
+        raise SystemExit(f"{path} does not exist; python -m {__package__}.{library} trains it")
     try:
         script = import_module(f"{__package__}.{library}")
     except ModuleNotFoundError as missing:
         raise SystemExit(
-            f"{path.name} needs {LIBRARIES[library]}, which this Python has not ({missing}): take that of another"
-            " virtual environment"
+            f"{path.name} needs {LIBRARIES[library]}, which is not installed here ({missing}): use the Python of"
+            " another virtual environment"
         ) from missing
     team = script.load(Run(library, question, int(seed), 0, path.parent))
     return f"{path.stem}: {QUESTIONS[question].title}", team
 
 
 def compare(teams: dict[str, Team], seeds: Sequence[int]) -> Table:
-    """Let everyone keep the same greenhouses, one simulation after the other.
+    """Run the same greenhouses with each team, one simulation after another.
 
     Args:
-        teams: By what to call them, who decides what; whoever is not named follows the rule.
-        seeds: Of the greenhouses.
+        teams: The teams by title. Agents without a policy follow their rule.
+        seeds: The seeds of the greenhouses.
     """
     table = Table(title="In the model's own loop")
     for column in ("greenhouse", "who decides", "days", "plants alive", "litres poured", "litres for each alive"):
@@ -82,10 +81,10 @@ def compare(teams: dict[str, Team], seeds: Sequence[int]) -> Table:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Show what policies do."""
+    """Run the policies, and print a table of the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policies", nargs="+", type=Path, metavar="FILE", help=f"what a run has left, in {RUNS}")
-    parser.add_argument("--greenhouses", type=int, default=4, help="how many of the held-out ones (default: 4)")
+    parser.add_argument("policies", nargs="+", type=Path, metavar="FILE", help=f"policies of runs, from {RUNS}")
+    parser.add_argument("--greenhouses", type=int, default=4, help="number of held-out greenhouses (default: 4)")
     options = parser.parse_args(arguments)
     teams: dict[str, Team] = {"the rules": {}}
     teams |= [load(path) for path in options.policies]

@@ -1,9 +1,9 @@
-"""What learning is compared with: the rule, random actions, the best constants, and the CMA-ES pair of ``make demo``.
+"""Baselines for learning: the rule, random actions, the best constants, and the CMA-ES pair of ``make demo``.
 
 ``python -m examples.greenhouse_coop.experiment.baselines``
 
-Searches and evolution are those of the module ``train``, once with as many episodes as ``make demo`` gives them, and
-once with as many as have a hundred days each out of the budget of all learners.
+Searches and evolution are those of the module ``train``. They run once with the number of episodes of ``make demo``,
+and once with the learners' budget, at a hundred days per episode.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from .runs import RUNS, each, write
 LIBRARY: Final = "baselines"
 
 TEAMS: Final = ("rule", "random actions", "constant watering", "constant pair", "CMA-ES, watering", "CMA-ES, both")
-"""Whom ``compare`` compares, in its order."""
+"""The teams that ``compare`` compares, in its order."""
 
 BESIDE_CURVES: Final[dict[str, Team]] = {
     "rule": {},
     "constant watering": BEST_WATERING,
     "constant pair": BEST_CONSTANTS,
 }
-"""Who is also judged as learners are on their way."""
+"""The baselines that are also evaluated on the greenhouses of the learning curves."""
 
 SEARCHED_ON: Final = 8
-"""On how many greenhouses constant ventilation is tried."""
+"""The number of greenhouses on which constant ventilation is tried."""
 
 
 def constant_ventilation(seed: int) -> Verdict:
-    """The best constant ventilation, where watering follows the rule: what question 2 has to beat."""
+    """Evaluate the best constant ventilation, where watering follows the rule: the baseline of question 2."""
     seeds = draw_seeds(np.random.default_rng(seed), SEARCHED_ON)
     teams: list[Team] = [{VENTILATOR: Constant(fraction)} for fraction in EXCHANGES]
     environment = raw_env()
@@ -50,11 +50,11 @@ def constant_ventilation(seed: int) -> Verdict:
 
 
 def search(out: Path, job: tuple[int, int]) -> str:
-    """Carry out a search, and write down what was found.
+    """Run a search, and write its results.
 
     Args:
         out: The folder of all runs.
-        job: How many episodes may be spent, and the seed.
+        job: The number of episodes and the seed of the search.
     """
     episodes, seed = job
     path = out / f"{LIBRARY}-{episodes}-{seed}.json"
@@ -70,7 +70,7 @@ def search(out: Path, job: tuple[int, int]) -> str:
 
 
 def beside_curves(out: Path) -> None:
-    """Judge on the greenhouses of the learning curves those who have nothing to learn.
+    """Evaluate the baselines without learning on the greenhouses of the learning curves.
 
     Args:
         out: The folder of all runs.
@@ -84,11 +84,11 @@ def beside_curves(out: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Carry out what has not been carried out before."""
+    """Run the missing searches."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", nargs="+", type=int, default=[600, 3600], help="default: 600 and 3600")
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(5)), metavar="SEED", help="default: 0 to 4")
-    parser.add_argument("--workers", type=int, default=1, help="searches at a time, in processes (default: 1)")
+    parser.add_argument("--workers", type=int, default=1, help="number of parallel searches, in processes (default: 1)")
     parser.add_argument("--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""The five questions, and how whatever has been learnt for one of them is judged.
+"""The five questions, and the evaluation of the policies that answer them.
 
-Learners see the greenhouse through different views: one agent or two, in turns or in rounds. What they have learnt is
-judged alike all the same: as a team in the AEC environment of both agents, on greenhouses that nobody has learnt from,
-by ``play`` of the module ``train``, whose return is that of one agent.
+Learners see the greenhouse through different views: one agent or two, in turns or in rounds. The evaluation is the
+same for all: as a team in the AEC environment of both agents, on held-out greenhouses, by ``play`` of the module
+``train``, whose return is that of one agent.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from simenv_marl import SimulationAECEnv
 from ..train import HELD_OUT, VENTILATOR, WATERER, Constant, Outcome, Policy, Team, play
 
 CURVE: Final = range(HELD_OUT + 10_000, HELD_OUT + 10_008)
-"""Greenhouses that are kept while learning goes on, for the learning curves."""
+"""The seeds of the greenhouses for the learning curves."""
 
 FINAL: Final = range(HELD_OUT, HELD_OUT + 32)
-"""Greenhouses that are kept in the end: those of ``make demo``."""
+"""The seeds of the greenhouses for the final evaluation: those of ``make demo``."""
 
 BEST_CONSTANTS: Final = {WATERER: Constant(0.084), VENTILATOR: Constant(1.0)}
-"""The best constant pair that ``make demo`` finds: 84 litres, and all of the air."""
+"""The best constant pair that ``make demo`` finds: 84 litres, and a full exchange of the air."""
 
 
 BEST_WATERING: Final = {WATERER: Constant(0.06)}
-"""The best constant watering that it finds where ventilation follows its rule: 60 litres."""
+"""The best constant watering that ``make demo`` finds where ventilation follows its rule: 60 litres."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """A question.
+    """A question of the experiment.
 
     Attributes:
-        title: What is asked.
-        learners: Who learns.
-        fixed: Who is answered by a fixed policy meanwhile. Whoever neither learns nor is fixed follows the rule.
-        needs: The question whose answer, of the same seed, is the fixed policy of whoever learnt there.
+        title: A short description.
+        learners: The agents that learn.
+        fixed: The fixed policies of other agents. Agents that neither learn nor have one follow their rule.
+        needs: The question whose trained policy, from the same seed, is a fixed policy here.
     """
 
     title: str
@@ -70,11 +70,11 @@ QUESTIONS: Final = {
 # -- policies -------------------------------------------------------------------------------------
 
 Act = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""What a library has learnt: from an observation, float32 ``(6,)``, to actions, float32 ``(number of learners,)``."""
+"""A trained policy: maps an observation, float32 ``(6,)``, to actions, float32 ``(number of learners,)``."""
 
 
 def in_turns(agent: str, act: Act) -> Team:
-    """The team of one learner, who decides on what it observes when it is asked.
+    """Make the team of one learner, which decides on its own observation.
 
     Its policy also serves ``simenv_marl.simulate`` and the option ``policies``, which pass an info where ``play``
     passes a space.
@@ -87,10 +87,10 @@ def in_turns(agent: str, act: Act) -> Team:
 
 
 def in_rounds(act: Act) -> Team:
-    """The team of two learners who decide at once, as in parallel and joint views: both on what is seen first in a day.
+    """Make the team of two learners with simultaneous decisions, as in parallel and joint views.
 
     Args:
-        act: Of an action for each of both, the waterer's first.
+        act: The policy of both; it returns the waterer's action, then the ventilator's.
     """
     waters = np.zeros(1, np.float32)
 
@@ -101,28 +101,28 @@ def in_rounds(act: Act) -> Team:
         return actions[1:]
 
     def waterer(observation: NDArray[np.float32], _: Any = None) -> NDArray[np.float32]:
-        return waters  # its decision was taken when the day began
+        return waters  # decided at the beginning of the day
 
     return {WATERER: waterer, VENTILATOR: ventilator}
 
 
 def team_of(question: Question, act: Act) -> dict[str, Policy]:
-    """Who plays when a question has been answered: those who have learnt, and those who are fixed."""
+    """Make the team that answers a question: the trained policies and the fixed ones."""
     learnt = in_rounds(act) if question.learners == BOTH else in_turns(question.learners[0], act)
     return {**question.fixed, **learnt}
 
 
-# -- judging --------------------------------------------------------------------------------------
+# -- evaluation -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a team was worth, in the mean over greenhouses.
+    """The results of a team, as means over greenhouses.
 
     Attributes:
         value: The return of the team.
-        alive: How many plants were alive in the end.
-        litres: How many litres were poured.
+        alive: The number of plants alive at the end.
+        litres: The litres poured.
     """
 
     value: float
@@ -137,11 +137,11 @@ class Verdict:
 
 
 def judge(environment: SimulationAECEnv, team: Team, seeds: Iterable[int]) -> Verdict:
-    """Let a team keep greenhouses.
+    """Evaluate a team on greenhouses.
 
     Args:
-        environment: As ``raw_env`` makes it.
-        team: Who plays.
-        seeds: Of the greenhouses.
+        environment: An environment from ``raw_env``.
+        team: The policies by agent.
+        seeds: The seeds of the greenhouses.
     """
     return Verdict.of(play(environment, team, seed) for seed in seeds)

@@ -1,10 +1,10 @@
-"""Learning curves and a table out of all runs.
+"""Learning curves and a table of all runs.
 
-``python -m examples.greenhouse_coop.experiment.results --runs FOLDER`` gathers what scripts have left in a folder into
-two CSV files that are under version control, ``data/curves.csv`` and ``data/finals.csv``, and draws them. Without
-``--runs`` it draws what these files hold: nothing has to be learnt again for that.
+``python -m examples.greenhouse_coop.experiment.results --runs FOLDER`` collects the results of all runs in a folder
+into two CSV files under version control, ``data/curves.csv`` and ``data/finals.csv``, and draws them. Without
+``--runs`` it draws the data of these files, without any training.
 
-What is shown of several seeds is their median and their quartiles, in curves as in the table.
+Curves and table show the median and the quartiles over seeds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LIBRARIES: Final = {
     "rllib": "RLlib: PPO",
 }
 NAMES: Final = {("torchrl", "4a"): "TorchRL: IPPO", ("torchrl", "4b"): "TorchRL: MAPPO", ("rllib", "4a"): "RLlib: IPPO"}
-"""What a library's PPO is called in these cases."""
+"""The names of a library's PPO in these cases."""
 
 MEASURED: Final = ("value", "alive", "litres")
 
@@ -43,7 +43,7 @@ LINES: Final = {
     "constant watering": ("best constant watering", "#e3b778"),
     "rule": ("rule", "#8c8c8c"),
 }
-"""Whom learners are compared with in the picture."""
+"""The baselines in the figure of the learning curves."""
 
 PANELS: Final = (
     (
@@ -69,17 +69,17 @@ PANELS: Final = (
 )
 
 
-# -- gathering ------------------------------------------------------------------------------------
+# -- collecting -----------------------------------------------------------------------------------
 
 
 def gather(runs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Read what scripts have left.
+    """Read the results that scripts have written.
 
     Args:
         runs: The folder of all runs.
 
     Returns:
-        Learning curves, a row for each point, and what came out, a row for each run.
+        The learning curves, one row per point, and the final results, one row per run.
     """
     found = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(runs.glob("*.json"))]
     learnt = [run for run in found if run["library"] != "baselines"]
@@ -100,7 +100,7 @@ def gather(runs: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _baselines(searches: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What evolution brings is shown for each number of episodes; all else once, as the longest searches found it."""
+    """Select rows: CMA-ES for each number of episodes, all other baselines from the longest searches alone."""
     most = max((search["episodes"] for search in searches), default=0)
     rows: list[dict[str, Any]] = []
     for search in searches:
@@ -116,21 +116,21 @@ def _baselines(searches: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-# -- telling --------------------------------------------------------------------------------------
+# -- the table ------------------------------------------------------------------------------------
 
 
 def name(library: str, question: str) -> str:
-    """What a library's learner is called."""
+    """Return the name of a library's learner."""
     return NAMES.get((library, question), LIBRARIES[library])
 
 
 def title(library: str, question: str) -> str:
-    """What is asked, or who plays."""
+    """Return the title of a question, or the name of a baseline."""
     return question if library == "baselines" else f"({question}) {QUESTIONS[question].title}"
 
 
 def table(finals: pd.DataFrame) -> str:
-    """Tell what came out, in Markdown: the median over seeds, and the quartiles."""
+    """Make the table of final results, in Markdown: medians and quartiles over seeds."""
     rows = []
     for (library, question), runs in finals.groupby(["library", "question"], sort=False):
         low, median, high = runs.value.quantile([0.25, 0.5, 0.75])
@@ -158,7 +158,7 @@ def table(finals: pd.DataFrame) -> str:
 
 
 def _place(library: str, question: str, median: float) -> tuple[bool, str | float, str]:
-    """Baselines first, from the worst to the best; then the questions in their order."""
+    """Return a sort key: baselines first, from the worst to the best, then the questions in their order."""
     return (False, median, "") if library == "baselines" else (True, question, library)
 
 
@@ -166,9 +166,9 @@ def _place(library: str, question: str, median: float) -> tuple[bool, str | floa
 
 
 def draw_curves(curves: pd.DataFrame, path: Path) -> None:
-    """Draw the learning curves: medians and quartiles over seeds, by simulated days."""
+    """Draw the learning curves: medians and quartiles over seeds, against simulated days."""
     figure = Figure(figsize=(12, 5.4), layout="constrained")
-    FigureCanvasAgg(figure)  # no window, no state of pyplot
+    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
     left, right = figure.subplots(1, 2, sharey=True)
     for axes, (heading, colours) in zip((left, right), PANELS, strict=True):
         _draw_lines(axes, curves)
@@ -207,7 +207,7 @@ def _draw_lines(axes: Axes, curves: pd.DataFrame) -> None:
 
 
 def draw_finals(finals: pd.DataFrame, path: Path) -> None:
-    """Draw what came out: a dot for each seed, a stroke for the median, and a bar between quartiles."""
+    """Draw the final results: a dot for each seed, a line for the median, and a bar between the quartiles."""
     groups = list(finals.groupby(["library", "question"], sort=False))
     groups.sort(key=lambda group: _place(group[0][0], group[0][1], group[1].value.median()), reverse=True)
     figure = Figure(figsize=(12, 0.8 + 0.34 * len(groups)), layout="constrained")
@@ -253,15 +253,15 @@ def _save(figure: Figure, path: Path) -> None:
     print(path)
 
 
-# -- all of it ------------------------------------------------------------------------------------
+# -- command line ---------------------------------------------------------------------------------
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Gather, tell, draw."""
+    """Collect the results, print the table, draw the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=Path, help="gather what is in this folder first")
-    parser.add_argument("--data", type=Path, default=DATA, help="where the CSV files are (default: %(default)s)")
-    parser.add_argument("--figures", type=Path, default=FIGURES, help="for what is drawn (default: %(default)s)")
+    parser.add_argument("--runs", type=Path, help="first collect the runs in this folder")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the CSV files (default: %(default)s)")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for the figures (default: %(default)s)")
     options = parser.parse_args(arguments)
     files = {kind: options.data / f"{kind}.csv" for kind in ("curves", "finals")}
     if options.runs is not None:

@@ -1,14 +1,14 @@
-"""Question 4a, answered by PPO of RLlib (its new API stack): a module for each of both agents.
+"""Question 4a, answered by RLlib's PPO (new API stack), with one module per agent.
 
-``python -m examples.greenhouse_coop.experiment.rllib``, in an environment with ``ray[rllib]``, which asks for other
-versions than the other libraries do.
+Run ``python -m examples.greenhouse_coop.experiment.rllib`` in a virtual environment with ``ray[rllib]``, whose
+dependencies conflict with those of the other libraries.
 
-The PettingZoo parallel environment stands in RLlib's own wrapper. Learning is, as far as the libraries allow, the same
+RLlib's own wrapper contains the PettingZoo parallel environment. Learning is, as far as the libraries allow, the same
 as in ``sb3`` and ``torchrl``:
 
-- RLlib rescales actions from [-1, 1] by itself. Their deviation is a variable of each module (``free_log_std``), and
-  begins with 0.37.
-- Rewards are divided by 20, about the deviation of returns, and the critic's error is not clipped.
+- RLlib itself rescales actions from [-1, 1]. Their standard deviation is a parameter of each module
+  (``free_log_std``), and starts at 0.37.
+- Rewards are divided by 20, about the standard deviation of returns, and the critic's error is not clipped.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from .rllib_module import LOG_STD, Module
 LIBRARY: Final = "rllib"
 
 GREENHOUSES: Final = 16
-"""How many are kept side by side, to learn from."""
+"""The number of parallel environments for training."""
 
 SETTINGS: Final[dict[str, Any]] = {
     "lr": 3e-4,
@@ -66,25 +66,25 @@ CELLS: Final = (64, 64)
 REWARD_SCALE: Final = 1 / 20
 
 BATCHES_A_POINT: Final = 5
-"""After how many batches there is a point of the learning curve."""
+"""The number of batches between two points of the learning curve."""
 
 
 class ScaledRewards(BaseParallelWrapper):
-    """A parallel environment, its rewards on the scale that critics learn best at."""
+    """A parallel environment with rewards scaled for the critic."""
 
     def step(self, actions: Mapping[str, Any]) -> Any:
-        """Play a round."""
+        """Step the environment, and scale the rewards."""
         observations, rewards, *others = super().step(actions)
         return observations, {agent: reward * REWARD_SCALE for agent, reward in rewards.items()}, *others
 
 
 def environment(_: Mapping[str, Any]) -> ParallelPettingZooEnv:
-    """The environment of both agents in RLlib's wrapper."""
+    """Make the environment of both agents in RLlib's wrapper."""
     return ParallelPettingZooEnv(ScaledRewards(parallel_env()))
 
 
 def configuration(seed: int) -> PPOConfig:
-    """What RLlib is to do, in this process."""
+    """Make the configuration of PPO; all of it runs in this process."""
     register_env("greenhouse_coop", environment)
     networks = DefaultModelConfig(
         fcnet_hiddens=list(CELLS),
@@ -107,7 +107,7 @@ def configuration(seed: int) -> PPOConfig:
 
 
 def learn(run: Run) -> Verdict:
-    """Carry out a run."""
+    """Train for a run, and evaluate the result."""
     start()
     torch.set_num_threads(1)
     algorithm = configuration(run.seed).build_algo()
@@ -118,32 +118,32 @@ def learn(run: Run) -> Verdict:
     )
     log.judge(0, team)
     size = SETTINGS["train_batch_size_per_learner"]
-    batches = -(-run.budget // size)  # whole ones: the last may go beyond the budget
+    batches = -(-run.budget // size)  # whole batches: the last one may exceed the budget
     for number in range(1, batches + 1):
         algorithm.train()
         if number % BATCHES_A_POINT == 0 or number == batches:
             log.judge(number * size, team)
     for agent, module in zip(BOTH, modules, strict=True):
         folder = run.stem / agent
-        shutil.rmtree(folder, ignore_errors=True)  # of a run that was interrupted
+        shutil.rmtree(folder, ignore_errors=True)  # left by an interrupted run
         module.save_to_path(folder.absolute())
     algorithm.stop()
     return log.close(batches * size, team)
 
 
 def start() -> None:
-    """Start Ray, of which nothing but this process is needed."""
+    """Start Ray, within this process alone."""
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     if not ray.is_initialized():
         ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
 
 
 def act(modules: Sequence[RLModule], observation: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What modules do, without exploring: both are asked when the day begins, and observe the same.
+    """Compute the modules' actions without exploration. At the beginning of a day, both agents observe the same.
 
     Args:
-        modules: The waterer's and the ventilator's.
-        observation: Of one agent, float32 ``(6,)``.
+        modules: The waterer's module and the ventilator's.
+        observation: The observation of one agent, float32 ``(6,)``.
     """
     batch = {"obs": torch.from_numpy(observation)[None]}
     with torch.no_grad():
@@ -152,7 +152,7 @@ def act(modules: Sequence[RLModule], observation: NDArray[np.float32]) -> NDArra
 
 
 def load(run: Run) -> Team:
-    """The team that a run has brought about."""
+    """Load the team that a run has trained."""
     if not run.stem.is_dir():
         raise SystemExit(f"{run.stem} is missing: question {run.question} of seed {run.seed} has to be answered first")
     modules = [RLModule.from_checkpoint((run.stem / agent).absolute()) for agent in BOTH]
@@ -160,7 +160,7 @@ def load(run: Run) -> Team:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Carry out what has not been carried out before."""
+    """Carry out the missing runs."""
     options = parser(__doc__ or "", budget=60_000, questions=("4a",)).parse_args(arguments)
     carry_out(LIBRARY, learn, options)
 

@@ -1,7 +1,7 @@
-"""RLlib's own module, which begins less wildly.
+"""RLlib's default module with less initial exploration.
 
-What RLlib saves of a module names its class, and the module that this class is in. So it is in none that is run as a
-script, which is ``__main__`` there, or ``__mp_main__`` in a worker, and neither of both to those who load it.
+A checkpoint of RLlib contains the name of the module's class and of its Python module. So the class is not in a
+script, whose name is ``__main__``, or ``__mp_main__`` in a worker, and something else where the checkpoint is loaded.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ LOG_STD: Final = -1.0
 
 
 class Module(DefaultPPOTorchRLModule):
-    """The same, except for what its deviation begins with."""
+    """RLlib's default PPO module with another initial standard deviation of actions."""
 
     def setup(self) -> None:
         """Make the networks."""

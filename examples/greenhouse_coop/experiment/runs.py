@@ -1,8 +1,8 @@
-"""What all scripts of the experiment have in common: command line, processes, files.
+"""Shared by all scripts of the experiment: command line, processes, files.
 
-A run is one question, learnt by one library from one seed. It leaves a JSON file, which says what came out, and beside
-it whatever the library needs to load its policy again. A run whose file is there is not done again: a script that was
-interrupted goes on where it was, with the run that it was at from its beginning.
+A run is one question, answered by one library from one seed. It writes a JSON file with its results, and beside it the
+files from which the library can load the policy. A run whose JSON file exists is not repeated: an interrupted script
+resumes with the run that it was at, which starts from the beginning.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 RUNS: Final = OUT / "experiment"
-"""Where runs are kept, unless ``--out`` says otherwise. Nothing of it is under version control."""
+"""The default folder of runs; it is not under version control."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run.
+    """A run of the experiment.
 
     Attributes:
-        library: Who learns.
-        question: The key of what is asked.
-        seed: Determines everything.
-        budget: The days that may be simulated for learning.
+        library: The learning library.
+        question: The key of the question.
+        seed: The seed of the run.
+        budget: The number of simulated days for learning.
         out: The folder of all runs.
     """
 
@@ -49,7 +49,7 @@ class Run:
 
     @property
     def asked(self) -> Question:
-        """What is asked."""
+        """The question."""
         return QUESTIONS[self.question]
 
     @property
@@ -59,23 +59,23 @@ class Run:
 
     @property
     def file(self) -> Path:
-        """What came out."""
+        """The path of the file with the results."""
         return self.stem.with_suffix(".json")
 
     def of(self, question: str) -> Run:
-        """The run of another question, all else alike."""
+        """Return the run of another question with the same other attributes."""
         return Run(self.library, question, self.seed, self.budget, self.out)
 
 
 class Log:
-    """Judges what a run has learnt so far, and writes it down in the end."""
+    """The log of a run: evaluates the policies so far, and writes the results at the end."""
 
     def __init__(self, run: Run, settings: Mapping[str, Any]) -> None:
         """Open the log of a run.
 
         Args:
             run: The run.
-            settings: With what it learns; such as JSON can hold.
+            settings: The learner's settings, serialisable to JSON.
         """
         self._run, self._settings = run, dict(settings)
         self._environment = raw_env()
@@ -86,17 +86,17 @@ class Log:
         """Add a point to the learning curve.
 
         Args:
-            days: How many have been simulated for learning.
-            team: As it plays now.
+            days: The number of days simulated for learning so far.
+            team: The current policies.
         """
         self._curve.append({"days": days, **asdict(judge(self._environment, team, CURVE))})
 
     def close(self, days: int, team: Team) -> Verdict:
-        """Judge what was learnt in the end, and write the run's file: nothing may go wrong after that.
+        """Evaluate the final policies, and write the run's file; nothing may fail after that.
 
         Args:
-            days: How many have been simulated for learning.
-            team: As it plays in the end.
+            days: The number of days simulated for learning.
+            team: The final policies.
         """
         seconds = time.process_time() - self._began
         verdict = judge(self._environment, team, FINAL)
@@ -119,37 +119,37 @@ class Log:
 
 
 def write(path: Path, found: Any) -> None:
-    """Write a JSON file, all of it or nothing."""
+    """Write a JSON file atomically."""
     unfinished = path.with_suffix(".unfinished")
     unfinished.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     unfinished.replace(path)
 
 
 def parser(description: str, *, budget: int, questions: Iterable[str] = ()) -> argparse.ArgumentParser:
-    """What scripts understand on the command line.
+    """Make the command line parser of a script.
 
     Args:
-        description: What the script does.
-        budget: How many days a run may simulate where nobody says otherwise.
-        questions: What the script can answer.
+        description: The description of the script.
+        budget: The default number of simulated days per run.
+        questions: The keys of the questions that the script can answer.
     """
     made = argparse.ArgumentParser(description=description)
     if questions := list(questions):
         made.add_argument("--questions", nargs="+", choices=questions, default=questions, metavar="QUESTION")
     made.add_argument("--seeds", nargs="+", type=int, default=list(range(5)), metavar="SEED", help="default: 0 to 4")
     made.add_argument("--budget", type=int, default=budget, help="simulated days for each run (default: %(default)s)")
-    made.add_argument("--workers", type=int, default=1, help="runs at a time, in processes (default: %(default)s)")
+    made.add_argument("--workers", type=int, default=1, help="parallel runs, in processes (default: %(default)s)")
     made.add_argument("--out", type=Path, default=RUNS, help="folder for all runs (default: %(default)s)")
     return made
 
 
 def carry_out(library: str, learn: Callable[[Run], Verdict], options: argparse.Namespace) -> None:
-    """Carry out all runs of a script that have not been carried out before.
+    """Carry out the missing runs of a script.
 
     Args:
-        library: Who learns.
-        learn: Carries out one run; a function of a module, so that other processes find it.
-        options: Of the command line.
+        library: The learning library.
+        learn: The function that carries out one run; at module level, so that other processes can import it.
+        options: The options of the command line.
     """
     options.out.mkdir(parents=True, exist_ok=True)
     runs = [
@@ -157,7 +157,7 @@ def carry_out(library: str, learn: Callable[[Run], Verdict], options: argparse.N
         for question in options.questions
         for seed in options.seeds
     ]
-    # Those who need what another run has learnt come after all others.
+    # runs that need the policy of another run come last
     for stage in ([run for run in runs if not run.asked.needs], [run for run in runs if run.asked.needs]):
         pending = [run for run in stage if not _done(run)]
         for run, verdict in zip(pending, each(learn, pending, options.workers), strict=True):
@@ -165,16 +165,16 @@ def carry_out(library: str, learn: Callable[[Run], Verdict], options: argparse.N
 
 
 def each(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
-    """Do jobs, one after the other or several at a time; what comes out stands in their order.
+    """Run jobs in processes; the results come in the order of the jobs.
 
     Args:
-        function: Does a job; such as can be pickled.
-        jobs: What is to be done.
-        workers: In how many processes. None of them is this one: in theirs, all sets of strings have the same order,
-            on which it depends what RLlib comes to.
+        function: The function that runs a job; it must be picklable.
+        jobs: The arguments of the function.
+        workers: The number of processes. The calling process is none of them, because the hash seed is fixed in the
+            workers: RLlib's results depend on the order of sets of strings.
     """
     os.environ["PYTHONHASHSEED"] = "0"
-    context = multiprocessing.get_context("spawn")  # forks of a process that may have threads are no good
+    context = multiprocessing.get_context("spawn")  # a process with threads should not fork
     with ProcessPoolExecutor(workers, context) as executor:
         yield from executor.map(function, jobs)
 

@@ -1,14 +1,14 @@
-"""Questions 1, 2, 3 and 5, answered by PPO of stable-baselines3.
+"""Questions 1, 2, 3 and 5, answered by Stable-Baselines3's PPO.
 
 ``python -m examples.greenhouse_coop.experiment.sb3``
 
-What its environments are is all there is to a question. Learning is the same for all of them:
+Questions differ in their environment alone. Learning is the same for all of them:
 
-- Actions are rescaled from [-1, 1] by Gymnasium's wrapper, as the library wants them.
-- Rewards are divided by the deviation of returns, by the library's ``VecNormalize``. Observations are what they are:
-  all of them lie between 0 and 1.
-- The deviation of actions begins with 0.37 instead of 1 (``log_std_init``): at 1 nearly a third of all actions would
-  lie outside of the space, and be clipped to one of its ends.
+- Gymnasium's wrapper rescales actions from [-1, 1], as the library recommends.
+- The library's ``VecNormalize`` divides rewards by the standard deviation of returns. Observations stay as they are,
+  between 0 and 1.
+- The standard deviation of actions starts at 0.37 instead of 1 (``log_std_init``). With 1, nearly a third of all
+  actions would lie outside the space and be clipped to its bounds.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .runs import Log, Run, carry_out, parser
 LIBRARY: Final = "sb3"
 
 GREENHOUSES: Final = 16
-"""How many are kept side by side, to learn from."""
+"""The number of parallel environments for training."""
 
 SETTINGS: Final[dict[str, Any]] = {
     "learning_rate": 3e-4,
@@ -50,17 +50,17 @@ SETTINGS: Final[dict[str, Any]] = {
 }
 
 DAYS_A_POINT: Final = 5 * GREENHOUSES * SETTINGS["n_steps"]
-"""After how many days there is a point of the learning curve."""
+"""The number of days between two points of the learning curve."""
 
 POINTS: Final = WATERING | VENTILATION
 
 
 def environment(run: Run, fixed: Team) -> gymnasium.Env[Any, Any]:
-    """The environment in which a question is answered: another view of the same simulation for each.
+    """Make the environment of a question: a view of the same simulation.
 
     Args:
         run: The run.
-        fixed: Who is answered by a fixed policy.
+        fixed: The fixed policies, by agent.
     """
     match run.question:
         case "1":
@@ -74,12 +74,12 @@ def environment(run: Run, fixed: Team) -> gymnasium.Env[Any, Any]:
 
 
 def fixed_in(run: Run) -> Team:
-    """Who is answered by a fixed policy: a constant, or what another run has brought about."""
+    """Return the fixed policies of a run: constants, or the policy that another run has trained."""
     return load(run.of(run.asked.needs)) if run.asked.needs else run.asked.fixed
 
 
 def learn(run: Run) -> Verdict:
-    """Carry out a run."""
+    """Train for a run, and evaluate the result."""
     torch.set_num_threads(1)
     fixed = fixed_in(run)
 
@@ -93,7 +93,7 @@ def learn(run: Run) -> Verdict:
     log.judge(0, team)
     while model.num_timesteps < run.budget:
         days = min(DAYS_A_POINT, run.budget - model.num_timesteps)
-        model.learn(days, reset_num_timesteps=False)  # in whole rollouts: the last one may go beyond the budget
+        model.learn(days, reset_num_timesteps=False)  # in whole rollouts: the last one may exceed the budget
         log.judge(model.num_timesteps, team)
     model.save(run.stem.with_suffix(".zip"))
     greenhouses.close()
@@ -101,12 +101,12 @@ def learn(run: Run) -> Verdict:
 
 
 def act(model: PPO, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a model does, without exploring.
+    """Compute a model's actions without exploration.
 
     Args:
         model: The model.
-        observation: Of one agent, float32 ``(6,)``. The joint agent is asked when the day begins, and both of its parts
-            observe the same.
+        observation: The observation of one agent, float32 ``(6,)``. The joint agent decides at the beginning of a day,
+            when both of its parts observe the same.
     """
     (size,) = model.observation_space.shape
     actions, _ = model.predict(np.tile(observation, size // len(observation)), deterministic=True)
@@ -114,7 +114,7 @@ def act(model: PPO, observation: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def load(run: Run) -> Team:
-    """The team that a run has brought about."""
+    """Load the team that a run has trained."""
     path = run.stem.with_suffix(".zip")
     if not path.exists():
         raise SystemExit(f"{path} is missing: question {run.question} of seed {run.seed} has to be answered first")
@@ -123,7 +123,7 @@ def load(run: Run) -> Team:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Carry out what has not been carried out before."""
+    """Carry out the missing runs."""
     questions = ("1", "2", "3", "5a", "5b", "5c")
     options = parser(__doc__ or "", budget=60_000, questions=questions).parse_args(arguments)
     carry_out(LIBRARY, learn, options)

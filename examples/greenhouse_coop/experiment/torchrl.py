@@ -1,20 +1,20 @@
-"""Question 4, answered by IPPO and MAPPO of TorchRL.
+"""Question 4, answered by IPPO and MAPPO with TorchRL.
 
 ``python -m examples.greenhouse_coop.experiment.torchrl``
 
-Two agents with a network each decide in rounds, in the PettingZoo parallel environment. In 4a each has a critic of its
-own, which sees what its agent sees (IPPO). In 4b there is one critic, which sees the greenhouse itself (MAPPO): the
-simulation's ``state()``, which a subclass defines here, outside of the model. As both agents observe the same in a
-round, what they observe taken together would be no more than what each of them knows.
+Two agents, each with its own network, decide in rounds in the PettingZoo parallel environment. In 4a each agent has its
+own critic, which sees the agent's observation (IPPO). In 4b there is one centralised critic (MAPPO), which sees the
+simulation's ``state()``; a subclass defines it here, outside of the model. The concatenated observations would not do
+as a state: in a round both agents observe the same, so they contain no more than each agent knows.
 
-Networks, advantages and losses are TorchRL's. It also has a wrapper for PettingZoo environments, and a collector;
-as the greenhouse is quick, most of the time would pass in these. Here sixteen environments stand side by side instead,
-and one call of the networks decides for all of them.
+Networks, advantages and losses are TorchRL's. TorchRL also has a wrapper for PettingZoo environments and a collector,
+but as the greenhouse is fast, they would take most of the time. Instead, sixteen environments run in parallel here, and
+one call of the networks decides for all of them.
 
 Learning is, as far as the libraries allow, the same as in ``sb3``:
 
-- Actions are normal variables, clipped to [-1, 1] and rescaled; their deviation begins with 0.37.
-- Rewards are divided by 20, about the deviation of returns.
+- Actions are normally distributed, clipped to [-1, 1] and rescaled; their standard deviation starts at 0.37.
+- Rewards are divided by 20, about the standard deviation of returns.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .runs import Log, Run, carry_out, parser
 LIBRARY: Final = "torchrl"
 
 GREENHOUSES: Final = 16
-"""How many are kept side by side, to learn from."""
+"""The number of parallel environments for training."""
 
 SETTINGS: Final[dict[str, Any]] = {
     "learning_rate": 3e-4,
@@ -62,7 +62,7 @@ SETTINGS: Final[dict[str, Any]] = {
 }
 
 BATCHES_A_POINT: Final = 5
-"""After how many batches there is a point of the learning curve."""
+"""The number of batches between two points of the learning curve."""
 
 
 # -- environments ---------------------------------------------------------------------------------
@@ -72,7 +72,7 @@ STATE: Final = Box(-np.inf, np.inf, (3 + 3 * len(LEVELS),), np.float32)
 
 
 class WholeGreenhouse(GreenhouseSim):
-    """The same simulation, which also tells those who train what no agent observes."""
+    """The same simulation with a global state for training, which no agent observes."""
 
     def state(self) -> NDArray[np.float64]:
         """Weather and day, and the deciles of water, health and thirst of all plants: ``(36,)``."""
@@ -84,14 +84,14 @@ class WholeGreenhouse(GreenhouseSim):
 
 
 class Greenhouses:
-    """Sixteen parallel environments, kept side by side."""
+    """Sixteen PettingZoo parallel environments that run side by side."""
 
     def __init__(self, question: str, seed: int) -> None:
-        """Furnish them.
+        """Create the environments.
 
         Args:
-            question: What is asked: only a centralised critic sees the state.
-            seed: Determines what they are like.
+            question: The key of the question: the environments have a state for a centralised critic alone.
+            seed: The seed of the greenhouses.
         """
         self._central = question == "4b"
         self._environments = [self._furnished() for _ in range(GREENHOUSES)]
@@ -102,10 +102,10 @@ class Greenhouses:
         return parallel_env(WholeGreenhouse, state_space=STATE) if self._central else parallel_env(GreenhouseSim)
 
     def collect(self, actor: ProbabilisticActor) -> TensorDict:
-        """Let an actor keep them for some days, as it explores.
+        """Collect a batch with an actor that explores.
 
         Returns:
-            A batch of shape ``(greenhouses, days)``, with keys as TorchRL's losses and estimators of value want them.
+            A batch of shape ``(greenhouses, days)``, with the keys that TorchRL's losses and value estimators expect.
         """
         days = []
         for _ in range(SETTINGS["days"]):
@@ -137,7 +137,7 @@ class Greenhouses:
         return self._look(environment, observations)
 
     def _look(self, environment: SimulationParallelEnv, observations: dict[str, Any]) -> Any:
-        """What agents observe, ``(2, 6)``, and the state, ``(36,)``, or nothing of it."""
+        """Return the agents' observations, ``(2, 6)``, and the state, ``(36,)``, or an empty array in its place."""
         state = environment.state() if self._central else np.zeros(0, np.float32)
         return np.stack([observations[agent] for agent in BOTH]), state
 
@@ -152,12 +152,12 @@ class Greenhouses:
 
 @dataclass(frozen=True)
 class Networks:
-    """What learns.
+    """The networks that learn.
 
     Attributes:
-        means: From observations, ``(..., 2, 6)``, to what becomes actions by rescaling, ``(..., 2, 1)``.
-        actor: The same as distributions of actions, in TorchRL's terms.
-        critic: What it is going to be worth, ``(..., 2, 1)``.
+        means: Maps observations, ``(..., 2, 6)``, to the means of actions before rescaling, ``(..., 2, 1)``.
+        actor: TorchRL's actor on top of these means: distributions of actions.
+        critic: The estimate of the value, ``(..., 2, 1)``.
     """
 
     means: nn.Module
@@ -166,7 +166,7 @@ class Networks:
 
     @classmethod
     def of(cls, question: str) -> Networks:
-        """Make the networks that answer a question."""
+        """Make the networks for a question."""
         cells: dict[str, Any] = {"num_cells": SETTINGS["cells"], "activation_class": nn.Tanh}
         own: dict[str, Any] = {"n_agents": 2, "centralized": False, "share_params": False, **cells}
         observation, loc, scale, action, log_prob, value = (
@@ -185,14 +185,14 @@ class Networks:
             in_keys={"loc": loc, "scale": scale},
             out_keys=[action],
             distribution_class=IndependentNormal,
-            default_interaction_type=ExplorationType.RANDOM,  # outside of TorchRL's collectors it would be the mean
+            default_interaction_type=ExplorationType.RANDOM,  # outside TorchRL's collectors, the default is the mean
             return_log_prob=True,
             log_prob_key=log_prob,
         )
         return cls(means, actor, critic)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What the agents do, without exploring: both are asked when the day begins, and observe the same."""
+        """Compute the agents' actions without exploration. At the beginning of a day, both observe the same."""
         with torch.no_grad():
             means = self.means(torch.from_numpy(observation).expand(2, -1)).reshape(2)
         return rescaled(means)
@@ -207,7 +207,7 @@ def rescaled(actions: torch.Tensor) -> NDArray[np.float32]:
 
 
 def learn(run: Run) -> Verdict:
-    """Carry out a run."""
+    """Train for a run, and evaluate the result."""
     torch.set_num_threads(1)
     torch.manual_seed(run.seed)
     networks = Networks.of(run.question)
@@ -217,7 +217,7 @@ def learn(run: Run) -> Verdict:
     log = Log(run, {"greenhouses": GREENHOUSES, **SETTINGS})
     log.judge(0, team)
     days = GREENHOUSES * SETTINGS["days"]
-    batches = -(-run.budget // days)  # whole ones: the last may go beyond the budget
+    batches = -(-run.budget // days)  # whole batches: the last one may exceed the budget
     for number in range(1, batches + 1):
         teach(greenhouses.collect(networks.actor))
         if number % BATCHES_A_POINT == 0 or number == batches:
@@ -227,7 +227,7 @@ def learn(run: Run) -> Verdict:
 
 
 class Teacher:
-    """Teaches networks by PPO."""
+    """PPO for the networks."""
 
     def __init__(self, networks: Networks) -> None:
         """Make the loss and its optimiser."""
@@ -239,7 +239,7 @@ class Teacher:
             critic_coeff=0.5,
             loss_critic_type="l2",
             normalize_advantage=True,
-            normalize_advantage_exclude_dims=(-2,),  # by itself for each agent
+            normalize_advantage_exclude_dims=(-2,),  # separately for each agent
         )
         names = ("reward", "action", "value", "done", "terminated", "advantage", "value_target", "sample_log_prob")
         own = {"value": "state_value", "sample_log_prob": "log_prob"}
@@ -266,7 +266,7 @@ class Teacher:
 
 
 def load(run: Run) -> Team:
-    """The team that a run has brought about."""
+    """Load the team that a run has trained."""
     path = run.stem.with_suffix(".pt")
     if not path.exists():
         raise SystemExit(f"{path} is missing: question {run.question} of seed {run.seed} has to be answered first")
@@ -276,7 +276,7 @@ def load(run: Run) -> Team:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Carry out what has not been carried out before."""
+    """Carry out the missing runs."""
     options = parser(__doc__ or "", budget=60_000, questions=("4a", "4b")).parse_args(arguments)
     carry_out(LIBRARY, learn, options)
 

@@ -180,7 +180,7 @@ def main() -> int:
     play(chosen.driver, chosen.episodes - warm, draw)
     seconds = time.perf_counter() - start
     after = figures()
-    print(f"{chosen.driver}: {chosen.episodes} episodes, {(chosen.episodes - warm) / seconds:.0f} a second")
+    print(f"{chosen.driver}: {chosen.episodes} episodes, {(chosen.episodes - warm) / seconds:.0f} per second")
     for name, value in after.items():
         print(f"  {name:12} {before[name]:>9} after {warm}, {value:>9} after all")
     grown = [name for name in ("threads", "greenlets", "descriptors") if after[name] > before[name]]

@@ -169,7 +169,7 @@ def main() -> None:
     building = Building(seed=0)
     building.run()
     for zone in building.zones:
-        print(f"{zone.name}: {zone.energy:.1f} kWh, {zone.cost:.2f} in all, {zone.temperature:.1f} °C in the end")
+        print(f"{zone.name}: {zone.energy:.1f} kWh, {zone.cost:.2f} in total, {zone.temperature:.1f} °C at the end")
     building.close()
 
 

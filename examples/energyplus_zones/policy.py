@@ -18,7 +18,7 @@ from .model import COMFORT
 WARM, COLD = COMFORT + 0.2, 15.0
 
 BEGIN, LATEST = 8.5, 10.0
-"""The hour at which the room should be warm, and the hour after which nobody arrives."""
+"""The hour at which the room should be warm, and the hour after which no people arrive."""
 
 HOURS_PER_DEGREE: Final = 1.0
 """The time that the heater takes to warm the room by one degree, in hours."""

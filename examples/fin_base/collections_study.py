@@ -67,7 +67,7 @@ class Thresholds:
 
 
 LEARNED: Final = Thresholds(letters=7.63, attempts=20.0, call=1.35, sue=8.4)
-"""What ``main`` finds by default, rounded."""
+"""The rounded result of ``main`` with its default options."""
 
 
 def rate(policy: Any, seeds: Sequence[int], simulation: Any = CollectionSim) -> float:

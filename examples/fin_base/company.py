@@ -78,7 +78,7 @@ class Company(Entity):
         manager: The manager of its assets.
         regulator: The regulator that supervises it.
         measured_short: The number of yearly measurements in a row at which its policy coverage was below the minimum.
-        rations: What each pension contract got in the last month, if the money did not suffice for all, in cents.
+        rations: The cents paid by each pension contract in the last month, if the money did not suffice for all.
         indexed: The current amount of a right that was 1 in the first month, after indexation and cuts.
     """
 
@@ -154,7 +154,7 @@ class Company(Entity):
         return cost * (0.8 if self.policy_coverage() >= REQUIRED else 1.0), min(1.3 * cost, HIGHEST_PREMIUM)
 
     def repair(self) -> float:
-        """How much more than inflation rights may grow, where coverage has the level required in the long run.
+        """The lawful growth of rights in addition to inflation, if coverage has the level required in the long run.
 
         Returns:
             A fifth of the gap between rights and prices.

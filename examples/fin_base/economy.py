@@ -101,7 +101,7 @@ class Climate:
         yield_memory: The share of a deviation from the mean that remains after a year.
         equity_premium: The excess of the mean log return of equities over the mean yield.
         equity_sd: Standard deviation of that return.
-        correlations: Of the shocks to inflation and yield, inflation and equities, yield and equities.
+        correlations: The correlations of the shocks to inflation and yield, inflation and equities, yield and equities.
     """
 
     inflation: float = 0.02

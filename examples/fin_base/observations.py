@@ -12,23 +12,23 @@ from .company import Company
 from .people import Client
 
 OBSERVED: Final = (
-    "coverage, up to 10",
-    "policy coverage, up to 10",
-    "yearly measurements below the minimum, in a row",
+    "coverage, at most 10",
+    "policy coverage, at most 10",
+    "number of yearly measurements in a row below the minimum",
     "share of equities",
-    "yield, in tens of per cent",
-    "inflation, in tens of per cent",
-    "what has become of a right of 1, in first prices",
+    "yield, times 10",
+    "inflation, times 10",
+    "purchasing power of a right that was 1 in the first month",
 )
 """The observation of the company, for the single agents."""
 
 OF_A_CLIENT: Final = (
-    "age, by 100 years",
-    "wage, by 100,000 in first prices",
-    "rights, by the wage",
-    "how much more than the standard is accrued",
-    "what the standard accrual costs, by the wage",
-    "savings, by the wage",
+    "age / 100 years",
+    "wage / 100,000, in prices of the first month",
+    "rights / wage",
+    "contribution beyond the standard",
+    "cost of the standard accrual / wage",
+    "savings / wage",
 )
 """The observation of a client, which follows that of the company."""
 

@@ -161,10 +161,10 @@ def _surcharge(policy: Any, age: int, coverage: float) -> float:
     observed = USUAL.copy()
     names = (*OBSERVED, *OF_A_CLIENT)
     observed[0] = observed[1] = coverage
-    observed[names.index("age, by 100 years")] = age / 100
-    observed[names.index("rights, by the wage")] = 0.0175 * (age - 25)
+    observed[names.index("age / 100 years")] = age / 100
+    observed[names.index("rights / wage")] = 0.0175 * (age - 25)
     # the cost of an accrual is discounted by the years until retirement, at 2.5 % a year; from 67 on it is 14 pensions
-    observed[names.index("what the standard accrual costs, by the wage")] = 0.0175 * 14 * 1.025 ** (age - 67)
+    observed[names.index("cost of the standard accrual / wage")] = 0.0175 * 14 * 1.025 ** (age - 67)
     lowest = SURCHARGES[0] if coverage >= REQUIRED else 1.0
     return max(SURCHARGES[round(policy.share(observed) * (len(SURCHARGES) - 1))], lowest)
 

@@ -147,7 +147,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     Returns:
         The share of decisions in which both agree, and the mean return with each.
     """
-    parser = argparse.ArgumentParser(description="Clone the rule that ventilates.")
+    parser = argparse.ArgumentParser(description="Clone the ventilation rule from a data set, and compare.")
     parser.add_argument("--episodes", type=int, default=50, help="greenhouses to learn from (default: %(default)s)")
     parser.add_argument("--steps", type=int, default=3000, help="batches to learn from (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=32, help="greenhouses to compare on (default: %(default)s)")
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
         WARM, {VENTILATOR: learned}, others={WATERER: sparing}, seeds=unseen, tolerance=TOLERANCE
     )[VENTILATOR]
     differences = np.abs(compared.policy_actions - compared.trajectories.actions)
-    print(f"agree in {compared.agreement:.1%} of the decisions; differ by {differences.max():.3f} at most")
+    print(f"agreement: {compared.agreement:.1%} of the decisions; largest difference: {differences.max():.3f}")
     results = {"agreement": compared.agreement}
     for title, ventilate in (("rule", RULE), ("imitation", learned)):
         collected = collect_episodes(WARM, {WATERER: sparing, VENTILATOR: ventilate}, seeds=unseen)

@@ -60,7 +60,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Compare the farms' rule with two simple policies.")
     parser.add_argument("--seeds", type=int, default=20, help="number of seeds (default: 20)")
     found = compare(range(parser.parse_args().seeds))
-    print("what all farms and shops earned:", found.summary().round(1).to_string(), sep="\n")
+    print("total earnings of farms and shops:", found.summary().round(1).to_string(), sep="\n")
     print("means:", *(f"{metric}: {found.values(metric).mean().round(2).to_dict()}" for metric in METRICS), sep="\n")
 
 

@@ -529,7 +529,7 @@ class Client {
         if (!found) return;
         int length = 0;
         if (std::sscanf(found, "%d,%d%n", &in_, &out_, &length) != 2 || found[length])
-            throw std::invalid_argument(std::string("SIMENV_MARL_FDS is to be two descriptors, R,W, not ") + found);
+            throw std::invalid_argument(std::string("SIMENV_MARL_FDS must be two descriptors, R,W, and is ") + found);
         for (const int descriptor : {in_, out_})
             if (fcntl(descriptor, F_SETFD, FD_CLOEXEC) == -1)  // child processes must not keep the pipes open
                 throw std::invalid_argument(std::string("SIMENV_MARL_FDS=") + found + ": " + std::strerror(errno));
@@ -563,7 +563,7 @@ class Client {
             } catch (const std::exception& caught) {
                 error(caught);
             } catch (...) {
-                error("unknown", "the model has thrown what is no std::exception");
+                error("unknown", "the model has thrown an exception that is not a std::exception");
             }
         }
         return failed_ ? 1 : 0;
@@ -582,7 +582,7 @@ class Client {
         const bool seeded = number && !number->is_null();
         const std::optional<std::uint64_t> sent = seeded ? number->integer<std::uint64_t>() : drawn();
         if (!start || !start->is_object() || !sent)
-            return fail("no start of an episode with a seed of 64 bits: " + frame->text()), std::nullopt;
+            return fail("expected the start of an episode with a 64-bit seed, got: " + frame->text()), std::nullopt;
         const Json* given = start->find("options");
         calls_ = 0, refused_ = 0;
         state_ = State::running;

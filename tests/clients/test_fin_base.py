@@ -10,7 +10,7 @@ from simenv_marl import evaluate
 
 from .page import blocks
 
-UNSEEN = range(2_000_000, 2_000_032)
+UNSEEN = range(2_000_000, 2_000_128)
 
 
 @pytest.fixture(autouse=True)

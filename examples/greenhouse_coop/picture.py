@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 COLOURS: Final = ("#8c8c8c", "#c9c9c9", "#e3b778", "#d1812c", "#7fb3d3", "#1b6f5f")
-"""In the order of the table: grey where nobody thinks, orange where constants were searched for, then the learnt."""
+"""In the order of the table: grey without a search, orange for searched constants, then the learned policies."""
 
 INK: Final = "#333333"
 

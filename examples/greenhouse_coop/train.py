@@ -3,7 +3,7 @@
 ``python -m examples.greenhouse_coop.train`` (or ``make demo``) trains the waterer and the ventilator by evolution
 (CMA-ES), looks for the best constant decisions to compare them with, and lets all of them keep greenhouses that they
 have never seen. It prints a table and draws a picture. All of it happens in ``raw_env``, the PettingZoo environment of
-both agents, in which ``RULE`` answers for whoever is to behave as the model has it.
+both agents, in which ``RULE`` answers for agents that are to follow the model's rule.
 
 The same options bring the same result, on any number of processes.
 """
@@ -366,7 +366,7 @@ def explain(outcomes: Sequence[Outcome]) -> str:
 def tabulate(results: Mapping[str, Sequence[Outcome]]) -> Table:
     """Make the table of a comparison."""
     number = len(next(iter(results.values())))
-    table = Table(title=f"{number} greenhouses that nobody was trained on: mean ± standard deviation")
+    table = Table(title=f"{number} greenhouses that no policy was trained on: mean ± standard deviation")
     table.add_column("who decides")
     for column in ("return", f"alive, day {DAYS}", "litres poured"):
         table.add_column(column, justify="right")

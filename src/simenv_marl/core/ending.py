@@ -164,7 +164,7 @@ class Ending(Participants):
     def without_decision(self) -> str:
         """Make the message for an episode that ended without a decision for the environment's user."""
         points = ", ".join(point.point.name for point in self._plan.active)
-        ended = f"{type(self._simulation).__name__}.run() came to its end without a decision of"
+        ended = f"{type(self._simulation).__name__}.run() ended without a decision of"
         if self.answered:
             wanted = f"{self._plan.one_agent!r} at {points}" if self._plan.one_agent else points
             return f"{ended} {wanted}; these have decided: {listed(self.answered)}"

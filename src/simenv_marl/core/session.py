@@ -259,7 +259,8 @@ class Session:
             again.close()
             raise BranchError(
                 f"{type(self.simulation).__name__} does not come to the same decision again when it is reset with the"
-                ' same seed and given the same actions: something in it is random for itself. Use method="fork", or'
+                " same seed and given the same actions: some of its random numbers do not follow from the seed. Use"
+                ' method="fork", or'
                 " global_rng=True if it draws from Python's or NumPy's global generators"
             )
         return again
@@ -291,10 +292,9 @@ class Session:
         """
         if self._rng is None and not callable(getattr(self.simulation, "reseed", None)):
             raise BranchError(
-                f"seeds= draws anew what {type(self.simulation).__name__} leaves to chance, and nothing says how: give"
-                " it a method reseed(seed) that seeds its generators in place (simenv_marl.reseed_generators(self,"
-                " seed) finds them), or make the environment with global_rng=True if it draws from Python's or NumPy's"
-                " global ones"
+                f"seeds= needs a way to reseed {type(self.simulation).__name__}: give it a method reseed(seed)"
+                " that seeds its generators in place (simenv_marl.reseed_generators(self, seed) finds them), or make"
+                " the environment with global_rng=True if it draws from Python's or NumPy's global generators"
             )
 
     def reseed(self, seed: int) -> None:

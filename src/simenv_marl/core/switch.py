@@ -193,7 +193,7 @@ class BaseDriver:
                 return problems
         if self.given_up is None:
             self.given_up = (
-                f"refuses to end: it went on after {UNWINDING_TRIES} times SimulationExit was raised in it; it is left"
+                f"refuses to end: it went on after SimulationExit was raised in it {UNWINDING_TRIES} times; it is left"
                 " suspended. Let the model re-raise exceptions that it does not know; callbacks from C need a"
                 " CallbackGuard"
             )

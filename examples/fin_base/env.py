@@ -437,9 +437,9 @@ def _register() -> None:
     register_simulation(FundSim, TEAM, name="fin_base", state_space=STATE_SPACE)
     if "fin_base/MixWithGoal-v0" not in gymnasium.registry:
         gymnasium.register("fin_base/MixWithGoal-v0", f"{__name__}:mix_env")
-    known = getattr(pettingzoo, "aec_registry", None)  # PettingZoo has a registry since 1.26
+    known = getattr(pettingzoo, "aec_registry", None)  # since PettingZoo 1.26, and with "-" for "_"
     for name in ("board", "premium"):
-        if known is not None and f"fin_base/{name}_v0" not in known:
+        if known is not None and f"fin_base/{name}-v0" not in known:
             pettingzoo.register("aec", f"fin_base/{name}_v0", f"{__name__}:{name}_env")
 
 

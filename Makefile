@@ -73,7 +73,7 @@ test-oldest: .venv-oldest/.oldest
 
 # What is published. The wheel is tested with what the source distribution contains, but for the sources: nothing can stand
 # in for what the wheel lacks.
-TESTED_WITH := cffi gevent hypothesis mesa[network] pytest pytest-xdist simpy trio
+TESTED_WITH := cffi gevent hypothesis mesa[network] pillow pytest pytest-xdist simpy trio
 WHEEL_TESTS := $(CHECK_TESTS) tests/many/test_workers.py tests/test_command_line.py tests/examples/test_greenhouse.py README.md
 test-wheel:
 	rm -rf dist build/sdist

@@ -1,5 +1,7 @@
 """The base class of all views: the session, the spaces, rendering and the state."""
 
+from __future__ import annotations
+
 import copy
 import weakref
 from collections.abc import Callable

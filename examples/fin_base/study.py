@@ -235,14 +235,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Learn, run, and show the results."""
     parser = argparse.ArgumentParser(description="Which policies decide best for a pension fund, and in which worlds?")
     parser.add_argument("--seeds", type=int, default=32, help="funds in each world (default: %(default)s)")
-    parser.add_argument("--large", type=int, default=8, help="funds of 10,000 clients (default: %(default)s)")
+    parser.add_argument("--large", type=int, default=0, help="funds of 10,000 clients (default: %(default)s)")
     parser.add_argument("--generations", type=int, default=24, help="generations of learning (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=OUT, help="folder for all results (default: %(default)s)")
     parser.add_argument("--figures", type=Path, help="folder for figures and tables (default: the same)")
     parser.add_argument("--quick", action="store_true", help="a small run, to check that everything works")
     if parser.parse_args(arguments).quick:
-        parser.set_defaults(seeds=2, large=0, generations=2, out=OUT.with_name("study-quick"))
+        parser.set_defaults(seeds=2, generations=2, out=OUT.with_name("study-quick"))
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     found = learned(options.out, options.generations, min(options.seeds, 12), options.workers)

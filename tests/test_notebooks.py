@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import gc
 import io
 import json
 import sys
@@ -49,8 +50,9 @@ def test_a_notebook_runs_in_an_empty_folder(page, tmp_path, monkeypatch):
                 got = run(source, names)
                 assert doctest.OutputChecker().check_output(want, got, FLAGS), source
         names.clear()
-    for model in ("bakery", "lake"):
+    for model in ("bakery", "bakery_env", "lake"):
         sys.modules.pop(model, None)
+    gc.collect()  # what is left of the notebook's models would be found by their names
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import seaborn
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from pandas import DataFrame
 
 from simenv_marl import Evaluation, effects, simulate
 
+from ..report import markdown, new_figure
 from .env import INDEXATIONS, MIXES, SURCHARGES
 from .law import INDEXING, MINIMUM, REQUIRED
 from .observations import OBSERVED, OF_A_CLIENT
@@ -49,18 +49,23 @@ def compared(table: Any) -> str:
         told = (f"{own.right:.1%}", f"{own.coverage:.0%}", f"{own.premium:.1%}", f"{own.short:.1f}", f"{own.cuts:.1f}")
         rows.append((name, f"{found['mean']:.0f}", better, *told))
     columns = ("who decides", "welfare", "more than the rule", "a right buys", "coverage", "premium", "short", "cuts")
-    return _markdown(columns, rows)
+    return markdown(columns, rows)
 
 
-def everywhere(table: Any) -> str:
-    """Tabulate how much better than the rule each contender is, in each world."""
+def in_worlds(table: Any) -> dict[str, Any]:
+    """Summarise the welfare of the contenders in each world, compared with the rule."""
+    worlds = table.groupby(list(FACTORS), sort=False)
+    return {", ".join(levels): _against_rule(own).summary("welfare") for levels, own in worlds}
+
+
+def everywhere(worlds: Mapping[str, Any]) -> str:
+    """Tabulate how much better than the rule each contender is, in each world of ``in_worlds``."""
     rows = []
-    for levels, own in table.groupby(list(FACTORS), sort=False):
-        summary = _against_rule(own).summary("welfare")
+    for levels, summary in worlds.items():
         differences = [_difference(found, "+.0f") for name, found in summary.iterrows() if name != "rule"]
-        rows.append((", ".join(levels), f"{summary.loc['rule', 'mean']:.0f}", *differences))
-    names = [name for name in COLOURS if name != "rule" and name in set(table.contender)]
-    return _markdown((", ".join(FACTORS), "rule", *names), rows)
+        rows.append((levels, f"{summary.loc['rule', 'mean']:.0f}", *differences))
+    names = next(iter(worlds.values())).index.drop("rule")
+    return markdown((", ".join(FACTORS), "rule", *names), rows)
 
 
 def moved(table: Any) -> str:
@@ -69,7 +74,7 @@ def moved(table: Any) -> str:
     for name in dict.fromkeys(table.contender):
         found = effects(table, of="welfare", contender=name).main["mean"].groupby("factor", sort=False)
         rows.append((name, *(f"{own.iloc[1] - own.iloc[0]:+.0f}" for _, own in found)))
-    return _markdown(("who decides", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
+    return markdown(("who decides", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
 
 
 def sizes(at_home: Any, large: Any) -> str:
@@ -77,7 +82,7 @@ def sizes(at_home: Any, large: Any) -> str:
     few = at_home[at_home.seed.isin(set(large.seed)) & at_home.contender.isin(set(large.contender))]
     small, big = (_against_rule(own).summary("welfare") for own in (few, large))
     rows = [(name, *(_difference(own.loc[name], "+.0f") for own in (small, big))) for name in big.index[1:]]
-    return _markdown((f"{len(set(large.seed))} seeds", f"{CLIENTS} clients", f"{LARGE:,} clients"), rows)
+    return markdown((f"{len(set(large.seed))} seeds", f"{CLIENTS} clients", f"{LARGE:,} clients"), rows)
 
 
 def _against_rule(table: Any) -> Evaluation:
@@ -90,25 +95,15 @@ def _difference(found: Any, form: str) -> str:
     return f"{found['difference']:{form}} ({low:{form}} to {high:{form}})"
 
 
-def _markdown(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
-
-
 # -- figures --------------------------------------------------------------------------------------
 
 
-def draw_worlds(table: Any) -> Figure:
-    """Draw how much better than the rule each contender is in each world, with intervals."""
-    rows = []
-    for levels, own in table.groupby(list(FACTORS), sort=False):
-        for name, found in _against_rule(own).summary("welfare").iterrows():
-            if name != "rule":
-                rows.append((", ".join(levels), name, found["difference"], _difference(found, "+.0f")))
-    cells = DataFrame(rows, columns=["world", "who", "better", "told"])
-    order = list(dict.fromkeys(cells.world)), list(dict.fromkeys(cells.who))
-    better, told = (cells.pivot(index="world", columns="who", values=of).loc[order] for of in ("better", "told"))
-    figure = _figure(11, 4.2)
+def draw_worlds(worlds: Mapping[str, Any]) -> Figure:
+    """Draw how much better than the rule each contender is in each world of ``in_worlds``, with intervals."""
+    without_rule = {levels: summary.drop("rule") for levels, summary in worlds.items()}
+    better = DataFrame({levels: own["difference"] for levels, own in without_rule.items()}).T
+    told = DataFrame({levels: own.apply(_difference, axis=1, form="+.0f") for levels, own in without_rule.items()}).T
+    figure = new_figure(11, 4.2)
     axes = figure.subplots()
     most = float(np.nanmax(abs(better.to_numpy())))
     seaborn.heatmap(
@@ -122,7 +117,7 @@ def draw_worlds(table: Any) -> Figure:
 
 def draw_learned(found: Mapping[str, Policies]) -> Figure:
     """Draw the decisions of the trained policies beside the model's rules, with all other observations typical."""
-    figure = _figure(11, 3.4)
+    figure = new_figure(11, 3.4)
     mix, by, premium = figure.subplots(1, 3)
     coverage = np.linspace(0.8, 1.8, 101)
     pair, shared = found["trained pair"], found["trained premiums"][PREMIUM]
@@ -171,7 +166,7 @@ def _surcharge(policy: Any, age: int, coverage: float) -> float:
 
 def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
     """Draw rights and coverage over the years: medians, and the range from the 10 % to the 90 % quantile."""
-    figure = _figure(9.5, 3.4)
+    figure = new_figure(9.5, 3.4)
     rights, coverages = figure.subplots(1, 2)
     for name, policies in (("rule", {}), ("trained pair", found["trained pair"])):
         funds = [simulate(world(), policies, seed=HELD_OUT + seed, points=POINTS) for seed in range(seeds)]
@@ -196,12 +191,6 @@ def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
     return figure
 
 
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
-    return figure
-
-
 def show(table: Any, large: Any, found: Mapping[str, Policies], folder: Path) -> None:
     """Write all figures and tables to a folder, and print the tables.
 
@@ -213,7 +202,8 @@ def show(table: Any, large: Any, found: Mapping[str, Policies], folder: Path) ->
     """
     folder.mkdir(parents=True, exist_ok=True)
     at_home = table[(table[list(HOME)] == list(HOME.values())).all(axis=1)]
-    texts = {"compared": compared(at_home), "worlds": everywhere(table), "moved": moved(table)}
+    worlds = in_worlds(table)
+    texts = {"compared": compared(at_home), "worlds": everywhere(worlds), "moved": moved(table)}
     if large is not None:
         texts["sizes"] = sizes(at_home, large)
     for name, text in texts.items():
@@ -221,7 +211,7 @@ def show(table: Any, large: Any, found: Mapping[str, Policies], folder: Path) ->
         print(text)
     few = len(at_home[at_home.contender == "rule"]) < 16
     drawn = {
-        "worlds": draw_worlds(table),
+        "worlds": draw_worlds(worlds),
         "learned": draw_learned(found),
         "years": draw_years(found, 4 if few else DRAWN),
     }

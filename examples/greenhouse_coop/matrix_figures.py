@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import seaborn
 from matplotlib import pyplot
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from pandas import DataFrame
 from statsmodels.formula.api import ols
@@ -17,6 +14,7 @@ from statsmodels.stats.anova import anova_lm
 
 from simenv_marl import Evaluation, effects
 
+from ..report import markdown, new_figure
 from .matrix import FACTORS, HOME, SCHOOLS
 
 AT_HOME, ALL_OVER = SCHOOLS
@@ -53,7 +51,7 @@ def compared(means: Any) -> str:
             apart = "" if name == AT_HOME else _between(found, "difference", "+.1f")
             alive, litres = others.loc[name]
             rows.append((plants, name, _between(found, "mean", ".1f"), apart, f"{alive:.0%}", f"{litres:.2f}"))
-    return _markdown(("plants", "who waters", "return", f"more than {AT_HOME}", "alive", "litres a pot and day"), rows)
+    return markdown(("plants", "who waters", "return", f"more than {AT_HOME}", "alive", "litres a pot and day"), rows)
 
 
 def _between(found: Any, name: str, form: str) -> str:
@@ -67,7 +65,7 @@ def moved(means: Any) -> str:
     for name in dict.fromkeys(means.contender):
         levels = effects(means, contender=name).main["mean"].groupby("factor", sort=False)
         rows.append((name, *(f"{value:.1f}" for value in levels.max() - levels.min())))
-    return _markdown(("who waters", *FACTORS), rows)
+    return markdown(("who waters", *FACTORS), rows)
 
 
 def learners(table: Any) -> str:
@@ -76,7 +74,7 @@ def learners(table: Any) -> str:
     home = team[(team[list(HOME)] == list(HOME.values())).all(axis=1)].groupby("contender")["return"].mean()
     by_plants = team.pivot_table(index="contender", columns="plants", values="return", sort=False)
     rows = [(name, *(f"{value:.1f}" for value in (home[name], *own))) for name, own in by_plants.iterrows()]
-    return _markdown(("who waters", "the paper's greenhouse", *(f"{plants} plants" for plants in by_plants)), rows)
+    return markdown(("who waters", "the paper's greenhouse", *(f"{plants} plants" for plants in by_plants)), rows)
 
 
 def shares(means: Any) -> str:
@@ -86,12 +84,7 @@ def shares(means: Any) -> str:
     found = anova_lm(ols(formula, means).fit(), typ=2)
     share = (found["sum_sq"] / found["sum_sq"].sum()).sort_values(ascending=False)
     rows = [(name.replace("C(", "").replace(")", "").replace(":", " x "), f"{own:.1%}") for name, own in share.items()]
-    return _markdown(("due to", "share of the variance"), rows)
-
-
-def _markdown(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
+    return markdown(("due to", "share of the variance"), rows)
 
 
 # -- figures --------------------------------------------------------------------------------------
@@ -130,7 +123,7 @@ def draw_behind(means: Any) -> Any:
             apart, low, high = summary.loc[name, ["difference", "difference_low", "difference_high"]]
             rows.append((*levels, name, apart, f"{apart:+.0f} ({low:+.0f} to {high:+.0f})"))
     behind = DataFrame(rows, columns=[*FACTORS, "contender", "apart", "said"])
-    figure = _figure(9.5, 4.2)
+    figure = new_figure(9.5, 4.2)
     for axes, name in zip(figure.subplots(1, len(SCHOOLS), sharey=True), SCHOOLS, strict=True):
         cells = behind[behind.contender == name].pivot(index=["climate", "exchange"], columns="plants")
         cells = cells.reindex(list(dict.fromkeys(zip(behind.climate, behind.exchange, strict=True))))
@@ -147,7 +140,7 @@ def draw_behind(means: Any) -> Any:
 
 def draw_factors(means: Any) -> Any:
     """Draw the effect of each factor on each contender: means over the other factors, seed by seed."""
-    figure = _figure(9.5, 3.2)
+    figure = new_figure(9.5, 3.2)
     for axes, factor in zip(figure.subplots(1, len(FACTORS), sharey=True), FACTORS, strict=True):
         by_seed = means.groupby([factor, "contender", "seed"], sort=False, as_index=False)["return"].mean()
         seaborn.pointplot(
@@ -160,12 +153,6 @@ def draw_factors(means: Any) -> Any:
         [Line2D([], [], color=colour, marker="o", markersize=5) for colour in COLOURS.values()], list(COLOURS),
         loc="outside upper center", ncols=len(COLOURS), frameon=False,
     )  # fmt: skip
-    return figure
-
-
-def _figure(width: float, height: float) -> Any:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
     return figure
 
 

@@ -100,11 +100,9 @@ def draw(points: Sequence[Point], along: Callable[[Point], float], label: str, p
         label: The label of the x axis.
         path: The file to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # imported here, so that forks do not load it
-    from matplotlib.figure import Figure
+    from ..report import new_figure  # imported here, so that forks do not load Matplotlib
 
-    figure = Figure(figsize=(8, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
+    figure = new_figure(8, 4.2)
     axes = figure.add_subplot()
     for line in LINES:
         own = [point for point in points if point[0] == line.title]

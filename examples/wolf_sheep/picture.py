@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+
+from ..report import new_figure
 
 FIGURES: Final = Path(__file__).parents[2] / "docs" / "figures"
 
@@ -44,8 +44,7 @@ def draw_training(course: Sequence[Mapping[str, str]], results: Mapping[str, Any
         results: The results that ``results`` has written, for the line of the rule.
         path: The file to write.
     """
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
+    figure = new_figure(10, 3.8)
     left, right = figure.subplots(1, 2)
     for axes, what, title in (
         (left, "sheep", "Sheep on the meadow, on average over 100 ticks"),
@@ -80,8 +79,7 @@ def _draw_course(axes: Axes, course: Sequence[Mapping[str, str]], what: str, nam
 
 def draw_results(results: Mapping[str, Any], path: Path) -> None:
     """Draw the numbers of sheep and wolves under each policy, and the lengths of the sheep's lives."""
-    figure = Figure(figsize=(11, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11, 6.4)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
     sheep = figure.add_subplot(grid[0, 0])
     wolves = figure.add_subplot(grid[1, 0], sharex=sheep)

@@ -17,9 +17,9 @@ from typing import Any, Final
 
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ...report import new_figure
 from ..env import DAYS
 from .questions import QUESTIONS
 
@@ -167,8 +167,7 @@ def _place(library: str, question: str, median: float) -> tuple[bool, str | floa
 
 def draw_curves(curves: pd.DataFrame, path: Path) -> None:
     """Draw the learning curves: medians and quartiles over seeds, against simulated days."""
-    figure = Figure(figsize=(12, 5.4), layout="constrained")
-    FigureCanvasAgg(figure)  # neither a window nor pyplot's global state
+    figure = new_figure(12, 5.4)
     left, right = figure.subplots(1, 2, sharey=True)
     for axes, (heading, colours) in zip((left, right), PANELS, strict=True):
         _draw_lines(axes, curves)
@@ -210,8 +209,7 @@ def draw_finals(finals: pd.DataFrame, path: Path) -> None:
     """Draw the final results: a dot for each seed, a line for the median, and a bar between the quartiles."""
     groups = list(finals.groupby(["library", "question"], sort=False))
     groups.sort(key=lambda group: _place(group[0][0], group[0][1], group[1].value.median()), reverse=True)
-    figure = Figure(figsize=(12, 0.8 + 0.34 * len(groups)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(12, 0.8 + 0.34 * len(groups))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.6))
     for axes in (left, right):
         for row, ((library, _), runs) in enumerate(groups):

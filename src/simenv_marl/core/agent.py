@@ -239,29 +239,20 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
         try:
             if reward and agent.decided:
                 value = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-                if type(value) is not float or value - value != 0.0:
-                    value = checked_reward(agent, value)
-                agent.reward = value
+                agent.reward = checked_reward(agent, value)
             elif reward and not last:  # the agent has not acted yet, so this value rewards nothing
                 reward_mapping(*args, **kwargs)
                 agent.decided, agent.settle_again = True, again
             if observe:
                 first, agent.present = not agent.present, True
                 if legal is not None:
-                    try:
-                        agent.mask, agent.choices = legal(args, kwargs)
-                    except MaskError:
-                        if not last:
-                            raise
-                        # The agent will not be asked again, so no action needs to be legal.
-                        agent.mask, agent.choices = point.open_mask(), None
+                    agent.mask, agent.choices = _legal_at_end(point, args, kwargs) if last else legal(args, kwargs)
                 agent.info = {} if quiet and agent.clock is None else agent.inform()
                 if masked:
                     agent.observation = point.observe(args, kwargs, agent.mask)
                 else:
-                    agent.observation = cast(
-                        observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args)
-                    )
+                    seen = observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args)
+                    agent.observation = cast(seen)
                 if first and point.finite is not None:
                     point.finite(agent.observation)
         finally:
@@ -277,9 +268,7 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
             before, EVALUATING[here] = EVALUATING.get(here), agent
         try:
             reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-            if type(reward) is not float or reward - reward != 0.0:
-                reward = checked_reward(agent, reward)
-            agent.reward = reward
+            agent.reward = checked_reward(agent, reward)
             agent.info = {} if agent.clock is None else agent.tell_time()
             agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
         finally:
@@ -293,12 +282,23 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
     return settle, again
 
 
+def _legal_at_end(point: BoundPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, Any]:
+    """Find the legal actions at the agent's end: it will not be asked again, so no action needs to be legal."""
+    legal: Any = point.legal
+    try:
+        return legal(args, kwargs)  # type: ignore[no-any-return]
+    except MaskError:
+        return point.open_mask(), None
+
+
 def checked_reward(agent: Agent, reward: Any) -> float:
     """Convert a reward to a Python float.
 
     Raises:
         RewardError: The reward is not one finite number.
     """
+    if type(reward) is float and reward - reward == 0.0:  # as a rule: a finite number
+        return reward
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):
         raise RewardError(f"the reward {shown(reward)} is not one number")

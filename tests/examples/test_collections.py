@@ -42,6 +42,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.testing import check_simulation
+from tests.worlds.models import follow_the_rule
 
 ROOT = Path(__file__).parents[2]
 DAYS = 60
@@ -294,34 +295,11 @@ def test_a_plan_ends_with_the_second_missed_instalment_or_with_the_debt(case):
 # -- the environments -----------------------------------------------------------------------------
 
 
-def by_rule_aec(environment, seed):
-    environment.reset(seed=seed)
-    for agent in environment.agent_iter():
-        environment.step(None if environment.terminations[agent] or environment.truncations[agent] else RULE)
-    return environment.simulation.agency
-
-
-def by_rule_parallel(environment, seed):
-    environment.reset(seed=seed)
-    while environment.agents:
-        environment.step(dict.fromkeys(environment.agents, RULE))
-    return environment.simulation.agency
-
-
-def by_rule_single(environment, seed):
-    environment.reset(seed=seed)
-    over = False
-    while not over:
-        _, _, terminated, truncated, _ = environment.step(RULE)
-        over = terminated or truncated
-    return environment.simulation.agency
-
-
 VIEWS = {
-    "aec": (aec_env, by_rule_aec),
-    "parallel": (parallel_env, by_rule_parallel),
-    "single": (single_env, by_rule_single),
-    "joint": (joint_env, by_rule_single),
+    "aec": aec_env,
+    "parallel": parallel_env,
+    "single": single_env,
+    "joint": joint_env,
 }
 ROSTER = {"possible_agents": [f"debtor_{number}" for number in range(20)], "undeclared": "rule"}
 
@@ -330,11 +308,10 @@ ROSTER = {"possible_agents": [f"debtor_{number}" for number in range(20)], "unde
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("points", [CASES, NAMED_CASES, COLLECTOR, NAMED_COLLECTOR])
 def test_the_rule_through_every_view_is_the_plain_run(view, points, driver):
-    make, play = VIEWS[view]
     options = {"driver": driver}
     if points in (CASES, NAMED_CASES):
         options |= {"joint": ROSTER, "single": {"agent": "debtor_3"}}.get(view, {})
-    agency = play(make(CollectionSim(DAYS), points, **options), 4)
+    agency = follow_the_rule(VIEWS[view](CollectionSim(DAYS), points, **options), 4).agency
     expected = plain(4, agency.world.month)
     assert view == "single" or agency.world.month == DAYS
     assert state(agency) == state(expected)

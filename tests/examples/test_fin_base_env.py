@@ -38,6 +38,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 from simenv_marl import RULE, InvalidActionError, aec_env, branch, joint_env, parallel_env, single_env, vector_env
 from simenv_marl.__main__ import main
 from simenv_marl.testing import check_simulation
+from tests.worlds.models import follow_the_rule
 
 from .test_fin_base import state, with_coverage
 
@@ -60,47 +61,24 @@ def plain(seed, years=12):
     return simulation.fund
 
 
-def by_rule_aec(environment, seed):
-    environment.reset(seed=seed)
-    for agent in environment.agent_iter():
-        environment.step(None if environment.terminations[agent] or environment.truncations[agent] else RULE)
-    return environment.simulation.fund
-
-
-def by_rule_parallel(environment, seed):
-    environment.reset(seed=seed)
-    while environment.agents:
-        environment.step(dict.fromkeys(environment.agents, RULE))
-    return environment.simulation.fund
-
-
-def by_rule_single(environment, seed):
-    environment.reset(seed=seed)
-    over = False
-    while not over:
-        _, _, terminated, truncated, _ = environment.step(RULE)
-        over = terminated or truncated
-    return environment.simulation.fund
-
-
 VIEWS = {
-    "aec board": (aec_env, BOARD, by_rule_aec),
-    "aec premiums": (aec_env, PREMIUMS, by_rule_aec),
-    "aec all": (aec_env, BOARD | PREMIUMS, by_rule_aec),
-    "parallel board": (parallel_env, BOARD, by_rule_parallel),
-    "parallel premiums": (parallel_env, PREMIUMS, by_rule_parallel),
-    "joint board": (joint_env, BOARD, by_rule_single),
-    "single manager": (single_env, MANAGER, by_rule_single),
-    "single goal": (single_env, MIX_WITH_GOAL, by_rule_single),
-    "single regulator": (single_env, REGULATOR, by_rule_single),
+    "aec board": (aec_env, BOARD),
+    "aec premiums": (aec_env, PREMIUMS),
+    "aec all": (aec_env, BOARD | PREMIUMS),
+    "parallel board": (parallel_env, BOARD),
+    "parallel premiums": (parallel_env, PREMIUMS),
+    "joint board": (joint_env, BOARD),
+    "single manager": (single_env, MANAGER),
+    "single goal": (single_env, MIX_WITH_GOAL),
+    "single regulator": (single_env, REGULATOR),
 }
 
 
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("driver", ["greenlet", "thread"])
 def test_the_rule_through_every_view_is_the_plain_run(view, driver):
-    make, points, play = VIEWS[view]
-    fund, expected = play(make(small(), points, driver=driver), 4), plain(4)
+    make, points = VIEWS[view]
+    fund, expected = follow_the_rule(make(small(), points, driver=driver), 4).fund, plain(4)
     assert state(fund) == state(expected)
     assert fund.world.counts == expected.world.counts
 
@@ -108,7 +86,7 @@ def test_the_rule_through_every_view_is_the_plain_run(view, driver):
 def test_the_single_view_of_one_client_by_rule_is_the_plain_run():
     fund = plain(4)
     name = next(client.name for client in clients_of(fund.world) if client.works)
-    assert state(by_rule_single(single_env(small(), PREMIUMS, agent=name), 4)) == state(fund)
+    assert state(follow_the_rule(single_env(small(), PREMIUMS, agent=name), 4).fund) == state(fund)
 
 
 def test_a_vector_whose_managers_act_as_the_rule_earns_what_the_rule_earns():
@@ -305,7 +283,7 @@ def test_a_state_for_critics():
     environment.reset(seed=1)
     first = environment.state()
     assert STATE_SPACE.contains(first)
-    by_rule_aec(environment, 1)
+    follow_the_rule(environment, 1)
     assert STATE_SPACE.contains(environment.state())
     assert first[-1] < environment.state()[-1] == 1
 

@@ -58,12 +58,17 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _freeze():
-    """Spare the collector's calls what the files before have left: it is the same from now on."""
-    yield
-    gc.collect()
-    gc.freeze()
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Spare the collector's calls what the files before have left: it is the same from now on.
+
+    Not in a fixture: until this hook returns, the test holds its fixtures, and what is frozen is never collected.
+    """
+    result = yield
+    if nextitem is None or nextitem.path != item.path:
+        gc.collect()
+        gc.freeze()
+    return result
 
 
 @pytest.fixture

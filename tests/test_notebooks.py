@@ -2,17 +2,15 @@
 
 import ast
 import doctest
-import gc
 import io
 import json
-import sys
 from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
 from tools.notebooks import PAGES, notebook, write_notebooks
 
-from tests.worlds.undone import registries_put_back
+from tests.worlds.undone import models_of_pages_forgotten, registries_put_back
 
 DOCS = Path(__file__).parents[1] / "docs"
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -32,7 +30,7 @@ def test_a_notebook_runs_in_an_empty_folder(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     names = {"__name__": "__main__"}
-    with registries_put_back():
+    with registries_put_back(), models_of_pages_forgotten():
         for cell in notebook(DOCS, page)["cells"]:
             if cell["cell_type"] == "markdown":
                 continue
@@ -40,19 +38,16 @@ def test_a_notebook_runs_in_an_empty_folder(page, tmp_path, monkeypatch):
             if source.startswith("%%writefile "):
                 name, text = source.removeprefix("%%writefile ").split("\n", 1)
                 Path(name).write_text(text, encoding="utf-8")
-                monkeypatch.delitem(sys.modules, Path(name).stem, raising=False)
             elif outputs and outputs[0]["output_type"] == "error":
                 with pytest.raises(Exception, match=r".") as raised:
                     run(source, names)
-                assert type(raised.value).__name__ == outputs[0]["ename"].rpartition(".")[2]
+                assert raised.typename == outputs[0]["ename"].rpartition(".")[2]
+                del raised
             else:
                 want = outputs[0]["text"] if outputs else ""
                 got = run(source, names)
                 assert doctest.OutputChecker().check_output(want, got, FLAGS), source
         names.clear()
-    for model in ("bakery", "bakery_env", "lake"):
-        sys.modules.pop(model, None)
-    gc.collect()  # what is left of the notebook's models would be found by their names
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import CodeType
 from typing import Any
+
+from tests.worlds.undone import models_of_pages_forgotten
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -41,9 +42,8 @@ def steps(section: str, monkeypatch: Any) -> Iterator[dict[str, Any]]:
         After each block, the names that the code has left behind.
     """
     monkeypatch.syspath_prepend(DOCS)
-    for model in ("bakery", "bakery_env", "lake"):
-        monkeypatch.delitem(sys.modules, model, raising=False)
     names: dict[str, Any] = {"__name__": "__main__"}
-    for code in blocks("clients.md", section):
-        exec(code, names)
-        yield names
+    with models_of_pages_forgotten():
+        for code in blocks("clients.md", section):
+            exec(code, names)
+            yield names

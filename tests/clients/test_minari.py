@@ -24,6 +24,7 @@ from simenv_marl import (
 from simenv_marl.many import demonstrations
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script
+from tests.worlds.undone import models_of_pages_forgotten
 
 minari = pytest.importorskip("minari")
 
@@ -353,12 +354,11 @@ def test_the_page_on_demonstrations_does_what_it_says(monkeypatch):
     """With the examples that need Minari, which are skipped where it is not there."""
     page = Path(__file__).parents[2] / "docs" / "demonstrations.md"
     monkeypatch.syspath_prepend(page.parent)
-    for model in ("bakery", "bakery_env"):
-        monkeypatch.delitem(sys.modules, model, raising=False)
     examples = DocTestParser().get_doctest(page.read_text(encoding="utf-8"), {}, page.name, str(page), 0)
     skipped = [example.options.pop(SKIP, False) for example in examples.examples]
     assert sum(skipped) > 3
-    assert DocTestRunner(optionflags=ELLIPSIS | NORMALIZE_WHITESPACE).run(examples).failed == 0
+    with models_of_pages_forgotten():
+        assert DocTestRunner(optionflags=ELLIPSIS | NORMALIZE_WHITESPACE).run(examples).failed == 0
 
 
 def test_the_example_imitates_the_rule(capsys):

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import gc
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
 import pettingzoo
+
+MODELS_OF_PAGES = ("bakery", "bakery_env", "lake")
+"""The modules that pages of the documentation import from the folder they are in."""
 
 
 @contextmanager
@@ -21,6 +26,25 @@ def registries_put_back() -> Iterator[None]:
         for registry, entries in zip(registries, before, strict=True):
             registry.clear()
             registry.update(entries)
+
+
+@contextmanager
+def models_of_pages_forgotten() -> Iterator[None]:
+    """Have the models of pages imported anew, and forget them afterwards.
+
+    Names of decision points would find the decorated functions of an earlier import as long as these exist.
+    """
+    _forget_models_of_pages()
+    try:
+        yield
+    finally:
+        _forget_models_of_pages()
+
+
+def _forget_models_of_pages() -> None:
+    for model in MODELS_OF_PAGES:
+        sys.modules.pop(model, None)
+    gc.collect()
 
 
 @contextmanager

@@ -1,8 +1,48 @@
 """What tests ask of other processes."""
 
 import os
+import subprocess
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+from simenv_marl.core.options import Options
+
+ROOT = Path(__file__).parents[1]
+
+
+def alone(function: Callable[..., None], *arguments: Any) -> None:
+    """Call a function of a test file in a process of its own, where no other test has left anything open.
+
+    Environments have the driver of the test that calls.
+
+    Args:
+        function: The function. It is not called in this process.
+        arguments: Its arguments: strings and numbers.
+    """
+    code = f"""
+from simenv_marl.core.options import Options
+from {function.__module__} import {function.__name__}
+Options.__init__.__kwdefaults__["driver"] = {(Options.__init__.__kwdefaults__ or {})["driver"]!r}
+{function.__name__}(*{arguments!r})
+"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), str(ROOT)])}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def descriptors() -> dict[str, str]:
+    """What this process has open: the descriptors, and what they lead to."""
+    found = {}
+    for number in os.listdir("/proc/self/fd"):
+        try:
+            found[number] = os.readlink(f"/proc/self/fd/{number}")
+        except FileNotFoundError:  # the one that listed the folder
+            continue
+    return found
 
 
 def runs(number: int) -> bool:

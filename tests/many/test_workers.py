@@ -26,6 +26,7 @@ from simenv_marl import (
     simulate_many,
 )
 from simenv_marl.many import spread
+from tests.processes import alone, descriptors
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import PAIR, decision, define, notes, script
 
@@ -338,7 +339,12 @@ class Ending:
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="descriptors are not told of")
 @pytest.mark.parametrize("what", ["it cannot be started", "it ends"])
-def test_a_worker_that_cannot_work_leaves_no_descriptors(what, monkeypatch):
+def test_a_worker_that_cannot_work_leaves_no_descriptors(what):
+    alone(work_in_vain, what)
+
+
+def work_in_vain(what: str) -> None:
+    """Simulate with workers that cannot work, again and again, and look for what is left open."""
     loky = joblib.externals.loky
 
     def refuse(process):
@@ -351,9 +357,9 @@ def test_a_worker_that_cannot_work_leaves_no_descriptors(what, monkeypatch):
             simulate_many(model, {Creature.act: policy}, points=POINTS, seeds=range(4), workers=2)
         loky.get_reusable_executor().shutdown(wait=True)
         gc.collect()
-        return len(os.listdir("/proc/self/fd"))
+        return len(descriptors())
 
     if what == "it cannot be started":
-        monkeypatch.setattr(loky.backend.process.LokyProcess, "start", refuse)
+        loky.backend.process.LokyProcess.start = refuse
     first = max(run(), run())  # joblib keeps some for the next time
     assert min(run(), run()) <= first  # some of it goes a little later

@@ -24,7 +24,7 @@ from simenv_marl import (
 from simenv_marl.remote.child import _Process
 from tests.outside.reservoirs import BOTH, INFLOW, PRICE, broken, by_its_rule, reservoirs
 from tests.outside.test_process import all_told, child, ruled
-from tests.processes import runs
+from tests.processes import alone, descriptors, runs
 from tests.worlds.faulty import AT_ONCE, FAULTS
 
 IN_MID_EPISODE = {
@@ -234,7 +234,12 @@ def test_an_error_in_a_mapping_breaks_the_episode_off_and_leaves_the_process():
 
 
 def test_descriptors_and_processes_are_given_back():
-    before = len(os.listdir("/proc/self/fd"))
+    alone(fail_many_times)
+
+
+def fail_many_times() -> None:
+    """End processes in all ways in which they fail, and look for what is left open."""
+    before = descriptors()
     for what in ("exit 3", "garbage", "silence"):
         env = aec_env(broken("in mid-episode", what), "reservoir.inflow")
         env.reset(seed=1)
@@ -247,7 +252,7 @@ def test_descriptors_and_processes_are_given_back():
     for _ in range(3):
         with pytest.raises(ProcessDiedError):
             aec_env(broken("at once", "exit 3")).reset()
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert descriptors() == before
 
 
 def test_a_process_that_does_not_end_is_ended():
@@ -299,8 +304,13 @@ def test_an_interrupt_ends_the_process(when, tmp_path):
     assert caught.tb  # all that the traceback holds lives
 
 
-def test_no_descriptor_is_left_where_there_are_no_more(monkeypatch):
-    before, pipes, pipe = len(os.listdir("/proc/self/fd")), [], os.pipe
+def test_no_descriptor_is_left_where_there_are_no_more():
+    alone(run_out_of_descriptors)
+
+
+def run_out_of_descriptors() -> None:
+    """Start a process that gets one of its two pipes, and look for what is left open."""
+    before, pipes, pipe = descriptors(), [], os.pipe
 
     def scarce():
         if pipes:
@@ -308,7 +318,7 @@ def test_no_descriptor_is_left_where_there_are_no_more(monkeypatch):
         pipes.append(1)
         return pipe()
 
-    monkeypatch.setattr(os, "pipe", scarce)
+    os.pipe = scarce  # type: ignore[assignment]
     with pytest.raises(ProcessDiedError, match="too many open files"):
         reservoirs().reset()
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert descriptors() == before

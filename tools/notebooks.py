@@ -1,17 +1,21 @@
-"""Make notebooks of pages: the same text and the same code, with the outputs that the page shows.
+"""Make notebooks of pages: the same text and the same code, executed.
 
-``docs/conf.py`` calls ``write_notebooks`` when Sphinx builds the pages. The tests run the code of the pages and of the
-notebooks.
+``docs/conf.py`` calls ``write_notebooks`` when Sphinx builds the pages. A notebook that shows something else than its
+page ends the build.
 """
 
 from __future__ import annotations
 
-import json
+import logging
 import re
 from collections.abc import Iterator
-from doctest import DocTestParser
+from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, DocTestParser, OutputChecker
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import nbformat
+from nbclient import NotebookClient
 
 PAGES = ("tutorial", "many-agents", "planning")
 """The pages that have a notebook."""
@@ -22,17 +26,72 @@ DOWNLOAD = re.compile(r"\{download\}`([\w.]+)`")
 NOTEBOOK = re.compile(r"\n[^\n]*\{download\}`[^`]*\.ipynb>`[^\n]*\n")
 
 
-def write_notebooks(docs: Path) -> None:
-    """Write a notebook of each of ``PAGES`` into ``_notebooks``.
+SECONDS: Final = 300
+"""How long a cell may take."""
+
+LOG = logging.getLogger(__name__)
+LOG.setLevel(logging.WARNING)
+
+FLAGS = ELLIPSIS | NORMALIZE_WHITESPACE
+
+
+def write_notebooks(docs: Path, pages: tuple[str, ...] = PAGES) -> None:
+    """Write the executed notebooks of pages into ``_notebooks``.
 
     Args:
         docs: The folder of the pages.
+        pages: The names of the pages.
+
+    Raises:
+        ValueError: A cell shows something else than the page.
     """
     folder = docs / "_notebooks"
     folder.mkdir(exist_ok=True)
-    for page in PAGES:
-        text = json.dumps(notebook(docs, page), indent=1) + "\n"
-        (folder / f"{page}.ipynb").write_text(text, encoding="utf-8")
+    for page in pages:
+        nbformat.write(executed(notebook(docs, page)), folder / f"{page}.ipynb")  # type: ignore[no-untyped-call]
+
+
+def executed(made: Any) -> Any:
+    """Execute a notebook in an empty folder.
+
+    Args:
+        made: The notebook, with the outputs of the page.
+
+    Returns:
+        A notebook with the outputs of the cells.
+
+    Raises:
+        ValueError: A cell shows something else than the page.
+    """
+    found = nbformat.from_dict(made)  # type: ignore[no-untyped-call]
+    with TemporaryDirectory() as folder:
+        NotebookClient(
+            found,
+            timeout=SECONDS,
+            resources={"metadata": {"path": folder}},
+            extra_arguments=["--log-level=ERROR"],  # of the kernel, which warns of its own ports
+            log=LOG,
+        ).execute()
+    for cell, run in zip(made["cells"], found["cells"], strict=True):
+        if cell["cell_type"] == "code" and not cell["source"].startswith("%%writefile"):
+            expected, shown = _shown(cell["outputs"]), _shown(run["outputs"])
+            if not OutputChecker().check_output(expected, shown, FLAGS):
+                raise ValueError(f"{cell['source']}\nshows\n{shown}\nand its page has\n{expected}")
+    return found
+
+
+def _shown(outputs: list[Any]) -> str:
+    """Return what a cell prints, its value or the name of its error."""
+    texts = []
+    for output in outputs:
+        match output["output_type"]:
+            case "stream" if output["name"] == "stdout":
+                texts.append(output["text"])
+            case "execute_result":
+                texts.append(output["data"]["text/plain"] + "\n")
+            case "error":
+                texts.append(output["ename"].rpartition(".")[2] + "\n")
+    return "".join(texts)
 
 
 def notebook(docs: Path, page: str) -> dict[str, Any]:
@@ -43,7 +102,7 @@ def notebook(docs: Path, page: str) -> dict[str, Any]:
         page: The name of the page.
 
     Returns:
-        The notebook, in format 4.5.
+        The notebook, in format 4.5, with the outputs that the page shows.
     """
     cells = []
     for number, cell in enumerate(_cells(docs, NOTEBOOK.sub("\n", (docs / f"{page}.md").read_text(encoding="utf-8")))):

@@ -18,12 +18,23 @@ from .clients import page
 SOURCES = Path(simenv_marl.__file__).parent
 
 
-def run(code, **names):
-    exec(code, names)
-    return names
+@pytest.fixture
+def run():
+    """Runs code, and returns its names."""
+    all_names = []
+
+    def execute(code):
+        names = {}
+        all_names.append(names)
+        exec(code, names)
+        return names
+
+    yield execute
+    for names in all_names:
+        names.clear()  # a suspended simulation holds its globals, and these hold its environment
 
 
-def test_the_front_page():
+def test_the_front_page(run):
     (code,) = page.blocks("index.md")
     env = run(code)["env"]
     assert env.reset(seed=1)[0] == [5.0]
@@ -45,14 +56,14 @@ def turns(env, seed):
     return told
 
 
-def test_a_hand_written_environment_and_its_successor_tell_the_same():
+def test_a_hand_written_environment_and_its_successor_tell_the_same(run):
     before, after = map(run, page.blocks("coming-from-pettingzoo.md"))
     told = [turns(before["StallEnv"](), seed) for seed in range(20)]
     assert told == [turns(after["env"], seed) for seed in range(20)]
     assert len({len(episode) for episode in told}) > 3  # the seller is not asked every day
 
 
-def test_the_environment_of_the_paper_in_todays_words(monkeypatch):
+def test_the_environment_of_the_paper_in_todays_words(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "model", model)
     _, after = page.blocks("coming-from-sim-env.md")
     names = run(after)

@@ -109,3 +109,17 @@ def test_the_page_names_errors_that_there_are():
     text = (page.DOCS / "troubleshooting.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`([A-Z]\w+Error)`", text))
     assert {name for name in named if not hasattr(builtins, name)} <= set(simenv_marl.errors.__all__)
+
+
+# -- the terms of the field -----------------------------------------------------------------------
+
+TERMS = (
+    "parameter sharing", "centralised training", "CTDE", "self-play", "black death", "discrete-event simulation",
+    "agent-based model", "semi-MDP", "callback", "hook", "DAgger", "action mask", "PPO", "wrapper", "seed", "pickle",
+    "AEC", "turn-based", "MARL", "behavior cloning",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_the_glossary_explains_the_terms_that_users_search_for(term):
+    assert term in (page.DOCS / "glossary.md").read_text(encoding="utf-8").splitlines()

@@ -15,7 +15,8 @@ def run(decide, seed, days):
     weather, level = random.Random(seed), 50.0
     for day in range(days):
         level += weather.uniform(0, 10)
-        outlet = decide("dam.outlet", "north", day, {"level": round(level, 2)}, rule=lambda level=level: level / 10)
+        seen = {"level": round(level, 2)}
+        outlet = decide("dam.outlet", "north", day, seen, rule=lambda level=level: level / 10)
         level = max(0.0, level - outlet)
     return {"level": round(level, 2)}
 

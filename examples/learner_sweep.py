@@ -44,7 +44,7 @@ class Training:
     """A training run, as a simulation.
 
     Attributes:
-        found: The comparison of the trained waterer with the model's rule: a row of ``Evaluation.summary``.
+        found: A row of ``Evaluation.summary``: the trained waterer compared with the model's rule.
     """
 
     def __init__(self, days: int, held_out: int = HELD_OUT, **settings: Any) -> None:
@@ -82,7 +82,7 @@ GAIN: Final = {
 }
 """The gain over the rule, with its interval over the seeds of the evaluation."""
 
-# Learners seed the process's global generators; with global_rng=True each training has generators of its own.
+# Learners seed the process's global generators; global_rng=True separates those of each training.
 experiment = partial(run_experiment, Training, metric=GAIN, global_rng=True)
 
 
@@ -100,9 +100,11 @@ def search(folder: Path, days: int, trials: int, seeds: Sequence[int] = SEEDS) -
         gamma = trial.suggest_float("gamma", 0.5, 0.99)
         found = []
         for step, seed in enumerate(seeds):  # a single training may be lucky
-            found.append(simulate(Training(days, learning_rate=rate, gamma=gamma), seed=seed, global_rng=True).found)
+            training = Training(days, learning_rate=rate, gamma=gamma)
+            found.append(simulate(training, seed=seed, global_rng=True).found)
             mean = float(np.mean([own["difference"] for own in found]))
-            trial.set_user_attr("intervals", [[own["difference_low"], own["difference_high"]] for own in found])
+            intervals = [[own["difference_low"], own["difference_high"]] for own in found]
+            trial.set_user_attr("intervals", intervals)
             trial.report(mean, step)
             if trial.should_prune():  # do not train again with settings that are worse than most
                 raise optuna.TrialPruned
@@ -110,8 +112,14 @@ def search(folder: Path, days: int, trials: int, seeds: Sequence[int] = SEEDS) -
 
     storage = f"sqlite:///{folder / 'search.db'}"
     name = f"{days} days, {len(seeds)} seeds"
-    study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True, direction="maximize")
-    study.sampler = optuna.samplers.TPESampler(seed=len(study.trials))  # so that a resumed search draws other settings
+    study = optuna.create_study(
+        storage=storage,
+        study_name=name,
+        load_if_exists=True,
+        direction="maximize",
+    )
+    # a resumed search draws other settings
+    study.sampler = optuna.samplers.TPESampler(seed=len(study.trials))
     done = len(study.get_trials(states=(TrialState.COMPLETE, TrialState.PRUNED)))
     study.optimize(objective, n_trials=max(0, trials - done))
     return study

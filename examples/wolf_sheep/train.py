@@ -126,7 +126,7 @@ class Herd:
 
 
 def tensors(found: Trajectories) -> Any:
-    """Convert trajectories for TorchRL: ``done`` where a trajectory ends, ``terminated`` where it ends by death.
+    """Convert trajectories for TorchRL: ``done`` marks every end, ``terminated`` an end by death.
 
     Rewards are scaled so that the value of an endless life is 1.
     """

@@ -6,7 +6,7 @@
     |-- DefinitionError      (ValueError)    a definition that cannot work
     |-- SimulationError      (TypeError)     an object that is not a simulation
     |-- UnknownPointError    (LookupError)   a decision point that does not exist
-    |-- PatchError           (TypeError)     a function that cannot be made a decision point or exposed
+    |-- PatchError           (TypeError)     a function that cannot be replaced
     |-- UnknownTargetError   (LookupError)   a function to extend that does not exist
     |-- HandlerError         (ValueError)    a handler that does not fit, or is not attached
     |-- AgentError           (ValueError)    names of agents that clash or are not strings
@@ -29,12 +29,12 @@
     |-- WrongThreadError     (RuntimeError)  a simulation or decision in the wrong thread or process
     |-- MissingExtraError    (ImportError)   a package of an extra that is not installed
     |-- ProcessError         (RuntimeError)  an error of a simulator in another process
-    |   |-- ProcessDiedError    (ChildProcessError)  ... the process did not start, ended, or closed its pipe
+    |   |-- ProcessDiedError    (ChildProcessError)  ... the process did not start, or has ended
     |   |-- ProcessTimeoutError (TimeoutError)  ... the process did not answer or read in time
     |   |-- RemoteError                         ... the model in the process raised an error
     |   `-- WireError           (ValueError)    ... a message that the wire does not allow
     |-- StoreError           (OSError)       a store of an experiment that cannot be read or written
-    |-- WorkerError          (RuntimeError)  a worker process that died, or an error that cannot be pickled
+    |-- WorkerError          (RuntimeError)  a worker that died, or an error that cannot be pickled
     `-- CheckFailedError     (AssertionError) a simulation that failed a check
 
 Every error has its message as the only argument, so that it can be pickled.

@@ -18,7 +18,10 @@ class SteppedSimulation(SimulationInterface):
     Each ``reset`` makes a new model. The seed is passed as the argument ``seed``, or as ``rng`` if the model does not
     take ``seed``. For a model that takes a scenario, give a function::
 
-        SteppedSimulation(lambda seed, **given: WolfSheep(WolfSheepScenario(rng=seed, **given)), 200, width=30)
+        def meadow(seed, **given):
+            return WolfSheep(WolfSheepScenario(rng=seed, **given))
+
+        SteppedSimulation(meadow, 200, width=30)
 
     The loop ends when the model's attribute ``running`` is false, or when it is truncated.
 

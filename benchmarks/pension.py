@@ -24,7 +24,7 @@ from gymnasium import spaces
 
 from benchmarks import wolf_sheep
 from benchmarks.measure import Contender, Section, now, side_by_side
-from simenv_marl import RULE, aec_env
+from simenv_marl import aec_env
 
 SEED = 5
 YEARS = 10
@@ -143,18 +143,7 @@ def called(definition: Any) -> tuple[Any, float]:
 def aec(definition: Any) -> tuple[Any, float, int]:
     """Run an AEC environment, in the shortest loop."""
     env: Any = aec_env(FundSim(YEARS, FUND), {POINT: definition})
-    env.reset(seed=SEED)
-    decisions = 0
-    step = env.step
-    started = now()
-    for agent in env.agent_iter():
-        if env.terminations[agent] or env.truncations[agent]:
-            step(None)
-        else:
-            step(RULE)
-            decisions += 1
-    seconds = now() - started
-    env.close()
+    decisions, seconds = wolf_sheep.by_rule(env, SEED, look=False)
     return outcome(env.simulation), seconds, decisions
 
 

@@ -175,7 +175,13 @@ def plain() -> tuple[Any, int, float]:
 def aec(*, look: bool = True) -> tuple[Any, int, float]:
     """Run an AEC environment, in the loop of PettingZoo's documentation or in the shortest one."""
     env: Any = aec_env(Meadow, POINTS)
-    env.reset(seed=SEED)
+    decisions, seconds = by_rule(env, SEED, look=look)
+    return env.simulation.outcome(), decisions, seconds
+
+
+def by_rule(env: Any, seed: int, *, look: bool) -> tuple[int, float]:
+    """Run an episode of an AEC environment with ``RULE`` throughout; return the numbers of decisions and seconds."""
+    env.reset(seed=seed)
     decisions = 0
     last, step = env.last, env.step
     started = now()
@@ -192,7 +198,7 @@ def aec(*, look: bool = True) -> tuple[Any, int, float]:
             decisions += 1
     seconds = now() - started
     env.close()
-    return env.simulation.outcome(), decisions, seconds
+    return decisions, seconds
 
 
 def parallel() -> tuple[Any, int, float]:

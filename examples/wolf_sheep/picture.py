@@ -53,7 +53,7 @@ def draw_training(course: Sequence[Mapping[str, str]], results: Mapping[str, Any
         for sight, name in LEARNERS.items():
             _draw_course(axes, [row for row in course if int(row["sight"]) == sight], what, name)
         axes.set_title(title, fontsize=10)
-        axes.set_xlabel("decisions learnt from, in thousands")
+        axes.set_xlabel("decisions used for training, in thousands")
         axes.set_ylim(bottom=0)
         axes.margins(x=0)
         axes.spines[["top", "right"]].set_visible(False)
@@ -97,7 +97,7 @@ def draw_results(results: Mapping[str, Any], path: Path) -> None:
     sheep.set_title(f"Sheep: median and middle half of {meadows} meadows", fontsize=10)
     wolves.set_title("Wolves, which follow the model's rule throughout", fontsize=10)
     wolves.set_xlabel("tick")
-    lives.set_title("Share of the sheep that live for so many turns", fontsize=10)
+    lives.set_title("Share of sheep that live at least that long", fontsize=10)
     lives.set_xlabel("turns")
     lives.legend(frameon=False, fontsize=9, loc="upper right")
     for axes in (sheep, wolves, lives):
@@ -111,7 +111,7 @@ def draw_results(results: Mapping[str, Any], path: Path) -> None:
 def table(results: Mapping[str, Any]) -> str:
     """Make the table, in Markdown."""
     lines = [
-        "| who leads the sheep | meadows with sheep at the end | sheep at the end | turns per death | starved |",
+        "| policy of the sheep | meadows with sheep at the end | sheep at the end | turns per death | starved |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name, own in results["results"].items():

@@ -63,7 +63,7 @@ QUESTIONS: Final = {
     "4b": Question("both, as two with a centralised critic", BOTH, {}),
     "5a": Question("watering, constant ventilation", (WATERER,), _fixed(VENTILATOR)),
     "5b": Question("ventilation, constant watering", (VENTILATOR,), _fixed(WATERER)),
-    "5c": Question("ventilation, watering as learnt in 1", (VENTILATOR,), {}, needs="1"),
+    "5c": Question("ventilation, watering as learned in 1", (VENTILATOR,), {}, needs="1"),
 }
 
 

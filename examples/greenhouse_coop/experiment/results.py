@@ -47,7 +47,7 @@ LINES: Final = {
 
 PANELS: Final = (
     (
-        "Whose decision is learnt (SB3)",
+        "Which decision is learned (SB3)",
         {
             ("sb3", "3"): "#1b6f5f",
             ("sb3", "5a"): "#56b4a0",
@@ -58,7 +58,7 @@ PANELS: Final = (
         },
     ),
     (
-        "Both: by one agent or by two",
+        "Both decisions: one agent or two",
         {
             ("sb3", "3"): "#1b6f5f",
             ("torchrl", "4a"): "#2f6da8",
@@ -182,7 +182,7 @@ def draw_curves(curves: pd.DataFrame, path: Path) -> None:
                 label += f" - {name(library, question)}"
             axes.plot(median.index, median, color=colour, linewidth=1.8, label=label)
         axes.set_title(heading, loc="left", fontsize=11)
-        axes.set_xlabel("days simulated", fontsize=9)
+        axes.set_xlabel("simulated days", fontsize=9)
         axes.xaxis.set_major_formatter(lambda days, _: f"{days:,.0f}")
         axes.set_xlim(0, None)
         if axes.get_legend_handles_labels()[0]:
@@ -234,8 +234,8 @@ def draw_finals(finals: pd.DataFrame, path: Path) -> None:
             color=INK,
         )
     left.set_yticks(range(len(groups)), [f"{title(*key)}  {name(*key)}".rstrip() for key, _ in groups])
-    left.set_title("Greenhouses nobody was trained on", loc="left", fontsize=11)
-    right.set_title("The same, from three quarters of the best return on", loc="left", fontsize=11)
+    left.set_title("Held-out greenhouses", loc="left", fontsize=11)
+    right.set_title("The same, above three quarters of the best return", loc="left", fontsize=11)
     _save(figure, path)
 
 

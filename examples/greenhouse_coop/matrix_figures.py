@@ -51,7 +51,7 @@ def compared(means: Any) -> str:
             apart = "" if name == AT_HOME else _between(found, "difference", "+.1f")
             alive, litres = others.loc[name]
             rows.append((plants, name, _between(found, "mean", ".1f"), apart, f"{alive:.0%}", f"{litres:.2f}"))
-    return markdown(("plants", "who waters", "return", f"more than {AT_HOME}", "alive", "litres a pot and day"), rows)
+    return markdown(("plants", "policy", "return", f"gain over {AT_HOME}", "alive", "litres per pot and day"), rows)
 
 
 def _between(found: Any, name: str, form: str) -> str:
@@ -65,7 +65,7 @@ def moved(means: Any) -> str:
     for name in dict.fromkeys(means.contender):
         levels = effects(means, contender=name).main["mean"].groupby("factor", sort=False)
         rows.append((name, *(f"{value:.1f}" for value in levels.max() - levels.min())))
-    return markdown(("who waters", *FACTORS), rows)
+    return markdown(("policy", *FACTORS), rows)
 
 
 def learners(table: Any) -> str:
@@ -74,7 +74,7 @@ def learners(table: Any) -> str:
     home = team[(team[list(HOME)] == list(HOME.values())).all(axis=1)].groupby("contender")["return"].mean()
     by_plants = team.pivot_table(index="contender", columns="plants", values="return", sort=False)
     rows = [(name, *(f"{value:.1f}" for value in (home[name], *own))) for name, own in by_plants.iterrows()]
-    return markdown(("who waters", "the paper's greenhouse", *(f"{plants} plants" for plants in by_plants)), rows)
+    return markdown(("policy", "the paper's greenhouse", *(f"{plants} plants" for plants in by_plants)), rows)
 
 
 def shares(means: Any) -> str:

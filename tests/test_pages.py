@@ -10,8 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-ABOUT_THE_REPOSITORY = ("contributing",)
-PAGES = sorted({page.stem for page in DOCS.glob("[!_]*.md")} - set(ABOUT_THE_REPOSITORY))
+PAGES = sorted(page.stem for page in DOCS.glob("[!_]*.md"))
 BESIDE = {"dask", "gym", "gym_fin", "tensordict"}
 """Packages that other packages bring, or that a reader who comes from them has."""
 

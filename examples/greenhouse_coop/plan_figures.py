@@ -66,13 +66,11 @@ def both(horizon: int, futures: int) -> Mapping[str, Any]:
 
 
 LINES: Final = (
-    Line("over the pair, then days left", water(BEST[WATERER], days_left), {"color": "#1b6f5f"}),
-    Line(
-        "over the pair, then one more day", water(BEST[WATERER], share_alive), {"color": "#1b6f5f", "linestyle": "--"}
-    ),
-    Line("over the rule, then days left", water(RULE, days_left), {"color": "#d1812c"}),
-    Line("over the rule, then one more day", water(RULE, share_alive), {"color": "#d1812c", "linestyle": "--"}),
-    Line("both planned over the rules, then days left", both, {"color": "#8c8c8c"}),
+    Line("over the pair, all days left", water(BEST[WATERER], days_left), {"color": "#1b6f5f"}),
+    Line("over the pair, one more day", water(BEST[WATERER], share_alive), {"color": "#1b6f5f", "linestyle": "--"}),
+    Line("over the rule, all days left", water(RULE, days_left), {"color": "#d1812c"}),
+    Line("over the rule, one more day", water(RULE, share_alive), {"color": "#d1812c", "linestyle": "--"}),
+    Line("both planned over the rules, all days left", both, {"color": "#8c8c8c"}),
 )
 
 Point = tuple[str, int, int, Kept]
@@ -109,7 +107,7 @@ def draw(points: Sequence[Point], along: Callable[[Point], float], label: str, p
         if own:
             means = [point[3].returns.mean() for point in own]
             axes.plot([along(point) for point in own], means, marker="o", markersize=4, label=line.title, **line.style)
-    axes.axhline(BEST_TRAINED, color="#7fb3d3", linewidth=1, label="best that was trained")
+    axes.axhline(BEST_TRAINED, color="#7fb3d3", linewidth=1, label="best trained policy")
     axes.set_xscale("log")
     ticks = sorted({along(point) for point in points})
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -117,7 +115,7 @@ def draw(points: Sequence[Point], along: Callable[[Point], float], label: str, p
     axes.set_xlabel(label)
     axes.set_ylabel("mean return")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(title="base policy, terminal value", frameon=False, fontsize=8, title_fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
 
@@ -125,8 +123,8 @@ def draw(points: Sequence[Point], along: Callable[[Point], float], label: str, p
 def table(points: Sequence[Point]) -> str:
     """Make the table, in Markdown."""
     lines = [
-        "| who plans, and what comes after the horizon | horizon, days | branches a decision | return |"
-        " days in branches, an episode |",
+        "| base policy, and terminal value | horizon in days | branches per decision | return |"
+        " days in branches, per episode |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
     for title, horizon, number, kept in points:
@@ -150,10 +148,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     draw(
         reaching,
         lambda point: point[1],
-        "horizon, days (nine branches a decision)",
+        "horizon in days (nine branches per decision)",
         options.figures / "plan-horizon.png",
     )
-    branches = f"branches a decision ({len(LITRES)} amounts; horizon of three days)"
+    branches = f"branches per decision ({len(LITRES)} amounts, horizon of three days)"
     draw(spending, lambda point: point[2] * len(LITRES), branches, options.figures / "plan-budget.png")
     (options.figures / "plan.md").write_text(table([*reaching, *spending]) + "\n", encoding="utf-8")
 

@@ -15,8 +15,8 @@ PAGE = "clients-java.md"
 
 
 def block(language):
-    (found,) = re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / PAGE).read_text(), re.MULTILINE | re.DOTALL)
-    return found
+    """The page's first block in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", (DOCS / PAGE).read_text(), re.MULTILINE | re.DOTALL)[0]
 
 
 @pytest.fixture

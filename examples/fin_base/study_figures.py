@@ -48,8 +48,8 @@ def compared(table: Any) -> str:
         better = "" if name == "rule" else _difference(found, "+.1f")
         told = (f"{own.right:.1%}", f"{own.coverage:.0%}", f"{own.premium:.1%}", f"{own.short:.1f}", f"{own.cuts:.1f}")
         rows.append((name, f"{found['mean']:.0f}", better, *told))
-    columns = ("who decides", "welfare", "more than the rule", "a right buys", "coverage", "premium", "short", "cuts")
-    return markdown(columns, rows)
+    outcomes = ("purchasing power", "coverage", "premium", "years short", "years with cuts")
+    return markdown(("policy", "welfare", "gain over the rule", *outcomes), rows)
 
 
 def in_worlds(table: Any) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def moved(table: Any) -> str:
     for name in dict.fromkeys(table.contender):
         found = effects(table, of="welfare", contender=name).main["mean"].groupby("factor", sort=False)
         rows.append((name, *(f"{own.iloc[1] - own.iloc[0]:+.0f}" for _, own in found)))
-    return markdown(("who decides", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
+    return markdown(("policy", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
 
 
 def sizes(at_home: Any, large: Any) -> str:
@@ -110,7 +110,7 @@ def draw_worlds(worlds: Mapping[str, Any]) -> Figure:
         better, annot=told, fmt="", vmin=-most, vmax=most, cmap="BrBG", linewidths=1.5, ax=axes, cbar=False,
         annot_kws={"fontsize": 8},
     )  # fmt: skip
-    axes.set(xlabel="", ylabel=", ".join(FACTORS), title="welfare, more than the rule's: per cent of a year's income")
+    axes.set(xlabel="", ylabel=", ".join(FACTORS), title="gain over the rule, in per cent of a year's income")
     axes.tick_params(left=False, bottom=False, labelrotation=0)
     return figure
 
@@ -135,8 +135,8 @@ def draw_learned(found: Mapping[str, Policies]) -> Figure:
         axes.set(xlabel="coverage", ylim=(-0.03, 1.03))
     mix.axvspan(0.8, MINIMUM, color="#f3e3e3", lw=0)
     by.axvspan(0.8, INDEXING, color="#f3e3e3", lw=0)
-    mix.set_title("share of equities (in the red: no increase)", fontsize=9)
-    by.set_title("share of full indexation (in the red: none)", fontsize=9)
+    mix.set_title("share of equities (red: no increase allowed)", fontsize=9)
+    by.set_title("share of full indexation (red: none allowed)", fontsize=9)
     ages = np.arange(25, 67)
     for of, style in ((1.0, ":"), (1.2, "-"), (1.5, "--")):
         asked = [_surcharge(shared, int(age), of) for age in ages]
@@ -179,10 +179,10 @@ def draw_years(found: Mapping[str, Policies], seeds: int) -> Figure:
             years = range(1, len(middle) + 1)
             axes.fill_between(years, low, high, color=COLOURS[name], alpha=0.2, lw=0)
             axes.plot(years, middle, color=COLOURS[name], label=name)
-    rights.set_title("what a right buys, in prices of the first month", fontsize=9)
+    rights.set_title("purchasing power of a right from the first month", fontsize=9)
     coverages.set_title("coverage", fontsize=9)
     for axes in (rights, coverages):
-        axes.yaxis.set_major_formatter(PercentFormatter(1))
+        axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         axes.set_xlabel("year")
         axes.set_xticks(range(0, funds[0].years + 1, 5))
         axes.grid(axis="y", color="#e6e6e6", linewidth=0.7)

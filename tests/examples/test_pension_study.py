@@ -223,7 +223,7 @@ def test_from_one_end_to_the_other_and_nothing_twice(tmp_path, capsys, monkeypat
     before = [path.read_bytes() for path in stored]
     study.main(arguments)
     assert [path.read_bytes() for path in sorted((tmp_path / "runs").glob("*.jsonl"))] == before
-    assert shown.split("| who decides", 1)[1] in capsys.readouterr().out
+    assert shown.split("| policy", 1)[1] in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("small")

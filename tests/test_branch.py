@@ -344,7 +344,7 @@ def test_simulations_that_are_random_for_themselves():
     env = single_env(lambda: Dice(6), Walk.choose)
     env.reset(seed=3)
     env.step(1)
-    with pytest.raises(BranchError, match=r"reset with the same seed[\s\S]*fork"):
+    with pytest.raises(BranchError, match=r"the same seed and the same actions[\s\S]*fork"):
         branch(env, short, 1, method="replay")
     found = branch(env, short, 2, method="fork")
     assert found[0] == found[1] == rest_of(env)
@@ -390,7 +390,7 @@ def test_what_cannot_be_continued():
     env.step(1)
     with pytest.raises(EpisodeOverError, match="begin the next one"):
         branch(env, short)
-    with pytest.raises(ViewError, match="branch continues environments"):
+    with pytest.raises(ViewError, match="branch needs an environment of one simulation"):
         branch("env", short)
     env = single_env(lambda: Walk(1), Walk.choose, driver="thread")
     env.reset()
@@ -449,7 +449,7 @@ def test_numbers_of_branches_are_integers():
     env = single_env(lambda: Walk(3), Walk.choose)
     env.reset()
     for number in (True, False, "1", None):
-        with pytest.raises(OptionValueError, match="n must be a number"):
+        with pytest.raises(OptionValueError, match="n must be a non-negative integer"):
             branch(env, short, number)
     assert branch(env, short, 0) == []
 

@@ -139,7 +139,7 @@ def test_points_by_name(capsys):
         ("simenv_marl.registraton:x", "did you mean simenv_marl.registration"),
         ("broken_walk:Walk", "needs 'no_such_package_at_all'"),
         ("failing_walk:Walk", "cannot be imported: ZeroDivisionError"),
-        ("walking:number", "is no simulation"),
+        ("walking:number", "is not a simulation"),
     ],
 )
 @pytest.mark.parametrize("command", ["check", "inspect"])

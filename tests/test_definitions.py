@@ -1000,7 +1000,7 @@ def test_what_is_defined_in_this_process_stays_as_it_is():
         ({"action_space": spaces.Discrete(3)}, "must have just the actions"),
         ({"rule_action_mapping": 3}, "rule_action_mapping must be a callable or a dict"),
         ({"agent": ""}, "agent must be a name"),
-        ({"removed_by": {3: None}}, "removed_by goes from dotted names"),
+        ({"removed_by": {3: None}}, "removed_by must be a dict from dotted names"),
         ({"goal_space": spaces.Discrete(3)}, "a goal needs all of its parts"),
     ],
 )

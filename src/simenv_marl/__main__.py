@@ -49,21 +49,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m simenv_marl",
-        description="Begin with a template, check a simulation before its environments are trusted, or see what is"
-        " decided in it.",
+        description="Write a template to start from, check a simulation, list its decision points, or test a simulator"
+        " in another process.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="new | check | inspect | wire-check")
     _add_new(commands)
     check = commands.add_parser(
         "check",
-        help="run it plainly and behind environments, and say what is wrong",
-        description="Run a simulation plainly and behind environments, and say what is wrong. Exit code: 0 if nothing"
-        " is, 1 if there are errors, 2 if it cannot be run.",
+        help="run it alone and in environments, and report what is wrong",
+        description="Run a simulation alone and in environments, and report what is wrong. Exit code: 0 without errors,"
+        " 1 with errors, 2 if the simulation cannot run.",
     )
     look = commands.add_parser(
         "inspect",
-        help="tell its decision points and the order in which they are called",
-        description="Tell the decision points of a simulation, and in what order its own rules call them.",
+        help="list its decision points and the order in which they are called",
+        description="List the decision points of a simulation, and the order in which the model calls them.",
     )
     check.set_defaults(look=_checked)
     look.set_defaults(look=_inspected)
@@ -78,10 +78,10 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--json", action="store_true", help="print JSON in place of text")
     check.add_argument("--episodes", type=_number(1), default=10, metavar="N", help="of random actions (default: 10)")
     check.add_argument(
-        "--max-steps", type=_number(1), default=1000, metavar="N", help="decisions in a run (default: 1000)"
+        "--max-steps", type=_number(1), default=1000, metavar="N", help="the longest run, in decisions (default: 1000)"
     )
     check.add_argument(
-        "--time-limit", type=_seconds, default=60.0, metavar="SECONDS", help="for all of it (default: 60)"
+        "--time-limit", type=_seconds, default=60.0, metavar="SECONDS", help="for the whole check (default: 60)"
     )
     _add_wire_check(commands)
     return parser
@@ -90,30 +90,38 @@ def _parser() -> argparse.ArgumentParser:
 def _add_new(commands: Any) -> None:
     new = commands.add_parser(
         "new",
-        help="write a model to begin with, its environment, training and tests",
+        help="write a model to start from, with environment, training and tests",
         description="Write one file with a model, its environment and its training, and a file with its tests.",
     )
     new.set_defaults(look=lambda options: write_template(options.kind, options.name, options.folder), json=False)
     new.add_argument("kind", choices=KINDS, help="a plain loop, processes of SimPy, or agents of Mesa")
-    new.add_argument("name", metavar="NAME", help="of the module; its class is called likewise")
-    new.add_argument("--folder", type=Path, metavar="DIR", help="where to write (default: a new folder NAME)")
+    new.add_argument("name", metavar="NAME", help="of the module; its class is named after it")
+    new.add_argument(
+        "--folder", type=Path, metavar="DIR", help="the folder for both files (default: a new folder NAME)"
+    )
 
 
 def _add_wire_check(commands: Any) -> None:
     wire = commands.add_parser(
         "wire-check",
-        help="play with a simulator in another process, and say what it does wrong",
-        description="Play with a simulator that speaks the wire, and say what it does wrong. Exit code: 0 if nothing"
-        " is, 1 if something is.",
+        help="test a simulator in another process, and report what it does wrong",
+        description="Test a simulator that speaks the wire, and report what it does wrong. Exit code: 0 if nothing is"
+        " wrong, otherwise 1.",
     )
     wire.set_defaults(look=_wire_checked)
-    wire.add_argument("--seed", type=_number(0), default=1, metavar="N", help="of the episodes (default: 1)")
-    wire.add_argument("--options", type=_json, default={}, metavar="JSON", help="what start is to bring (default: {})")
+    wire.add_argument("--seed", type=_number(0), default=1, metavar="N", help="the seed of the episodes (default: 1)")
     wire.add_argument(
-        "--decisions", type=_number(1), default=1000, metavar="N", help="break off an episode there (default: 1000)"
+        "--options", type=_json, default={}, metavar="JSON", help="the options in the start message (default: {})"
     )
     wire.add_argument(
-        "--timeout", type=_seconds, default=30.0, metavar="SECONDS", help="to wait for each line (default: 30)"
+        "--decisions",
+        type=_number(1),
+        default=1000,
+        metavar="N",
+        help="stop an episode after so many decisions (default: 1000)",
+    )
+    wire.add_argument(
+        "--timeout", type=_seconds, default=30.0, metavar="SECONDS", help="the longest wait for a line (default: 30)"
     )
     wire.add_argument("--json", action="store_true", help="print JSON in place of text")
     wire.add_argument("program", metavar="COMMAND", nargs=argparse.REMAINDER, help="the program and its arguments")
@@ -122,7 +130,7 @@ def _add_wire_check(commands: Any) -> None:
 def _number(least: int) -> Any:
     def number(text: str) -> int:
         if not text.isdecimal() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least {least}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least}")
         return int(text)
 
     return number
@@ -134,7 +142,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no positive number of seconds")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number of seconds")
     return seconds
 
 
@@ -142,9 +150,9 @@ def _json(text: str) -> Any:
     try:
         found = json.loads(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no JSON: {error}") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not JSON: {error}") from None
     if not isinstance(found, dict):
-        raise argparse.ArgumentTypeError(f"{text!r} is no JSON object")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
     return found
 
 

@@ -87,7 +87,7 @@ def branch(
     obstacles, loops = view.opened() if forks and method != "replay" else ([], [])
     if obstacles and method == "fork":
         raise BranchError(
-            f"a forked process could not go on with {', '.join(obstacles)} that the simulation has opened; use"
+            f"a forked process cannot continue with {', '.join(obstacles)} that the simulation has opened; use"
             ' method="replay"'
         )
     if obstacles or not forks or method == "replay":
@@ -104,9 +104,9 @@ def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
     """
     view = getattr(env, "unwrapped", env)
     if not isinstance(view, View):
-        raise ViewError(f"branch continues environments of one simulation, and {shown(env)} is none")
+        raise ViewError(f"branch needs an environment of one simulation, not {shown(env)}")
     if isinstance(n, bool) or not isinstance(n, int) or n < 0:
-        raise OptionValueError(f"n must be a number of continuations, not {shown(n)}")
+        raise OptionValueError(f"n must be a non-negative integer, not {shown(n)}")
     if method not in (None, *METHODS):
         raise OptionValueError(
             f"method must be None or one of {', '.join(map(repr, METHODS))}, not {shown(method)}"
@@ -114,7 +114,7 @@ def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
         )
     if method == "fork" and not _can_fork(view):
         raise OptionValueError(
-            'method="fork" needs a platform that can fork, and driver="greenlet": a forked process has none of the'
+            'method="fork" needs a platform that can fork, and driver="greenlet": a forked process does not have the'
             ' other threads; use "replay"'
         )
     if not isinstance(time_limit, (int, float)) or not time_limit > 0:
@@ -122,8 +122,8 @@ def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
     view.check_pending()
     if _depth.get() == DEEPEST:
         raise BranchError(
-            f"branches are nested {DEEPEST} deep: a policy that branches its environment is asked again in its"
-            " branches, and so on without end; action_values and RolloutPolicy leave what is decided there to a base"
+            f"branches are nested {DEEPEST} deep: a policy that branches its environment also decides in the branches,"
+            " and branches them again; use action_values or RolloutPolicy, which let a base policy decide there"
         )
     return view
 
@@ -234,7 +234,7 @@ def _forked(env: Any, function: Callable[[Any, int], Any], n: int, time_limit: f
             left = first.deadline - time.monotonic()
             ready = waiting.poll(min(max(left, 0.0), _A_WHILE) * 1000)
             if not ready and left <= _A_WHILE:
-                raise BranchError(f"branch {first.number} was ended: it took longer than {time_limit} s")
+                raise BranchError(f"branch {first.number} was stopped: it took longer than {time_limit} s")
             for pipe, _ in ready:
                 child = children[pipe]
                 chunk = os.read(pipe, 1 << 16)
@@ -304,7 +304,7 @@ def _answer(value: Any) -> bytes:
 
 
 def _unpicklable(error: Exception) -> BranchError:
-    return BranchError(f"it has returned what cannot be pickled ({told(error)})")
+    return BranchError(f"it returned a value that cannot be pickled ({told(error)})")
 
 
 def _result(child: _Child) -> Any:
@@ -315,7 +315,7 @@ def _result(child: _Child) -> Any:
     if not child.received:
         code = os.waitstatus_to_exitcode(status)
         how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
-        raise BranchError(f"branch {number} has died without an answer, {how}")
+        raise BranchError(f"branch {number} died without a result, {how}")
     answered, parcel = pickle.loads(child.received)
     if answered:
         try:

@@ -86,7 +86,9 @@ class Definition:
             name = f"{given.__module__}.{given.__qualname__}"
             hook = Hook(given, name, bound=binding is not staticmethod)
         elif not isinstance(hook.function, FunctionType):
-            raise PatchError(f"{shown(hook.function)} cannot be a decision point: it is no function written in Python")
+            raise PatchError(
+                f"{shown(hook.function)} cannot be a decision point: it is not a function written in Python"
+            )
         elif not hook.for_good:  # fetched while its hook was set temporarily
             stays(hook)
         point = point_for(hook)
@@ -214,7 +216,8 @@ def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
     for name, agent in named.items():
         if not isinstance(name, str) or not (agent is None or callable(agent)):
             raise DefinitionError(
-                f"make_step: removed_by goes from dotted names to callables, not {shown(name)}: {shown(agent)}"
+                f"make_step: removed_by must be a dict from dotted names to callables, not {shown(name)}:"
+                f" {shown(agent)}"
             )
     return dict(named)
 

@@ -61,7 +61,7 @@ def register_simulation(
             raise OptionValueError("register_simulation needs a name= for the ids")
         name = simulation.name
     if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
-        raise OptionValueError(f"name must be of letters, digits, _ and -, as ids take it, not {shown(name)}")
+        raise OptionValueError(f"name must consist of letters, digits, _ and -, not {shown(name)}")
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise OptionValueError(f"version must be a non-negative integer, not {shown(version)}")
     flatten = options.pop("flatten", False)

@@ -71,9 +71,9 @@ def test_the_functions_return_what_they_say():
 
 @pytest.mark.parametrize("points", [[PUMP, FAN], NAMED], ids=["two", "callable"])
 def test_the_single_view_is_refused_where_there_is_not_one_agent(points):
-    with pytest.raises(ViewError, match="needs one active decision point"):
+    with pytest.raises(ViewError, match="needs the name of one agent, or one active decision point"):
         single_env(BOTH, points)
-    with pytest.raises(ViewError, match="needs one active decision point"):
+    with pytest.raises(ViewError, match="needs the name of one agent, or one active decision point"):
         generate_env(BOTH, points, view="single")
 
 
@@ -453,7 +453,7 @@ def test_policies_observe_in_order_with_everybody_else():
 def test_a_callable_that_names_no_string_is_an_error(name):
     decide = decision(agent=lambda: name)
     env = aec_env(calling(decide), decide)
-    with pytest.raises(AgentError, match="must name a string or None") as caught:
+    with pytest.raises(AgentError, match="must return a string or None") as caught:
         env.reset()
     assert isinstance(caught.value, ValueError)
 

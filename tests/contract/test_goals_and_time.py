@@ -271,7 +271,7 @@ def test_masks_on_request_of_choices_and_of_several_parts():
 def test_continuous_actions_have_no_masks():
     env = single_env(Walk, goals())
     env.reset()
-    with pytest.raises(ViewError, match="masks of Discrete and MultiDiscrete"):
+    with pytest.raises(ViewError, match="masks need a Discrete or MultiDiscrete"):
         env.action_masks()
 
 

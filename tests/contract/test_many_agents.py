@@ -1044,7 +1044,7 @@ def test_removals_that_cannot_be(removed_by, error):
 
 @pytest.mark.parametrize("removed_by", [{f"{HERE}.banish": "being_0"}, {3: None}, [3]])
 def test_removals_that_are_not_even_defined(removed_by):
-    with pytest.raises(DefinitionError, match="removed_by goes from dotted names"):
+    with pytest.raises(DefinitionError, match="removed_by must be a dict from dotted names"):
         beings(removed_by=removed_by)
 
 

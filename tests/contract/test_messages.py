@@ -211,7 +211,7 @@ def test_an_error_without_looks_is_no_obstacle_to_the_first_one():
     env = aec_env(script(main), decide)
     with pytest.raises(ObservationError) as caught:
         env.reset(seed=4)
-    assert "when it was unwound, raised" in notes(caught.value)
+    assert "unwinding the simulation raised" in notes(caught.value)
     decide = decision()
     env = single_env(script(main), decide)
     env.reset()

@@ -595,7 +595,7 @@ def test_an_action_for_one_who_has_not_joined_is_refused():
 
     env = parallel_env(script(main), beings())
     env.reset()
-    with pytest.raises(UnknownAgentError, match="no live agent"):
+    with pytest.raises(UnknownAgentError, match="not a live agent"):
         env.step({"being_0": 1, "being_1": 1})
 
 

@@ -147,7 +147,7 @@ def test_errors_surface():
         simulate(calling(ant), {"nobody": lambda observation: 1}, points=ant)
     with pytest.raises(OptionValueError, match="must be a callable"):
         simulate(calling(ant), {ant: 3})
-    with pytest.raises(SimulationError, match="is no simulation"):
+    with pytest.raises(SimulationError, match="is not a simulation"):
         simulate(3)
 
 

@@ -183,7 +183,7 @@ def test_the_removed_are_paid_at_once_and_blank_from_then_on():
     _, rewards, _, _, infos = env.step({"being_1": "not looked at", "being_2": 4})
     assert rewards == {"being_1": 0.0, "being_2": 1.0}
     assert infos["being_1"]["acted"] is False
-    with pytest.raises(UnknownAgentError, match="no live agent"):
+    with pytest.raises(UnknownAgentError, match="not a live agent"):
         env.step({"being_3": 1})
     _, rewards, terminations, truncations, _ = env.step({"being_1": 1, "being_2": 5})
     assert env.simulation.log == [3, 4, 5]

@@ -110,7 +110,7 @@ def test_none_says_that_no_action_corresponds():
 
 def test_an_action_outside_the_space_is_an_error():
     env = single(decision(counting(), rule_action_mapping=lambda tens: tens))
-    with pytest.raises(InvalidActionError, match="the rule's decision 10 is the action 10"):
+    with pytest.raises(InvalidActionError, match="the rule's decision 10 to the action 10"):
         env.step(RULE)
     env.reset(seed=0)
 

@@ -47,7 +47,7 @@ def test_main_effects_and_interactions_are_those_of_the_model(tmp_path):
     assert found.cells("c", "b").equals(cells.T)
     drawn = found.plot().axes
     assert sum(axes.get_visible() for axes in drawn) == 4
-    with pytest.raises(OptionValueError, match="no two factors"):
+    with pytest.raises(OptionValueError, match="not two factors"):
         found.cells("a", "z")
 
 
@@ -117,16 +117,16 @@ def test_what_cannot_be_is_refused(tmp_path):
     frame = results(design({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "sobol", 6), tmp_path)
     with pytest.raises(OptionValueError, match="saltelli"):
         sobol_indices(frame, "y")
-    with pytest.raises(OptionValueError, match="no column with values"):
+    with pytest.raises(OptionValueError, match="not a column of numbers"):
         effects(frame, "a")
     with pytest.raises(OptionValueError, match="no contender 'x'"):
         effects(frame, "y", contender="x")
-    with pytest.raises(OptionValueError, match="what run_experiment has returned"):
+    with pytest.raises(OptionValueError, match="that run_experiment returned"):
         effects(frame[["a"]])
     for wrong in (None, frame["y"]):
-        with pytest.raises(OptionValueError, match="what run_experiment has returned"):
+        with pytest.raises(OptionValueError, match="that run_experiment returned"):
             effects(wrong)
-        with pytest.raises(OptionValueError, match="what run_experiment has returned"):
+        with pytest.raises(OptionValueError, match="that run_experiment returned"):
             sobol_indices(wrong)
     for look in (effects, sobol_indices):
         with pytest.raises(OptionValueError, match="confidence must lie between 0 and 1"):
@@ -135,7 +135,7 @@ def test_what_cannot_be_is_refused(tmp_path):
     odd = {"text": lambda s: "x", "some": lambda s: s.y if s.a > 0.5 else None}
     frame = results(whole, tmp_path / "odd", metric=odd)
     for look in (effects, sobol_indices):
-        with pytest.raises(OptionValueError, match="'text' is a column of other values"):
+        with pytest.raises(OptionValueError, match="'text' is not a column of numbers"):
             look(frame, "text")
     with pytest.raises(OptionValueError, match="'some' is missing or not finite"):
         sobol_indices(frame, "some")

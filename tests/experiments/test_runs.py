@@ -243,7 +243,7 @@ def test_a_team_that_fails_is_an_error_until_it_is_mended(tmp_path):
     frame = run(tmp_path, DESIGN[:1], team=lambda returns: returns["stranger"])
     assert set(frame["agent"]) == {"team"}
     assert set(frame["status"]) == {"error"}
-    assert "'stranger' has not decided in this episode; keeper, helper has" in frame["error"][0]
+    assert "'stranger' did not decide in this episode; these agents did: keeper, helper" in frame["error"][0]
     known = len(lines(tmp_path))
     assert set(run(tmp_path, DESIGN[:1], team=max)["status"]) == {"ok"}
     assert len(lines(tmp_path)) == known  # nothing was run again
@@ -396,9 +396,9 @@ def one_argument(days):
         ("cannot be called with the factors", {"make": one_argument}),
         ("must be a callable of the factors", {"make": Shop()}),
         ("cannot be called with the parameters", {"make": Variant("v", one_argument)}),
-        ("factor 'seed' is called like", {"design": {"seed": [1]}}),
-        ("factor 'error' is called like", {"design": {"error": [1]}}),
-        ("metric 'days' is called like", {"metric": {"days": level}}),
+        ("factor 'seed' has the name of", {"design": {"seed": [1]}}),
+        ("factor 'error' has the name of", {"design": {"error": [1]}}),
+        ("metric 'days' has the name of", {"metric": {"days": level}}),
         ("has no rows", {"design": DESIGN[:0]}),
         ("must be a string", {"design": pd.DataFrame([[1]])}),
         ("cannot be stored", {"design": {"days": [object()]}}),
@@ -429,7 +429,7 @@ def test_a_store_of_another_experiment_is_refused(tmp_path):
         run(tmp_path, DESIGN[["days"]])
     with pytest.raises(OptionValueError, match="its metrics are"):
         run(tmp_path, metric=None)
-    with pytest.raises(OptionValueError, match="of which this design has none"):
+    with pytest.raises(OptionValueError, match="but this design has none"):
         run(tmp_path, DESIGN.assign(days=7))
     with pytest.warns(UserWarning, match="1 rows that this design does not have"):
         run(tmp_path, DESIGN[1:])
@@ -440,7 +440,7 @@ def test_a_store_of_another_experiment_is_refused(tmp_path):
     other.mkdir()
     (other / ".hidden").write_text("")
     (other / "thesis.tex").write_text("")
-    with pytest.raises(OptionValueError, match="store of no experiment"):
+    with pytest.raises(OptionValueError, match="not the store of an experiment"):
         run(other)
     (other / "thesis.tex").unlink()
     assert len(run(other)) > 0

@@ -97,7 +97,7 @@ def test_private_names_are_found_as_they_are_written_and_as_they_are(owner, name
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("nowhere", "a dotted name is needed"),
+        ("nowhere", "it needs a dotted name"),
         ("no_such_package_at_all.function", "no module 'no_such_package_at_all'"),
         (f"{HERE}.Missing.method", "has no 'Missing'"),
         (f"{HERE}.Base.missing", "has no 'missing'"),

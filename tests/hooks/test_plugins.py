@@ -698,7 +698,7 @@ def test_handlers_are_there_for_as_long_as_the_block_runs():
 
 def test_half_of_the_handlers_are_none():
     with (
-        pytest.raises(HandlerError, match="cannot be called with all arguments"),
+        pytest.raises(HandlerError, match="cannot be called with the arguments"),
         handlers(
             (lambda *args, **kwargs: 1, f"{MARKET}.Trader.bid", "instead"),
             (lambda: 1, f"{MARKET}.price", "instead"),

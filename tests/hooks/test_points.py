@@ -268,7 +268,7 @@ def test_a_slip_of_the_pen_gets_a_hint():
 
 def test_a_refusal_leaves_nothing_patched():
     before = vars(Trader)["bid"]
-    with pytest.raises(PatchError, match="no function written"):
+    with pytest.raises(PatchError, match="not a function written"):
         aec_env(home(), {f"{MARKET}.Trader.bid": define(), f"{MARKET}.Trader.quote": define()})
     assert vars(Trader)["bid"] is before
 
@@ -729,7 +729,7 @@ def test_local_functions_without_a_class_must_be_decorated():
     def decide():
         return "rule"
 
-    with pytest.raises(PatchError, match="is not what is found under that name"):
+    with pytest.raises(PatchError, match="is the name of another object"):
         aec_env(calling(decide), {decide: define()})
     decorated = decision(decide)
     assert log_of(aec_env(calling(decorated), decorated)) == [9]

@@ -203,7 +203,7 @@ def test_each_policy_needs_a_data_set_of_its_own(dataset_id, match):
 
 def test_what_cannot_be_saved():
     ant = decision(agent="ant_0")
-    with pytest.raises(OptionValueError, match="under one key"):
+    with pytest.raises(OptionValueError, match="under each key"):
         save_dataset("ants-v0", collect_episodes(calling(ant), {ant: ones}, seeds=[1]))
     with pytest.raises(OptionValueError, match="policies"):
         record_dataset("ants-v0", calling(ant), ones, seeds=[1])

@@ -66,7 +66,7 @@ def test_a_simulator_may_exit_after_a_stop(tmp_path):
 def test_an_episode_that_does_not_end_is_broken_off():
     report = check_wire(command(), options={"hours": 10_000}, decisions=20)
     assert report.ok
-    assert found(report)["an episode by its rule"] == "note"
+    assert found(report)["an episode by its own rule"] == "note"
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_an_episode_that_does_not_end_is_broken_off():
     [
         ("outside.Wire.play = lambda *_: None", "starts, and says hello"),
         ("outside.POINTS = []", "starts, and says hello"),
-        ("outside.Reservoirs.run = lambda *_: None", "an episode by its rule"),
+        ("outside.Reservoirs.run = lambda *_: None", "an episode by its own rule"),
         ("outside.random.Random = lambda seed: outside.random", "two episodes in a row with the same seed"),
         (
             "stopped = outside.Stopped\n"
@@ -99,7 +99,7 @@ def test_an_episode_that_does_not_end_is_broken_off():
             "def lenient(self):\n    answer = receive(self)\n"
             "    return {**answer, 'act': self.number} if 'act' in answer else answer\n"
             "outside.Wire.receive = lenient",
-            "an answer to another call",
+            "an answer with the number of another call",
         ),
         (
             "import os\n"
@@ -109,7 +109,7 @@ def test_an_episode_that_does_not_end_is_broken_off():
             "init = outside.Wire.__init__\n"
             "def short(self):\n    init(self)\n    self.lines = Short(self.lines)\n"
             "outside.Wire.__init__ = short",
-            "a line of a mebibyte",
+            "a line of 1 MiB",
         ),
         (
             "import time\n"
@@ -120,7 +120,7 @@ def test_an_episode_that_does_not_end_is_broken_off():
             "        if sys._getframe(1).f_code.co_name == 'play':\n            time.sleep(60)\n"
             "        raise\n"
             "outside.Wire.receive = waits",
-            "the input's end between episodes",
+            "the end of its input between episodes",
         ),
     ],
 )
@@ -136,7 +136,7 @@ def test_what_is_wrong_is_found(tmp_path, change, tried):
 )
 def test_frames_that_are_wrong_are_found(what):
     report = check_wire([sys.executable, faulty.__file__, "in mid-episode", what], timeout=10.0)
-    assert found(report)["an episode by its rule"] == "wrong", str(report)
+    assert found(report)["an episode by its own rule"] == "wrong", str(report)
 
 
 def test_a_reseed_that_changes_nothing_is_noted(tmp_path):
@@ -157,4 +157,4 @@ def test_the_command_line(capsys):
     assert "needs a command" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["wire-check", "--options", "[1]", *command()])
-    assert "no JSON object" in capsys.readouterr().err
+    assert "not a JSON object" in capsys.readouterr().err

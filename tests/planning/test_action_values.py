@@ -371,7 +371,7 @@ def test_in_the_one_exact_future_too_a_base_has_the_same_noise(method):
 @pytest.mark.parametrize("view", VIEWS)
 def test_one_exact_future_and_a_warning(view, method):
     env = made(view, Unseeded)
-    with pytest.warns(UserWarning, match="Unseeded cannot draw anew .* foresees") as caught:
+    with pytest.warns(UserWarning, match="Unseeded cannot draw new random numbers .* foresees") as caught:
         told = action_values(env, futures=9, method=method)
     assert caught[0].filename == __file__
     assert told.counts.tolist() == [1, 1, 1]

@@ -221,7 +221,7 @@ def test_a_planner_decides_alike_wherever_it_serves():
         assert list(zip(*(collected[name].actions.tolist() for name in planners), strict=True)) == one
 
 
-@pytest.mark.filterwarnings("ignore:.*draws from the global generator", "ignore:.*cannot draw anew")
+@pytest.mark.filterwarnings("ignore:.*draws from the global generator", "ignore:.*cannot draw new random numbers")
 def test_replays_leave_the_generators_of_the_process_alone():
     class Lucky(Pair):
         reseed = None

@@ -160,7 +160,8 @@ class BoundPoint:
         self.one_entity = False
         warn_user(
             f"several objects decide at {self.point.name} as one agent, {agent!r}: their rewards and differences mix."
-            " Give its make_step agent=, a callable that names an agent for each; or a string, where one agent is meant"
+            " Set agent= of its make_step to a callable that names an agent for each object, or to a string if one"
+            " agent is meant"
         )
 
     # -- observations -----------------------------------------------------------------------------
@@ -244,7 +245,7 @@ class BoundPoint:
             legal = None if action is None else self.check(action)
             if legal is ILLEGAL:
                 raise InvalidActionError(
-                    f"rule_action_mapping of {self.point.name} says that the rule's decision {shown(decision)} is the"
+                    f"rule_action_mapping of {self.point.name} maps the rule's decision {shown(decision)} to the"
                     f" action {shown(action)}, which is not in its action space {shown(definition.action_space)}"
                 )
             return legal
@@ -287,8 +288,8 @@ def _look_back(actions: Mapping[Any, Any]) -> Callable[..., Any]:
             return known[decision]
         except (KeyError, TypeError):
             raise InvalidActionError(
-                f"the dict rule_action_mapping has no action for the rule's decision {shown(decision)}; give it one,"
-                " or a callable that returns None where no action corresponds"
+                f"the dict rule_action_mapping has no action for the rule's decision {shown(decision)}; add one, or"
+                " pass a callable that returns None where no action corresponds"
             ) from None
 
     return look_back

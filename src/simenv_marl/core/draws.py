@@ -52,8 +52,8 @@ def watched(simulation: Any, work: Callable[[], Any], *, in_thread: bool) -> Any
     if drawn:
         names = " and ".join(name for name, own in zip(("random", "numpy.random"), moved, strict=True) if own)
         warn_user(
-            f"{kind.__name__} draws from the global generator of {names}, which all else in the process shares: its"
-            " environments influence each other, and the same seed gives other episodes. Make them with global_rng=True"
+            f"{kind.__name__} draws from the global generator of {names}, which all code in the process shares: its"
+            " environments influence each other, and a seed does not repeat an episode. Make them with global_rng=True"
         )
     return result
 

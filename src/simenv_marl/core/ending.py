@@ -37,8 +37,8 @@ REFUSALS: Final[Mapping[str, tuple[type[Exception], str]]] = {
     "new": (NotResetError, "there is no episode yet; call reset() first"),
     "copied": (
         NotResetError,
-        "this is a copy of an environment in mid-episode, and has no episode of its own yet; call reset() first, or see"
-        " branch() for copies that go on from where an environment stands",
+        "this is a copy of an environment, and has no episode yet; call reset() first, or use branch() to continue the"
+        " episode of the original",
     ),
     "resetting": (
         ReentrancyError,
@@ -176,8 +176,8 @@ class Ending(Participants):
         """Warn that many rounds had no action for the agent whose decision is pending."""
         assert self.pending is not None
         warn_user(
-            f"the simulation stands still: {shown(self.pending.name)} is to decide, and {MANY_ROUNDS} rounds in a row"
-            ' had no action for it; infos tell which agent is "deciding"'
+            f"the simulation stands still: {shown(self.pending.name)} must decide, but {MANY_ROUNDS} rounds in a row"
+            ' had no action for it; the info of the agent that must decide has "deciding": True'
         )
 
     def check(self, actions: Mapping[str, Any]) -> dict[str, Any]:
@@ -199,7 +199,9 @@ class Ending(Participants):
             if agent is None and name in self.ended and self.ended[name] in self.untold:
                 continue
             if agent is None:
-                raise UnknownAgentError(f"there is an action for {shown(name)}, which is no live agent: {self.names()}")
+                raise UnknownAgentError(
+                    f"there is an action for {shown(name)}, which is not a live agent; live agents: {self.names()}"
+                )
             if action is not RULE:
                 check = agent.point.check
                 legal = check(action)
@@ -219,7 +221,7 @@ class Ending(Participants):
         except Warning as warning:  # warnings may be errors; this one must not replace the original error
             problems = [warning]
         for problem in problems:
-            annotate(error, f"simenv_marl: and the simulation, when it was unwound, raised {shown(problem)}")
+            annotate(error, f"simenv_marl: unwinding the simulation raised {shown(problem)} as well")
         clear_frames(error)
 
     def annotate(self, error: BaseException) -> None:

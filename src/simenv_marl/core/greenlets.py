@@ -142,8 +142,8 @@ class GreenletDriver(BaseDriver):
             return
         if self._body is None or not self.reachable():
             raise WrongThreadError(
-                "the simulation is suspended in another thread, the one that has begun the episode, and only there it"
-                ' can be stepped, closed and reset; made with driver="thread", an environment can be used from any'
+                "the simulation is suspended in another thread, the one that called reset(); step, reset and close the"
+                ' environment there, or make it with driver="thread", which allows any thread'
             )
         self._here, self._switch_out = here, here.switch
         self._body.parent = here  # control returns here when the stack ends

@@ -77,13 +77,13 @@ class Participants:
             AgentError: The name is not a string, or belongs to another point, or to an agent that has ended.
         """
         if not isinstance(name, str):
-            raise AgentError(f"agent= of {point.point.name} must name a string or None, not {shown(name)}")
+            raise AgentError(f"agent= of {point.point.name} must return a string or None, not {shown(name)}")
         agent = self.answered.get(name) or self.agents.get(name)
         if agent is None:
             if name in self.ended:
                 raise AgentError(
-                    f"the agent {name!r} decides at {point.point.name} after its end; let agent= give each entity"
-                    " a name of its own, and removed_by= or end_agent() tell what really ends it"
+                    f"the agent {name!r} decides at {point.point.name} after its end; agent= must give each entity a"
+                    " name of its own, and removed_by= or end_agent() must end an agent only when its entity is gone"
                 )
             policy = self._plan.policy_of(name, point)
             agent = self._agent_of(name, point, policy)

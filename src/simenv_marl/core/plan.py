@@ -288,13 +288,15 @@ class Plan:
                 point, _ = locate(name, self._own)
                 removal = self._cross(point, Removed(point))
                 if not isinstance(removal, Removed):
-                    raise DefinitionError(f"{name} cannot both be decided by an agent and, as removed_by says, end one")
+                    raise DefinitionError(
+                        f"{name} is a decision point, so removed_by= cannot name it as a function that ends an agent"
+                    )
                 owner, remover = owner_class(binding.point), owner_class(point)
                 if agent is None and warns and point.bound and owner and remover and not have_instances(owner, remover):
                     warn_user(
-                        f"{name}, which removed_by= of {binding.point.name} names, is called on a {remover.__name__},"
-                        f" which is no {owner.__name__}, and so ends no agent; give a dict from {name!r} to a callable"
-                        " of the call's arguments that names the agent"
+                        f"{name}, in removed_by= of {binding.point.name}, is called on a {remover.__name__}, not on a"
+                        f" {owner.__name__}, and so ends no agent; pass a dict from {name!r} to a callable of the"
+                        " call's arguments that names the agent"
                     )
                 removal.of.append((binding, agent, owner))
 
@@ -333,7 +335,7 @@ class Plan:
             source, points, options = variant.applied(points, options)
         checked = Options().amended(options)
         if unanswered and checked.agent is not None:
-            raise UnknownOptionError("agent is an option of single_env, and of what makes single views, alone")
+            raise UnknownOptionError("agent is an option of single views only, as single_env makes them")
         model: Any = source
         spare: list[Spare] = []
         plain_factory = not isinstance(source, type) and not hasattr(source, "run")

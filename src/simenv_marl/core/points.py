@@ -255,7 +255,7 @@ def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Defi
 
 def _point_at(hook: Hook) -> tuple[DecisionPoint, None]:
     if not isinstance(hook.function, FunctionType):
-        raise PatchError(f"{hook.name} cannot be a decision point: what it exposes is no function written in Python")
+        raise PatchError(f"{hook.name} cannot be a decision point: it is not a function written in Python")
     return point_for(hook), None
 
 

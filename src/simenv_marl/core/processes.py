@@ -200,7 +200,7 @@ def _rebuild(number: int, packed: list[_Packed], errors: dict[int, BaseException
     """Rebuild an error, after the members of its group, unless it is already rebuilt."""
     if number not in errors:
         parts, message, notes, numbers, *_ = packed[number]
-        error: BaseException = WorkerError(f"another process has raised what cannot be pickled: {message}")
+        error: BaseException = WorkerError(f"another process raised an error that cannot be pickled: {message}")
         members = [_rebuild(member, packed, errors) for member in numbers]
         if parts is not None:
             with suppress(Exception):

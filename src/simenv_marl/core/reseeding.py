@@ -45,10 +45,9 @@ def reseed_generators(simulation: Any, seed: int) -> int:
     found = list(_generators(simulation))
     if not found:
         raise SimulationError(
-            f"{shown(simulation)} holds no random generator that could be seeded: keep one in an attribute"
-            " (random.Random, numpy.random.Generator) and draw from that; for a model that draws from Python's or"
-            " NumPy's global generators make the environment with global_rng=True; seed those of other libraries in"
-            " the simulation's reseed"
+            f"{shown(simulation)} holds no random generator to seed: keep a random.Random or numpy.random.Generator in"
+            " an attribute; make the environment with global_rng=True if the model draws from random or numpy.random;"
+            " seed other libraries' generators in the simulation's reseed"
         )
     for generator, stream in zip(found, streams(seed, HELD, len(found)), strict=True):
         reseed_one(generator, stream)

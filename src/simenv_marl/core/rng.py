@@ -204,8 +204,8 @@ class GlobalRandom:
         thread, now = get_ident(), _owners[-1]
         if len(_owners) > 1 and thread not in now.threads:
             raise WrongThreadError(
-                "two environments with global_rng=True were at work in two threads at once, but there is one state of"
-                " the global generators in a process; run them one after the other, or in processes of their own"
+                "two environments with global_rng=True ran in two threads at once, but a process has only one state of"
+                " the global generators; run them one after the other, or in separate processes"
             )
         self._owner.threads.add(thread)
         _owners.append(self._owner)

@@ -57,23 +57,23 @@ def call_the_roll(
             point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
             if point is None:
                 raise OptionValueError(
-                    f"possible_agents names {shown(key)}, which is no active decision point whose agents are named by a"
-                    f" callable; those are {[b.point.name for b in named]}"
+                    f"possible_agents names {shown(key)}, which is not an active decision point with a callable as"
+                    f" agent=; these are: {[b.point.name for b in named]}"
                 )
             names[point] = value
     elif declared is not None:
         others = [name for name in declared if name not in known]
         if len(named) > 1 or (others and not named):
             raise OptionValueError(
-                "possible_agents must be a dict from decision point to names where"
-                f" {len(named)} points name their agents by a callable"
+                "possible_agents must be a dict from decision points to names, unless exactly one point names its"
+                f" agents by a callable; here {len(named)} do"
             )
         names = dict.fromkeys(named, others)
     roster: dict[str, BoundPoint] = {}
     for binding in active:
         for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
             if not isinstance(name, str) or name in roster:
-                raise AgentError(f"possible_agents must be names, and each but once, not {shown(name)}")
+                raise AgentError(f"possible_agents must be different strings, not {shown(name)}")
             roster[name] = binding
     return roster, not named or declared is not None
 

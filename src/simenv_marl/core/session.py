@@ -245,8 +245,7 @@ class Session:
             raise other.refusal()
         if episode.tape is LOST:
             raise BranchError(
-                f"the episode has had more than {LONGEST_TAPE:,} decisions, and its actions were not kept; use"
-                ' method="fork"'
+                f'the episode has more than {LONGEST_TAPE:,} decisions, so its actions were not kept; use method="fork"'
             )
         generator = self.kept()
         again = self.start(other.seed, other.options, episode.when, episode.tape)
@@ -258,9 +257,8 @@ class Session:
         if not _stand_alike(again, episode):
             again.close()
             raise BranchError(
-                f"{type(self.simulation).__name__} does not come to the same decision again when it is reset with the"
-                " same seed and given the same actions: some of its random numbers do not follow from the seed. Use"
-                ' method="fork", or'
+                f"{type(self.simulation).__name__} does not repeat its decisions with the same seed and the same"
+                ' actions: some of its random numbers do not follow from the seed. Use method="fork", or'
                 " global_rng=True if it draws from Python's or NumPy's global generators"
             )
         return again
@@ -365,7 +363,10 @@ class Session:
         """Render the simulation in the environment's render mode; without a render mode, warn and return None."""
         mode = self.plan.options.render_mode
         if mode is None:
-            warn_user(f"render() without a render_mode shows nothing; the simulation's are {self.plan.render_modes}")
+            warn_user(
+                "render() shows nothing without a render_mode; the simulation's render modes are"
+                f" {self.plan.render_modes}"
+            )
             return None
         with self.at_work():
             return self.simulation.render(mode)

@@ -70,17 +70,19 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise ObservationError(f"the observation {shown(value)} is no array for {shown(space)}: {error}") from error
+        raise ObservationError(f"the observation {shown(value)} does not fit {shown(space)}: {error}") from error
     if array.shape != space.shape:
         raise ObservationError(
             f"the observation has shape {array.shape}, its space {shown(space)} has shape {space.shape}; it was"
             f" {shown(value)}"
         )
     if array.dtype.kind not in "biuf":
-        raise ObservationError(f"the observation {shown(value)} has dtype {array.dtype}, which is no number")
+        raise ObservationError(f"the observation {shown(value)} has dtype {array.dtype}, which is not numeric")
     assert space.dtype is not None
     if space.dtype.kind in "iu" and array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ObservationError(f"the observation {shown(value)} is not finite, which {space.dtype} cannot hold")
+        raise ObservationError(
+            f"the observation {shown(value)} is not finite, and {space.dtype} holds only finite numbers"
+        )
     if space.dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, space.dtype):
         limits = np.iinfo(space.dtype)
         if array.min() < limits.min or array.max() > limits.max:
@@ -101,7 +103,7 @@ def _discrete_cast(space: spaces.Discrete) -> Cast:
                     return number
             except (TypeError, ValueError, OverflowError):
                 pass
-        raise ObservationError(f"the observation {shown(value)} is no integer for {shown(space)}")
+        raise ObservationError(f"the observation {shown(value)} must be an integer for {shown(space)}")
 
     return cast
 
@@ -161,7 +163,7 @@ def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
         # Usually all numbers are finite, and searching bytes finds that out faster than NumPy's ``all``.
         if 0 in np.isfinite(observation).tobytes() and not np.isfinite(observation[bounded]).all():
             raise ObservationError(
-                f"the observation {shown(observation)} is not finite, where its space {shown(space)} is bounded"
+                f"the observation {shown(observation)} is not finite, but its space {shown(space)} is bounded"
             )
 
     return check_numbers

@@ -76,7 +76,7 @@ def _stray(error: SimulationExit) -> SimulationError:
     """Make the error that replaces an exit from an earlier episode."""
     stray = SimulationError(
         "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of that"
-        " episode has kept; let nothing that belongs to an episode outlive it (cancel it in stop or in a finally)"
+        " episode has kept; end all of these with their episode (cancel them in stop or in a finally)"
     )
     stray.__cause__ = error
     return stray
@@ -184,7 +184,7 @@ class BaseDriver:
             if kind is STALLED:
                 problems += [error for error in box if not is_exit(error)]
                 box.clear()
-                self.given_up = f"has neither decided anything nor ended for {seconds} s; it is left where it is"
+                self.given_up = f"neither decided anything nor ended for {seconds} s; it is abandoned"
                 break
             if kind is FINISHED or kind is FAILED:
                 value = box.pop()
@@ -252,7 +252,7 @@ class BaseDriver:
             if self._refused is not None and self._refused is not error:
                 if isinstance(error, SimulationExit):
                     return FAILED, [self.refusal()], None
-                annotate(error, f"simenv_marl: and before that a decision was refused: {self._refused}")
+                annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
             return FAILED, [error if self._exiting or type(error) is not SimulationExit else _stray(error)], None
         return (FINISHED, [result], None) if self._refused is None else (FAILED, [self.refusal()], None)
 
@@ -354,8 +354,8 @@ class BaseDriver:
         This is called in the thread that has asked for the decision.
         """
         error = WrongThreadError(
-            f"{hook.name} was called in {where}, where no user can be asked. Call it where run() runs, and have others"
-            " wait for the answer"
+            f"{hook.name} was called in {where}, where the environment cannot ask for a decision. Call it where run()"
+            " runs, and pass the decision on"
         )
         if self._refused is None and self._astray is None:
             self._refused = error

@@ -172,8 +172,8 @@ class ThreadDriver(BaseDriver):
         """
         if self.lost():
             raise WrongThreadError(
-                "this process was forked in mid-episode, and the thread in which the simulation is suspended has"
-                ' stayed behind in the parent; call reset(), or use driver="greenlet"'
+                "this process was forked in mid-episode, but the simulation is suspended in a thread of the parent"
+                ' process; call reset(), or use driver="greenlet"'
             )
 
     def reachable(self) -> bool:
@@ -200,7 +200,7 @@ class ThreadDriver(BaseDriver):
                 thread.join(SECONDS_TO_UNWIND)
             if thread.is_alive():
                 warn_user(
-                    f"the thread of a simulation that has ended is still there after {SECONDS_TO_UNWIND} s",
+                    f"the thread of a simulation that has ended is still alive after {SECONDS_TO_UNWIND} s",
                     ResourceWarning,
                 )
         self._forget_stack()
@@ -215,8 +215,8 @@ class ThreadDriver(BaseDriver):
         """Handle a fork in the child process, which runs in the simulation's own thread or lacks it."""
         if self._ident == get_ident():
             self._go_astray(
-                "a process that the simulation has forked, while the environment's user is in another thread and has"
-                ' stayed behind in the parent (with driver="greenlet" it comes along)'
+                "a process that the simulation has forked, without the thread that steps the environment"
+                ' (driver="greenlet" needs no such thread)'
             )
         else:
             self._stay_behind()

@@ -47,8 +47,8 @@ class Variant:
             raise OptionValueError(f"a variant needs a name, not {shown(self.name)}")
         if isinstance(self.simulation, Variant):
             raise SimulationError(
-                f"the variant {self.name!r} is one of a simulation, not of {self.simulation.name!r}; derive variants"
-                " from each other with dataclasses.replace"
+                f"the variant {self.name!r} needs a simulation, not the variant {self.simulation.name!r}; derive one"
+                " variant from another with dataclasses.replace"
             )
         for name in ("parameters", "policies", "options"):
             value = getattr(self, name)
@@ -58,7 +58,9 @@ class Variant:
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         twice = [name for name in ("plugins", "policies") if name in self.options]
         if twice:
-            raise OptionValueError(f"{' and '.join(twice)} of the variant {self.name!r} are not among its options")
+            raise OptionValueError(
+                f"{' and '.join(twice)} must be arguments of the variant {self.name!r} itself, not among its options"
+            )
         object.__setattr__(self, "plugins", tuple(self.plugins))
         self._check_parameters()
 
@@ -68,7 +70,7 @@ class Variant:
             return
         if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
             raise SimulationError(
-                f"the variant {self.name!r} has parameters, for which its simulation must be a class or a factory, not"
+                f"the variant {self.name!r} has parameters, so its simulation must be a class or a factory, not"
                 f" {shown(source)}"
             )
         try:

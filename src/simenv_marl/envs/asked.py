@@ -66,7 +66,7 @@ class AskedEnv(SimulationEnv):
         """
         if not self._branched:
             raise ReentrancyError(
-                "the decision is answered by what the policy returns; step(action) is for branches of this environment"
+                "a policy answers by what it returns; call step(action) only on branches of this environment"
             )
         return super().step(action)
 
@@ -76,7 +76,7 @@ class AskedEnv(SimulationEnv):
         Raises:
             ReentrancyError: Always.
         """
-        raise ReentrancyError("the environment that a policy is given stands at its decision, and is not to be reset")
+        raise ReentrancyError("a policy cannot reset the environment that it is given")
 
     def close(self) -> None:
         """End a branch.
@@ -85,9 +85,7 @@ class AskedEnv(SimulationEnv):
             ReentrancyError: This environment is not a branch.
         """
         if not self._branched:
-            raise ReentrancyError(
-                "the environment that a policy is given goes on when it has answered; it is not closed"
-            )
+            raise ReentrancyError("a policy cannot close the environment that it is given")
         super().close()
 
     def replayed(self) -> AskedEnv:
@@ -98,7 +96,7 @@ class AskedEnv(SimulationEnv):
         """
         if self._running().alone:
             raise BranchError(
-                "a branch of the environment that a policy is given cannot be branched again by replaying; use"
+                "a branch of the environment that a policy is given cannot be branched again by replay; use"
                 ' method="fork"'
             )
         session = Session(self._made_of)
@@ -111,10 +109,10 @@ class AskedEnv(SimulationEnv):
             raise
 
     def __deepcopy__(self, memory: dict[int, Any]) -> NoReturn:
-        raise CopyError("the environment that a policy is given cannot be copied; branch continues it")
+        raise CopyError("the environment that a policy is given cannot be copied; use branch")
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        raise CopyError("the environment that a policy is given cannot be pickled; branch continues it")
+        raise CopyError("the environment that a policy is given cannot be pickled; use branch")
 
 
 AskingPolicy.make = staticmethod(AskedEnv)

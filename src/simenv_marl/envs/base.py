@@ -66,7 +66,7 @@ class View:
         """
         for option, view in (("flatten", "joint"), ("agent", "single")):
             if getattr(plan.options, option) and option not in cls.takes:
-                raise UnknownOptionError(f"{option} is an option of the {view} view alone")
+                raise UnknownOptionError(f"{option} is an option of the {view} view only")
 
     @staticmethod
     def metadata_of(plan: Plan) -> dict[str, Any]:

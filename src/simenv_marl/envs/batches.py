@@ -66,7 +66,7 @@ class Actions:
         """
         space = self._space
         if actions is RULE:
-            raise InvalidActionError("RULE is no action in vector environments; use single_env, or policies=")
+            raise InvalidActionError("RULE is not an action in vector environments; use single_env, or policies=")
         swift = self.complete and type(actions) is np.ndarray and actions.shape == (self._number, *(space.shape or ()))
         if swift and isinstance(space, spaces.Discrete) and actions.dtype.kind in "iu":
             if actions.min() >= space.start and actions.max() < space.start + space.n:
@@ -94,7 +94,7 @@ class Actions:
             apart = list(iterate(self._batch, actions))
         except Exception as error:
             raise InvalidActionError(
-                f"{shown(actions)} is no batch of {self._number} actions of {shown(self._space)}"
+                f"{shown(actions)} is not a batch of {self._number} actions of {shown(self._space)}"
             ) from error
         if len(apart) != self._number:
             raise InvalidActionError(f"there are {len(apart)} actions for {self._number} simulations: {shown(actions)}")

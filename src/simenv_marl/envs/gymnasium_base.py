@@ -74,8 +74,8 @@ class OneAgentView(View, gym.Env[Any, Any]):
         """
         if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
             raise ViewError(
-                f"there are masks of Discrete and MultiDiscrete action spaces only, not of {self.action_space}; joint"
-                " environments of discrete actions have a MultiDiscrete with flatten=True"
+                f"action masks need a Discrete or MultiDiscrete action space, not {self.action_space}; a joint"
+                " environment of discrete actions has a MultiDiscrete with flatten=True"
             )
         masks = self._legal(self._running())
         parts = [part for mask in masks for part in (mask if isinstance(mask, tuple) else (mask,))]

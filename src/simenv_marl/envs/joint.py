@@ -75,7 +75,7 @@ class Joint:
         """
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
-            raise InvalidActionError("RULE is no action in vector environments; use joint_env, or policies=")
+            raise InvalidActionError("RULE is not an action in vector environments; use joint_env, or policies=")
         episode.check(actions)
 
     def observe(self, episode: Episode) -> Any:

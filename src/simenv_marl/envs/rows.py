@@ -343,7 +343,9 @@ class Row:
                 if raised is None:
                     raised = error
                 else:
-                    annotate(raised, f"simenv_marl: and in sub-environment {self._offset + number}: {shown(error)}")
+                    annotate(
+                        raised, f"simenv_marl: sub-environment {self._offset + number} raised {shown(error)} as well"
+                    )
         if raised is not None:
             raise raised
 

@@ -61,8 +61,8 @@ class SimulationEnv(OneAgentView):
         if plan.one_agent is None:
             points = ", ".join(binding.point.name for binding in plan.active)
             raise ViewError(
-                "the single view needs one active decision point, whose agent has a name of its own, or the name of one"
-                f" agent; active are {points}. Name the agent with agent=, a point in points=, answer the others with"
+                "the single view needs the name of one agent, or one active decision point whose agent= is a string;"
+                f" active are {points}. Name the agent with agent=, name one point in points=, answer the others with"
                 " policies=, or use aec_env"
             )
 

@@ -167,7 +167,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _enter(self) -> None:
         if self.closed:
-            raise ClosedError("the environment is closed; make another one")
+            raise ClosedError("the environment is closed; make a new one")
         if not self._moving.acquire(blocking=False):
             raise ReentrancyError(
                 "the environment was used from inside its own simulations or mappings, or while another thread was"
@@ -193,7 +193,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             raise OptionValueError(f"reset_mask must be a bool array of shape ({self.num_envs},), not {shown(mask)}")
         chosen: list[int] = np.flatnonzero(mask).tolist()
         if not chosen:
-            raise OptionValueError("reset_mask names no simulation that is to be reset")
+            raise OptionValueError("reset_mask selects no simulation to reset")
         if chosen != numbers and not self._begun:
             raise NotResetError("there are no episodes yet; call reset() without a reset_mask first")
         if chosen != numbers and self._crew.failed:
@@ -286,7 +286,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled, since the stacks of simulations cannot be."""
-        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make another one in its place")
+        raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make a new one")
 
 
 def _merged(told: Iterable[tuple[int, Any]], number: int) -> dict[str, Any]:

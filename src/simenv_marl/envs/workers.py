@@ -79,7 +79,7 @@ class Worker:
             WorkerError: The worker is dead.
         """
         if self._pipe is None:
-            raise WorkerError(f"{self.name} is dead; reset() puts another one in its place")
+            raise WorkerError(f"{self.name} is dead; reset() starts a new one")
         return self._pipe
 
     @property
@@ -123,14 +123,13 @@ class Worker:
         self.end_now()
         how = "closed its pipe" if code is None else f"died with exit code {code}"
         script = (
-            '. In a script, environments with workers are made under `if __name__ == "__main__":`, because each worker'
-            " runs the script once more"
+            '. In a script, make environments with workers under `if __name__ == "__main__":`, because each worker'
+            " imports the script"
             if code == 1  # an error has ended it before it could send a message
             else ""
         )
         return WorkerError(
-            f"{self.name} {how}; it was killed, or its simulations have ended the process. reset() puts another one"
-            f" in its place{script}"
+            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts a new one{script}"
         )
 
     def end_now(self, seconds: float = 0.0) -> None:
@@ -174,8 +173,8 @@ class Workers:
             self._recipe = pack_plainly(recipe.spelt_out(common))
         except Exception as error:
             raise OptionValueError(
-                f"what the simulations are made of cannot be sent to another process ({told(error)});"
-                " give a class or a factory that a module holds, or workers=0"
+                f"the simulation, its points or its options cannot be sent to another process ({told(error)}); pass a"
+                " class or a factory of a module, or workers=0"
             ) from error
         self._memory = share_memory(self._space, number, self._context)
         self.batch = shared_batch(self._space, number, self._memory)
@@ -229,7 +228,7 @@ class Workers:
         """
         if os.getpid() != self._process:
             raise WorkerError(
-                "the workers are those of the process of which this one is a fork; make another environment"
+                "the workers belong to the process from which this one was forked; make a new environment"
             )
 
     def _gather(self, asked: list[Worker], identity: int) -> list[tuple[Worker, Any]]:
@@ -348,7 +347,7 @@ class Workers:
             there = [worker for worker in there if worker.there]
             results, errors = self._collect(there, self._identity, SECONDS_TO_CLOSE)
             if len(results) + len(errors) < len(there):
-                warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are ended by force", ResourceWarning)
+                warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are killed", ResourceWarning)
             for worker, error in errors.items():
                 if worker.there:  # otherwise it has died, and nothing is left to close
                     raise error

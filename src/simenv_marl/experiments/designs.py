@@ -70,8 +70,8 @@ class Factor:
         """
         if self.levels is not None and len(self.levels) != 2:
             raise OptionValueError(
-                f"this method has two levels of each factor, and {self.name!r} has {len(self.levels)}; give it two, or"
-                " a range (low, high)"
+                f"this method needs two levels of each factor, but {self.name!r} has {len(self.levels)}; give it two,"
+                " or a range (low, high)"
             )
         return [self.low, self.high] if self.levels is None else list(self.levels)
 
@@ -143,7 +143,7 @@ def _factor(name: Any, given: Any) -> Factor:
             )
         low, high = numbers
         if not low < high:
-            raise OptionValueError(f"the range of {name!r} is empty: {shown(given)} goes from low to high")
+            raise OptionValueError(f"the range of {name!r} is empty: in {shown(given)}, low must be less than high")
         whole = type(low) is type(high) is int
         return Factor(name, low=low if whole else float(low), high=high if whole else float(high), whole=whole)
     if isinstance(given, (set, frozenset)):
@@ -186,7 +186,7 @@ Columns = list[list[Any]]
 
 def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     if n == 1:
-        raise OptionValueError("a full factorial design has n values of each range, at least 2")
+        raise OptionValueError("a full factorial design takes n values of each range; n must be at least 2")
     steps = [factor.steps(n or 2) for factor in factors]
     _checked_rows(prod(map(len, steps)))
     places = needed("pydoe", "design").fullfact([len(own) for own in reversed(steps)])[:, ::-1].astype(int)
@@ -210,8 +210,8 @@ def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -
         n = least
     if n & (n - 1) or not least <= n <= min(2**number, MOST_ROWS):
         raise OptionValueError(
-            f"a fractional design of {number} factors in {n} runs cannot be: n is a power of two, from {least}"
-            f" to {2**number}"
+            f"a fractional design of {number} factors cannot have {n} runs: n must be a power of two, from {least} to"
+            f" {2**number}"
         )
     if n == 2**number:
         return _of_two_levels(factors, pydoe.ff2n(number))
@@ -270,9 +270,7 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
     pydoe = needed("pydoe", "design")
     ranges = [factor for factor in factors if factor.levels is None]
     if len(ranges) < 2:
-        raise OptionValueError(
-            f"a central composite design is one of two ranges (low, high) at least, not {len(ranges)}"
-        )
+        raise OptionValueError(f"a central composite design needs at least two ranges (low, high), not {len(ranges)}")
     number = 2 ** len(ranges) + 2 * len(ranges) + 1
     sizes = [len(factor.levels or "-") for factor in factors]  # once for each combination of levels
     rows = _checked_rows(number * prod(sizes))
@@ -308,7 +306,7 @@ def _halton(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
 def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     rows, names = _rows(n), [factor.name for factor in factors]
     if rows & (rows - 1):
-        raise OptionValueError(f"a Saltelli design has a power of two of samples, not {rows}")
+        raise OptionValueError(f"the number of samples of a Saltelli design must be a power of two, not {rows}")
     _checked_rows(rows * (2 * len(names) + 2))
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     return _spread(factors, needed("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
@@ -316,7 +314,7 @@ def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
 
 def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     if n == 1:
-        raise OptionValueError("a design of one factor at a time has n values of each range, at least 2")
+        raise OptionValueError("a design of one factor at a time takes n values of each range; n must be at least 2")
     middle = [f.levels[0] if f.levels is not None else f.placed(np.array([0.5]))[0] for f in factors]
     rows = [middle]
     for place, factor in enumerate(factors):
@@ -335,7 +333,7 @@ def _rows(n: int | None) -> int:
 def _checked_rows(rows: int) -> int:
     if rows > MOST_ROWS:
         raise OptionValueError(
-            f"the design would have {rows:,} rows, more than {MOST_ROWS:,}; another method or n needs fewer"
+            f"the design would have {rows:,} rows, more than {MOST_ROWS:,}; choose another method or a smaller n"
         )
     return rows
 

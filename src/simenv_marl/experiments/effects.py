@@ -55,7 +55,7 @@ class Effects:
                 return table
             if pair == (other, one):
                 return table.T
-        raise OptionValueError(f"{shown(one)} and {shown(other)} are no two factors of {list(self.levels)}")
+        raise OptionValueError(f"{shown(one)} and {shown(other)} are not two factors of {list(self.levels)}")
 
     def plot(self, *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw the main effects of all factors and, below them, the strongest interactions.
@@ -145,11 +145,11 @@ def _taken(frame: "DataFrame", of: str, contender: str | None, agent: str) -> "t
     """
     columns = list(getattr(frame, "columns", ()))
     if not {"contender", "seed", "agent", "return", "length", "status"} <= set(columns):
-        raise OptionValueError("frame must be what run_experiment has returned")
+        raise OptionValueError("frame must be the DataFrame that run_experiment returned")
     factors = columns[: columns.index("contender")]
     if of not in columns or of in (*factors, "contender", "seed", "agent", "status", "error"):
         values = columns[columns.index("return") : columns.index("status")]
-        raise OptionValueError(f"of={shown(of)} is no column with values; there are {values}{meant(of, values)}")
+        raise OptionValueError(f"of={shown(of)} is not a column of numbers; these are: {values}{meant(of, values)}")
     for what, value in (("contender", contender), ("agent", agent)):
         if value is not None and value not in set(frame[what]):
             known = sorted(set(frame[what]))
@@ -157,7 +157,7 @@ def _taken(frame: "DataFrame", of: str, contender: str | None, agent: str) -> "t
     chosen = (frame["agent"] == agent) & (frame["status"] == "ok")
     table = frame[chosen if contender is None else chosen & (frame["contender"] == contender)]
     if not len(table):
-        raise OptionValueError("there is no run that has come to its end")
+        raise OptionValueError("no run has come to its end")
     return table, factors
 
 
@@ -235,16 +235,16 @@ def sobol_indices(
     check_confidence(confidence)
     table, names = _taken(frame, of, contender, agent)
     if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():
-        raise OptionValueError("some runs have failed, and shares of the variance need all rows of the design")
+        raise OptionValueError("some runs have failed, but shares of the variance need all rows of the design")
     seeds = table["seed"].nunique()
     values, rows = numbers(table[of], of).to_numpy(), table[names].to_numpy(object)
     if not np.isfinite(values).all():
-        raise OptionValueError(f"{of!r} is missing or not finite in some rows, and shares of the variance need all")
+        raise OptionValueError(f"{of!r} is missing or not finite in some rows, but shares of the variance need all")
     if len(values) % seeds or not _is_saltelli(rows[::seeds]):
         raise OptionValueError("shares of the variance need all rows of design(..., method='saltelli'), in their order")
     means = values.reshape(-1, seeds).mean(axis=1)
     if (means == means[0]).all():
-        raise OptionValueError(f"{of!r} is {means[0]:g} in all rows, and has no variance")
+        raise OptionValueError(f"{of!r} is {means[0]:g} in all rows, so it has no variance")
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     found = analyze(problem, means, conf_level=confidence, seed=0)
     columns = {"first": "S1", "first_error": "S1_conf", "total": "ST", "total_error": "ST_conf"}

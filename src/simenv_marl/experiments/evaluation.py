@@ -78,7 +78,7 @@ class Evaluation:
         """
         if of not in self.frame.columns or of in ("contender", "seed", "agent"):
             known = list(self.frame.columns[3:])
-            raise OptionValueError(f"of={shown(of)} is no column with values; there are {known}{meant(of, known)}")
+            raise OptionValueError(f"of={shown(of)} is not a column of numbers; these are: {known}{meant(of, known)}")
         team = self.frame[self.frame["agent"] == TEAM]
         names = list(dict.fromkeys(team["contender"]))
         seeds = list(dict.fromkeys(team["seed"]))
@@ -149,7 +149,7 @@ class Evaluation:
         check_number("difference", difference)
         check_number("power", power)
         if difference == 0:
-            raise OptionValueError("difference must not be 0: no number of seeds tells none from none")
+            raise OptionValueError("difference must not be 0: no number of seeds is enough to detect that")
         if not 0 < power < 1:
             raise OptionValueError(f"power must lie between 0 and 1, such as 0.8, not {shown(power)}")
         apart = self._differences(of)
@@ -395,20 +395,20 @@ def distinct_seeds(given: Iterable[int]) -> list[int]:
     """
     seeds = checked_seeds(given)
     if not seeds:
-        raise OptionValueError("seeds must be some integers, such as range(32): there are none")
+        raise OptionValueError("seeds must be at least one integer, as in range(32); there are none")
     twice = next((seed for seed in seeds if seeds.count(seed) > 1), None) if len(set(seeds)) < len(seeds) else None
     if twice is not None:
-        raise OptionValueError(f"the seed {twice} is there twice: its result would be counted twice")
+        raise OptionValueError(f"the seed {twice} occurs twice: its result would be counted twice")
     return seeds
 
 
 def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: Any) -> None:
     if not contenders:
-        raise OptionValueError("contenders must be some, such as {'rule': {}}: there are none")
+        raise OptionValueError("contenders must have at least one entry, as in {'rule': {}}; there are none")
     if baseline is not None and baseline not in list(contenders):
         raise OptionValueError(
-            f"the baseline {shown(baseline)} is none of the contenders: {', '.join(contenders)}"
-            f"{meant(baseline, contenders)}"
+            f"the baseline {shown(baseline)} is not one of the contenders:"
+            f" {', '.join(contenders)}{meant(baseline, contenders)}"
         )
     check_confidence(confidence)
     if width is not None:

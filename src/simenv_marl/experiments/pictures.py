@@ -77,7 +77,7 @@ def _draw_values(axes: Any, values: DataFrame, summary: DataFrame, what: str) ->
         _mark(axes, place, *summary.loc[name, ["mean", "low", "high"]])
     axes.set_xlim(-0.5, len(names) - 0.5)
     axes.set_ylabel(what)
-    each = "each a dot" if len(names) == 1 else "each a line" if len(values) <= LINES else f"{LINES} of them as lines"
+    each = "each a dot" if len(names) == 1 else "each a line" if len(values) <= LINES else f"lines for {LINES} of them"
     axes.set_title(f"{len(values)} seeds, {each}" if len(values) > 1 else "1 seed")
     _bare(axes, grid="y")
     _name_below(axes, names)
@@ -94,7 +94,7 @@ def _draw_differences(axes: Any, values: DataFrame, summary: DataFrame, baseline
         axes.scatter(across, apart, 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
         _mark(axes, place, *summary.loc[name, ["difference", "difference_low", "difference_high"]])
     axes.set_xlim(-0.5, len(others) - 0.5)
-    axes.set_ylabel(f"more than {baseline}, on the same seed")
+    axes.set_ylabel(f"difference from {baseline}, same seed")
     axes.set_title("differences")
     _bare(axes, grid="y")
     _name_below(axes, others)

@@ -63,7 +63,9 @@ class Returns(tuple[float, ...]):
         if not isinstance(key, str):
             return super().__getitem__(key)
         if key not in self._names:
-            raise KeyError(f"{key!r} has not decided in this episode; {', '.join(self._names) or 'no agent'} has")
+            raise KeyError(
+                f"{key!r} did not decide in this episode; these agents did: {', '.join(self._names) or 'none'}"
+            )
         return super().__getitem__(self._names.index(key))
 
     def __contains__(self, key: object) -> bool:
@@ -141,7 +143,7 @@ def checked_contenders(contenders: Any, what: str = "contenders", *, batched: bo
             if not batched and policy is not RULE and takes_identities(policy):
                 raise OptionValueError(
                     f"the policy of {shown(key)} in {name!r}, {shown(policy)}, answers many decisions at once, as"
-                    " mixtures do; give batched=True, with which all policies are those of simulate_many"
+                    " mixtures do; pass batched=True, and only policies as simulate_many takes them"
                 )
     return dict(contenders)
 
@@ -165,7 +167,7 @@ def checked_metrics(metric: Any, taken: Sequence[str] = ()) -> dict[str, Callabl
                 f"metric must be a callable of the simulation, or a dict of them, not {shown(metric)}"
             )
         if name in COLUMNS or name in taken:
-            raise OptionValueError(f"the metric {name!r} is called like another column; rename it")
+            raise OptionValueError(f"the metric {name!r} has the name of another column; rename it")
     return metrics
 
 
@@ -176,7 +178,7 @@ def checked_options(options: Mapping[str, Any]) -> dict[str, Any]:
         OptionValueError: They contain ``policies``; the contenders define these.
     """
     if "policies" in options:
-        raise OptionValueError("there is no option policies here: give the policies of each contender in its dict")
+        raise OptionValueError("there is no option policies here; pass the policies of each contender in its dict")
     return {name: list(value) if isinstance(value, Iterator) else value for name, value in options.items()}
 
 
@@ -222,7 +224,7 @@ def contender_plan(
     except (AgentError, UnknownPointError):
         raise first from None
     if not named and decision_points():
-        warn_user(f"no returns are counted, since it is not known which decision points are meant: {first}")
+        warn_user(f"returns are not counted, because the decision points are not known: {first}")
     return plan
 
 
@@ -277,7 +279,7 @@ class Tally:
         """
         accounts = self._books.pop(place, {})
         if TEAM in accounts:
-            raise AgentError(f"an agent is called {TEAM!r}, which is what the row of all agents is called; rename it")
+            raise AgentError(f"an agent is called {TEAM!r}, as is the row of all agents together; rename the agent")
         returns = {name: float(account[0]) for name, account in accounts.items()}
         lengths = {name: account[1] for name, account in accounts.items()}
         team_value(self._team, returns)  # called now because it may fail, not when all episodes are over

@@ -197,7 +197,8 @@ def _contenders(policies: Any, *, batched: bool) -> dict[str, Policies]:
     found = checked_contenders(policies or {}, "policies", batched=batched)
     if found.pop(BY_RULE, {}):
         raise OptionValueError(
-            f"the contender {BY_RULE!r} is the model as it is, and always there; rename the other one"
+            f"a contender cannot be called {BY_RULE!r}: that is the model as it is, which is always a contender;"
+            " rename yours"
         )
     return {BY_RULE: {}, **found}
 
@@ -212,15 +213,15 @@ def checked_design(design: Any) -> "tuple[DataFrame, list[Row]]":
     try:
         table = design if isinstance(design, pandas.DataFrame) else pandas.DataFrame(design)
     except (TypeError, ValueError) as error:
-        raise OptionValueError(f"design must be a DataFrame, or what becomes one, not {shown(design)}") from error
+        raise OptionValueError(f"design must be a DataFrame, or data to make one from, not {shown(design)}") from error
     names = list(table.columns)
     for name in names:
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {shown(name)}")
         if name in COLUMNS:
-            raise OptionValueError(f"the factor {name!r} is called like another column of the table; rename it")
+            raise OptionValueError(f"the factor {name!r} has the name of another column of the table; rename it")
         if names.count(name) > 1:
-            raise OptionValueError(f"the factor {name!r} is there twice")
+            raise OptionValueError(f"the factor {name!r} occurs twice")
     if not len(table):
         raise OptionValueError("the design has no rows")
     columns = {name: [_plain(name, value) for value in table[name].tolist()] for name in names}
@@ -233,7 +234,7 @@ def _plain(name: str, value: Any) -> Any:
     if value is not None and type(value) not in (bool, int, float, str):
         raise OptionValueError(
             f"the factor {name!r} has the value {shown(value)}, which cannot be stored: factors are numbers, strings,"
-            " bools or None. Give it a name, and look that up in make"
+            " bools or None. Use a name as the value, and look it up in make"
         )
     return value
 
@@ -429,7 +430,7 @@ def _frame(
     return pandas.concat([factors, typed(columns)], axis=1)
 
 
-LOST: Final = Known(None, "it has not come to an end: the process that was to run it has ended")
+LOST: Final = Known(None, "it did not come to its end: the worker process that ran it has ended")
 
 
 def _rows(known: Known, contender: str, seed: int, metrics: Sequence[str], team: Any) -> Iterator[tuple[Any, ...]]:

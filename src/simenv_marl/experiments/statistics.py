@@ -59,7 +59,7 @@ def numbers(values: Any, of: str) -> Any:
     try:
         return values.astype(np.float64)
     except (TypeError, ValueError):
-        raise OptionValueError(f"of={shown(of)} is a column of other values than numbers") from None
+        raise OptionValueError(f"of={shown(of)} is not a column of numbers") from None
 
 
 def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:

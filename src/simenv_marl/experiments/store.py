@@ -65,8 +65,7 @@ class Writer:
         """
         if not (store / HEADER).exists():
             raise StoreError(
-                f"the store {store} is not seen by the process that is to write to it; give a folder that all machines"
-                " share"
+                f"the process that must write to the store {store} cannot see it; pass a folder that all machines share"
             )
         self._path = store / f"runs-{session}-{_process()}.jsonl"
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
@@ -113,7 +112,7 @@ def new_session() -> str:
 
 def _unwritable(path: Path, error: OSError) -> StoreError:
     reason = error.strerror or str(error)
-    return StoreError(f"nothing can be written to {path}: {reason}; what was stored before stays, and can be read")
+    return StoreError(f"cannot write to {path}: {reason}; what was stored before is still there")
 
 
 # -- what every run has ---------------------------------------------------------------------------
@@ -133,7 +132,7 @@ def prepare(store: Path, factors: Sequence[str], metrics: Sequence[str]) -> None
         if not header.exists():
             strange = any(not path.name.startswith((HEADER, ".")) for path in store.iterdir())
             if strange and not header.exists():  # another process may have written it meanwhile
-                raise OptionValueError(f"the folder {store} holds something, and is the store of no experiment")
+                raise OptionValueError(f"the folder {store} is not empty, and not the store of an experiment")
             fresh = store / f"{HEADER}.{uuid4().hex}"  # renamed as a whole: readers never see half of it
             try:
                 fresh.write_text(json.dumps(meant) + "\n", encoding="ascii")
@@ -153,8 +152,8 @@ def prepare(store: Path, factors: Sequence[str], metrics: Sequence[str]) -> None
     for what in ("factors", "metrics"):
         if found.get(what) != meant[what]:
             raise OptionValueError(
-                f"the store {store} is one of another experiment: its {what} are {found.get(what)}, and not"
-                f" {meant[what]}; give another folder"
+                f"the store {store} belongs to another experiment: its {what} are {found.get(what)}, not"
+                f" {meant[what]}; pass another folder"
             )
 
 
@@ -176,7 +175,7 @@ def lines(store: Path, factors: Sequence[str]) -> Iterator[tuple[Key, Known, dic
                     try:
                         yield _parsed(json.loads(line), factors)
                     except (ValueError, TypeError, LookupError, AttributeError):  # not JSON, or not a run
-                        warn_user(f"line {number} of {path} cannot be read, and is taken for a run that is not known")
+                        warn_user(f"line {number} of {path} cannot be read, so its run counts as missing")
         except OSError as error:
             raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
 
@@ -292,13 +291,13 @@ def compare(folder: Path, stored: Stored, keys: Sequence[str]) -> None:
     strange = stored.rows - set(keys)
     if strange and len(strange) == len(stored.rows):
         raise OptionValueError(
-            f"the store {folder} holds runs of {len(strange)} rows, such as {min(strange)}, of which this design has"
-            f" none: its first is {keys[0]}; give another folder, or a design that has them too"
+            f"the store {folder} holds runs of {len(strange)} rows, such as {min(strange)}, but this design has none"
+            f" of them: its first is {keys[0]}; pass another folder, or a design that includes them"
         )
     if strange:
         warn_user(
             f"the store {folder} holds runs of {len(strange)} rows that this design does not have, such as"
-            f" {min(strange)}; they stay there, and are not in the table"
+            f" {min(strange)}; they stay in the store, but are not in the table"
         )
 
 
@@ -323,8 +322,8 @@ def warn_of_changes(folder: Path, stored: Stored, made_of: Mapping[str, dict[str
             ]
             if other:
                 warn_user(
-                    f"the store {folder} holds runs of {contender!r} that were made otherwise: {'; '.join(other)}; they"
-                    " stay what they are, so give another folder if all are to be alike"
+                    f"the store {folder} holds runs of {contender!r} that were made differently: {'; '.join(other)};"
+                    " they are kept, so pass another folder if all must be made alike"
                 )
                 return
 

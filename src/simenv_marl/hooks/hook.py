@@ -31,7 +31,7 @@ _FILE: Final = "<stand-in for "
 
 _ASK: Final = "TAKERS.get(getcurrent(), elsewhere)({}, {})".format
 
-_SPAWNED: Final = 'a greenlet that the simulation has spawned on a hub of others (with driver="thread" it could be)'
+_SPAWNED: Final = 'a greenlet that the simulation has spawned on another library\'s hub (driver="thread" allows that)'
 
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 
@@ -278,7 +278,7 @@ class Hook(Target):
         self._stands = False
         self._set: FunctionType | None = None  # the temporary stand-in
         iterates = self.kind == "generator"
-        super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is no generator function", signature)
+        super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is not a generator function", signature)
         with suppress(TypeError):  # not all objects can be referenced weakly
             MADE_OF.setdefault(function, WeakSet()).add(self)
 

@@ -209,8 +209,8 @@ class Group:
             if actions is None or len(actions) != len(waiting):
                 returned = shown(answers) if actions is None else f"{len(actions)} actions"
                 raise InvalidActionError(
-                    f"{asked!r} was asked for {len(waiting)} decisions at once and has returned {returned}; it is to"
-                    " return as many actions, in their order, for observations whose first axis counts the decisions"
+                    f"{asked!r} was asked for {len(waiting)} decisions at once and returned {returned}; it must return"
+                    " one action for each row of the observations, in their order"
                 )
         except BaseException as error:
             seeds = [str(episode.seed) for episode in waiting]
@@ -419,7 +419,7 @@ class _Batches:
             except BaseException as problem:
                 annotate(
                     error,
-                    f"simenv_marl: and the simulation of seed {self._seeds[place]}, when it was unwound, raised"
-                    f" {shown(problem)}",
+                    f"simenv_marl: unwinding the simulation of seed {self._seeds[place]} raised {shown(problem)} as"
+                    " well",
                 )
         self._sessions.clear()

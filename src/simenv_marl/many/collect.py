@@ -283,5 +283,5 @@ def check_numbers(batch_size: Any, workers: Any) -> None:
     """
     for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as there are"
+            what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"
             raise OptionValueError(f"{name} must be {what}, not {shown(value)}")

@@ -88,7 +88,9 @@ def compare_with_rule(
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
         raise OptionValueError(f"tolerance must be a number that is not negative, not {shown(tolerance)}")
     if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
-        raise OptionValueError(f"others must be a dict of policies for those who are not compared, not {shown(others)}")
+        raise OptionValueError(
+            f"others must be a dict of policies for agents or points that policies does not name, not {shown(others)}"
+        )
     by_rule = dict.fromkeys(policies, RULE)
     checked = {name: value for name, value in options.items() if name not in PLAYING}
     check_knowable(simulation, {**by_rule, **(others or {})}, by_rule, points, checked)

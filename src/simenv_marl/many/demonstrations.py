@@ -108,7 +108,7 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
         raise OptionValueError(
-            f"dataset_id names {shown(unknown[0])}, for whom there is no policy{meant(unknown[0], map(str, policies))}"
+            f"dataset_id names {shown(unknown[0])}, which has no policy{meant(unknown[0], map(str, policies))}"
         )
     if len(set(dataset_id.values())) < len(dataset_id):
         raise OptionValueError(f"each policy needs a data set of its own: {shown(dict(dataset_id))}")
@@ -141,8 +141,8 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
     """
     if not isinstance(trajectories, Trajectories):
         raise OptionValueError(
-            f"the data set {shown(dataset_id)} needs what collect_episodes has returned under one key, not"
-            f" {shown(trajectories)}"
+            f"the data set {shown(dataset_id)} needs Trajectories, as collect_episodes returns them under each key,"
+            f" not {shown(trajectories)}"
         )
     (path,) = _check_free([dataset_id])
     _check_writable(dataset_id, trajectories)
@@ -179,12 +179,14 @@ def _check_free(names: Iterable[str]) -> list[Any]:
         try:
             parse_dataset_id(name)
         except (TypeError, ValueError):
-            raise OptionValueError(f'{shown(name)} is no name of a data set; "namespace/name-v0" is one') from None
+            raise OptionValueError(
+                f'{shown(name)} is not a name for a data set; a valid one is "namespace/name-v0"'
+            ) from None
         paths.append(get_dataset_path(name))
         if paths[-1].exists():
             raise OptionValueError(
-                f"there is a data set {shown(name)} already, in {paths[-1]}; take another name or version, or delete it"
-                " with minari.delete_dataset"
+                f"the data set {shown(name)} exists already, in {paths[-1]}; take another name or version, or delete"
+                " it with minari.delete_dataset"
             )
     return paths
 

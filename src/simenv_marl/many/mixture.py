@@ -38,13 +38,13 @@ class Mixture:
         pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
         if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
             raise OptionValueError(
-                f"a mixture is a dict from policies to weights, or pairs of these, not {shown(parts)}"
+                f"a mixture needs a dict from policies to weights, or pairs of these, not {shown(parts)}"
             )
         for policy, weight in pairs:
             if policy is not RULE and not callable(policy):
-                raise OptionValueError(f"a mixture is one of policies, callables or RULE, not of {shown(policy)}")
+                raise OptionValueError(f"a mixture consists of policies, callables or RULE, not of {shown(policy)}")
             if asks_for_environment(policy):
-                raise OptionValueError(f"{shown(policy)} asks for the environment, which a mixture has none of")
+                raise OptionValueError(f"{shown(policy)} asks for the environment, which a mixture does not have")
             if (
                 isinstance(weight, bool)
                 or not isinstance(weight, (int, float))
@@ -55,7 +55,7 @@ class Mixture:
                 )
         weights = np.array([weight for _, weight in pairs], np.float64)
         if not weights.sum() > 0:
-            raise OptionValueError("some weight of a mixture must be positive")
+            raise OptionValueError("at least one weight of a mixture must be positive")
         self.policies: tuple[Any, ...] = tuple(policy for policy, _ in pairs)
         self.weights: NDArray[np.float64] = weights / weights.sum()
         self._bounds = np.cumsum(self.weights)[:-1]

@@ -95,8 +95,7 @@ def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
         return {None: trajectories}
     if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):
         raise OptionValueError(
-            "what is to be drawn is what collect_episodes has returned, a dict of Trajectories, not"
-            f" {shown(trajectories)}"
+            f"pass the dict of Trajectories that collect_episodes returned, not {shown(trajectories)}"
         )
     if not trajectories:
         raise OptionValueError("there is nothing to draw: no policy has answered any decision")
@@ -115,7 +114,7 @@ def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
     except TypeError:
         raise OptionValueError(f"episode must be the number of an episode, not {shown(episode)}") from None
     if not -number <= place < number:
-        raise OptionValueError(f"there is no episode {place}, but {number} from 0 on")
+        raise OptionValueError(f"there is no episode {place}; there are {number}, counted from 0")
     return place % number
 
 
@@ -167,7 +166,7 @@ def _chosen(rows: Sequence[Row], agents: Any, episode: int) -> list[Row]:
     for name in agents:
         if name not in by_name:
             raise UnknownAgentError(
-                f"{shown(name)} has not decided in episode {episode}; those who have are"
+                f"{shown(name)} did not decide in episode {episode}; these agents did:"
                 f" {', '.join(list(by_name)[:20])}{' and others' if len(by_name) > 20 else ''}"
             )
     return [by_name[name] for name in dict.fromkeys(agents)]

@@ -144,7 +144,7 @@ def plot_timeline(
             for axes in column:
                 axes.tick_params(labelsize=8, colors=INK, color=PALE, labelbottom=axes is column[-1])
             timed = all(row.found.times is not None for row in rows)
-            column[-1].set_xlabel("time" if timed else "number of the decision in the episode")
+            column[-1].set_xlabel("time" if timed else "decision number in the episode")
             column[-1].set_xlim(begin - margin, end + margin)
         _mark_legend(columns[-1][0], rows, charts=len(columns) == 1)
         figure.suptitle(f"Episode {number}, seed {next(iter(parts.values())).seeds[number]}", x=0.01, ha="left")

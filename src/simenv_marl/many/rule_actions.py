@@ -24,8 +24,8 @@ def check_knowable(
         for point in plan.points:
             if not point.recorded and answers(plan, point, places[key]):
                 raise DefinitionError(
-                    f"which action the rule of {point.point.name} takes is not known; give its make_step a"
-                    " rule_action_mapping, from the rule's decision to the action that it corresponds to"
+                    f"the actions of the rule of {point.point.name} are not known; give its make_step a"
+                    " rule_action_mapping, which maps the rule's decision to an action"
                 )
 
 
@@ -35,7 +35,7 @@ def check_known(found: Trajectories) -> None:
     if len(unknown):
         agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
         raise DefinitionError(
-            f"in {len(unknown)} of {len(found)} decisions it is not known which action the rule has taken, first in"
-            f" that of {agent!r} at turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point"
-            " needs a rule_action_mapping that returns an action for every decision of the rule"
+            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known, first for {agent!r} at"
+            f" turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point needs a"
+            " rule_action_mapping that returns an action for every decision of the rule"
         )

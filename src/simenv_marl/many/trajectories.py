@@ -285,8 +285,8 @@ class Ledger:
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(
-                    f"{page.asked!r} has returned {shown(name)} of shape {array.shape} for {len(actions)} decisions;"
-                    " the first axis is to count them"
+                    f"{page.asked!r} returned {shown(name)} of shape {array.shape} for {len(actions)} decisions; the"
+                    " length of its first axis must be their number"
                 )
         page.extras.append(arrays)
 
@@ -410,8 +410,8 @@ def _check_extras(extras: Sequence[Mapping[str, Any]]) -> None:
     for other in extras:
         if other.keys() != extras[0].keys():
             raise OptionValueError(
-                f"a policy has returned {sorted(extras[0])} beside its actions, and another time {sorted(other)}; it is"
-                " to return the same at every time"
+                f"a policy returned {sorted(extras[0])} beside its actions, but later {sorted(other)}; it must return"
+                " the same names in every call"
             )
 
 

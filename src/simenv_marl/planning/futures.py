@@ -54,10 +54,10 @@ class Futures:
         except BranchError:
             self.endless = False
             warn_user(
-                f"{type(player.view.simulation).__name__} cannot draw anew what it leaves to chance: candidates are"
-                " tried out on the one future that lies ahead of it, and the planner foresees that. Give it a method"
-                " reseed(seed), which does nothing where nothing is left to chance, or make the environment with"
-                " global_rng=True if it draws from Python's or NumPy's global generators"
+                f"{type(player.view.simulation).__name__} cannot draw new random numbers in a branch: the planner"
+                " tries all candidates on the one future that will happen, and so foresees chance. Give it a method"
+                " reseed(seed), empty if nothing in it is random, or make the environment with global_rng=True if it"
+                " draws from random or numpy.random"
             )
 
     def run(self, candidates: Iterable[int], more: int, *, progress: bool = False) -> None:

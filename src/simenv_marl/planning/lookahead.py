@@ -41,7 +41,7 @@ class Lookahead:
             raise OptionValueError(f"futures must be a positive integer, not {shown(self.futures)}")
         horizon, timed = self.horizon, self.horizon_by == "time"
         if horizon is not None and not (is_number(horizon) and horizon > 0 if timed else is_count(horizon)):
-            kind = "a time that is positive" if timed else "a number of decisions, 1 or more,"
+            kind = "a positive time" if timed else "a number of decisions, 1 or more,"
             raise OptionValueError(f"horizon must be {kind} or None, not {shown(horizon)}")
         if not (is_number(self.discount) and 0 <= self.discount <= 1):
             raise OptionValueError(f"discount must be a number from 0 to 1, not {shown(self.discount)}")

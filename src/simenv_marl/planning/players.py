@@ -71,7 +71,7 @@ class Player:
         if actions is None:
             space = self.space
             if not isinstance(space, spaces.Discrete):
-                raise OptionValueError(f"actions=None means all legal ones of a Discrete; of {shown(space)}, list some")
+                raise OptionValueError(f"actions=None needs a Discrete action space; list candidates of {shown(space)}")
             actions, legal = range(int(space.start), int(space.start + space.n)), True
         try:
             listed = [] if isinstance(actions, (str, Mapping)) else list(actions)
@@ -120,7 +120,7 @@ class Player:
             if not self._may_be(name):
                 known = [*self.episode.agents, *self.episode.answered]
                 raise UnknownAgentError(
-                    f"base names {shown(name)}, which is no agent here; these are: {known}{meant(name, known)}"
+                    f"base names {shown(name)}, which is not an agent here; the agents are: {known}{meant(name, known)}"
                 )
 
     def _may_be(self, name: Any) -> bool:
@@ -248,7 +248,9 @@ class JointPlayer(Player):
         """
         super().check_base()
         if isinstance(self.base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
-            raise OptionValueError("a base by agent needs a joint view without flatten=True; give one policy of all")
+            raise OptionValueError(
+                "a base by agent needs a joint view without flatten=True; pass one policy for all agents"
+            )
 
     def _may_be(self, name: Any) -> bool:
         return name in self.view.joint.roster
@@ -283,8 +285,8 @@ class AECPlayer(Player):
         super().__init__(env, base)
         if self.view.agent_selection != self.agent:
             raise EpisodeOverError(
-                f"{self.view.agent_selection!r} is selected, whose episode has ended: take its step(None) before the"
-                f" decision of {self.agent!r} is planned"
+                f"{self.view.agent_selection!r} is selected, but its episode has ended: call step(None) before you"
+                f" plan the decision of {self.agent!r}"
             )
 
     @property
@@ -383,6 +385,6 @@ def player_of(env: Any, base: Any) -> Player:
     """
     view = getattr(env, "unwrapped", env)
     if not isinstance(view, View):
-        raise ViewError(f"actions can only be tried in an environment of one simulation, not in {shown(env)}")
+        raise ViewError(f"planning needs an environment of one simulation, not {shown(env)}")
     view.check_pending()
     return next(made for kind, made in PLAYERS.items() if isinstance(view, kind))(env, base)

@@ -95,7 +95,7 @@ class RolloutPolicy:
         number = len(found.actions)
         budget = number * self._look.futures if self.budget is None else self.budget
         if budget < number:
-            raise OptionValueError(f"a budget of {budget} branches does not suffice to try {number} candidates once")
+            raise OptionValueError(f"a budget of {budget} branches is too small to try {number} candidates once")
         return valued(found, self._search(found, budget) if number > 1 else [0])
 
     def _search(self, found: Futures, budget: int) -> list[int]:

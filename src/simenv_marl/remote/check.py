@@ -58,7 +58,7 @@ class WireReport:
     def __str__(self) -> str:
         lines = [f"{finding.verdict:5}  {finding.tried}: {finding.text}" for finding in self.findings]
         wrong = sum(finding.verdict == WRONG for finding in self.findings)
-        return "\n".join([*lines, "", f"{wrong} of {len(lines)} are wrong" if wrong else "nothing is wrong"])
+        return "\n".join([*lines, "", f"{wrong} of {len(lines)} tests failed" if wrong else "nothing is wrong"])
 
 
 def check_wire(
@@ -97,23 +97,23 @@ class _Check:
         """Try everything."""
         self._try("starts, and says hello", self._hello)
         if self._report.ok:
-            self._try("an episode by its rule", self._episode)
+            self._try("an episode by its own rule", self._episode)
         if not self._report.ok:
             return self._report
         self._try("two episodes in a row with the same seed", self._two)
         for number in sorted({1, (self._decisions + 1) // 2, self._decisions} - {0}):
             self._try(f"stop in place of the answer to call {number}", partial(self._stop, number))
-        self._try("a line of a mebibyte", self._long)
+        self._try("a line of 1 MiB", self._long)
         self._try("reseed", self._reseed)
         for what, line in (
-            ("an answer to another call", encode({"act": 10**6, "rule": True})),
-            ("a frame that there is not", encode({"desire": 1})),
-            ("a line that is no JSON", b"hello?\n"),
-            ("half a line, and the input's end", b'{"act'),
-            ("the input's end in mid-episode", b""),
+            ("an answer with the number of another call", encode({"act": 10**6, "rule": True})),
+            ("a frame that does not exist", encode({"desire": 1})),
+            ("a line that is not JSON", b"hello?\n"),
+            ("half a line, then the end of its input", b'{"act'),
+            ("the end of its input in mid-episode", b""),
         ):
             self._try(what, partial(self._refusal, line))
-        self._try("the input's end between episodes", self._idle)
+        self._try("the end of its input between episodes", self._idle)
         self._try("a run without an environment", self._alone)
         return self._report
 
@@ -162,12 +162,12 @@ class _Check:
                 if "error" in frame:
                     child.fail(ProcessError(f"it has sent {shown(frame)}"))
                 if not {"remove", "update"} & frame.keys():
-                    child.fail(ProcessError(f"it has sent what is no frame of the wire: {shown(frame)}"))
+                    child.fail(ProcessError(f"it sent {shown(frame)}, which is not a frame of the wire"))
                 child.check_named(frame, frame.get("update", frame.get("remove")))
                 continue
             number += 1
             if type(frame["decide"]) is not int or frame["decide"] != number:
-                child.fail(ProcessError(f"call {number} was due, and it has sent {shown(frame)}"))
+                child.fail(ProcessError(f"call {number} was due, but it sent {shown(frame)}"))
             child.check_named(frame, frame.get("entity"))
             if number == stop or number == self._most:
                 child.send(STOP)
@@ -191,9 +191,9 @@ class _Check:
             count = Counter(frame["point"] for frame in self._first if "decide" in frame)
             told = ", ".join(f"{point} {number}" for point, number in count.items())
             if not count:
-                return WRONG, "it has asked for no decision"
+                return WRONG, "it asked for no decision"
             if "end" not in self._first[-1]:
-                return NOTE, f"it was broken off after {self._most} decisions ({told})"
+                return NOTE, f"it was stopped after {self._most} decisions ({told})"
             return OK, f"{self._decisions} decisions ({told}), result {shown(self._first[-1]['end'].get('result'))}"
 
     def _two(self) -> tuple[str, str]:
@@ -207,7 +207,7 @@ class _Check:
             return self._compared(self._play(child))
         except ProcessDiedError:
             if child.may_exit and child.exit_code() == 0:
-                return NOTE, "it exits after an episode, and is started anew for each"
+                return NOTE, "it exits after an episode, and is started again for each"
             raise
 
     def _compared(self, frames: list[Any]) -> tuple[str, str]:
@@ -215,7 +215,7 @@ class _Check:
             if one != other:
                 return WRONG, f"frame {number} is {shown(other)}, and in a new process it was {shown(one)}"
         if len(frames) != len(self._first):
-            return WRONG, f"it has {len(frames)} frames, and in a new process {len(self._first)}"
+            return WRONG, f"it sent {len(frames)} frames, and in a new process {len(self._first)}"
         return OK, "the same as in a new process"
 
     def _stop(self, number: int) -> tuple[str, str]:
@@ -230,7 +230,7 @@ class _Check:
     def _reseed(self) -> tuple[str, str]:
         with self._child() as child:
             if "reseed" not in child.can:
-                return NOTE, 'it has not said "reseed" among what it can: no branches with other futures'
+                return NOTE, 'the "can" of its hello does not list "reseed": no branches with other futures'
         middle, futures = (self._decisions + 1) // 2, []
         for seed in (11, 11, 12):
             with self._child() as child:
@@ -239,7 +239,7 @@ class _Check:
         if one != again:
             return WRONG, "the same seed has led to two futures"
         if one == other:
-            return NOTE, "two seeds have led to the same future; is nothing left to chance?"
+            return NOTE, "two seeds have led to the same future; is nothing in the model random?"
         return OK, f"two seeds at call {middle} lead to two futures, and one seed twice to the same"
 
     def _refusal(self, line: bytes) -> tuple[str, str]:
@@ -253,12 +253,12 @@ class _Check:
             try:
                 frame = child.receive()
             except ProcessTimeoutError:
-                return WRONG, f"it neither says so nor ends within {self._timeout:g} s"
+                return WRONG, f"it neither sends an error nor ends within {self._timeout:g} s"
             except ProcessDiedError:
                 return OK, "it ends"
             if "error" in frame:
-                return OK, f"it says {shown(frame['error'])}"
-            return WRONG, f"it goes on with {shown(frame)}"
+                return OK, f"it sends the error {shown(frame['error'])}"
+            return WRONG, f"it continues with {shown(frame)}"
 
     def _idle(self) -> tuple[str, str]:
         with self._child() as child:

@@ -202,7 +202,7 @@ class Child:
             raise
         version, points, can = hello.get("hello"), hello.get("points"), hello.get("can", [])
         if version is None:
-            self.refuse(hello, f"has begun with {shown(hello)}, and not with a hello")
+            self.refuse(hello, f"began with {shown(hello)}, not with a hello")
         if type(version) is not int or version != VERSION:
             self.fail(WireError(f"{self} speaks version {shown(version)} of the wire; this is version {VERSION}"))
         if not _are_strings(points) or not _are_strings(can):
@@ -272,13 +272,17 @@ class Child:
         if not isinstance(name, str) or name not in self.points:
             self.fail(WireError(f"{self} has named the point {shown(name)}, which is not in its hello"))
         if type(entity) not in _ENTITIES:
-            self.fail(WireError(f"{self} has named {shown(entity)} at {name}; an entity is a string or an integer"))
+            self.fail(
+                WireError(
+                    f"{self} has sent the entity {shown(entity)} for {name}; an entity must be a string or an integer"
+                )
+            )
         if arguments is not None and not isinstance(arguments, dict):
-            self.fail(WireError(f"{self} has sent args for {name} that are no object: {shown(arguments)}"))
+            self.fail(WireError(f"{self} has sent args for {name} that are not an object: {shown(arguments)}"))
         if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
             time = float(time)
         if type(time) not in _TIMES:
-            self.fail(WireError(f"{self} has sent the time {shown(time)} for {name}, which is no number"))
+            self.fail(WireError(f"{self} has sent the time {shown(time)} for {name}, which is not a number"))
         return name, time
 
     def check_end(self, end: Any) -> None:
@@ -288,7 +292,9 @@ class Child:
             WireError: It is invalid.
         """
         if not isinstance(end, dict):
-            self.fail(WireError(f'{self} has sent the end {shown(end)}; it is an object with "truncated" and "result"'))
+            self.fail(
+                WireError(f'{self} has sent the end {shown(end)}; it must be an object with "truncated" and "result"')
+            )
 
     def send(self, lines: bytes) -> None:
         """Send lines.
@@ -316,7 +322,7 @@ class Child:
                 self._poll.unregister(process.writing)
                 self._poll.register(process.reading, select.POLLIN)
             except OSError as error:  # its input is closed
-                raise ProcessDiedError(f"{self} was ended") from error
+                raise ProcessDiedError(f"{self} has been ended already") from error
 
     def _wait(self, descriptor: int, begun: float, sent: str) -> None:
         """Wait until a descriptor is ready; read standard error meanwhile."""
@@ -350,7 +356,7 @@ class Child:
         """End the process at once, and raise an error with the last part of its standard error."""
         self.end(patience=0.0)
         text = self._process.last.decode(errors="replace").strip()
-        raise type(error)(f"{error}. The last that it wrote on its standard error:\n{text}" if text else str(error))
+        raise type(error)(f"{error}. The end of its standard error:\n{text}" if text else str(error))
 
     def refuse(self, frame: Mapping[str, Any], what: str) -> NoReturn:
         """Raise the error that a frame reports, or say that the frame is invalid or not due."""
@@ -359,7 +365,7 @@ class Child:
             self.fail(WireError(f"{self} {what}"))
         kind, text, trace = (error.get(name) or "" for name in ("type", "text", "trace"))
         where = f"\n{trace}" if trace else ""
-        self.fail(RemoteError(f"the model in {self} has raised {kind or 'an error'}: {text}{where}"))
+        self.fail(RemoteError(f"the model in {self} raised {kind or 'an error'}: {text}{where}"))
 
     def end(self, patience: float = GRACE) -> None:
         """Close its pipes, and end it and all processes that it started.

@@ -113,7 +113,7 @@ class ProcessSimulation(SimulationInterface):
             ProcessError: The platform is not POSIX.
         """
         if os.name != "posix":
-            raise ProcessError("ProcessSimulation needs POSIX: a process elsewhere gets no descriptors")
+            raise ProcessError("ProcessSimulation needs POSIX: elsewhere a process cannot inherit the descriptors")
         self.command = _words(command)
         if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < inf:
             raise OptionValueError(f"timeout must be a positive number of seconds, not {shown(timeout)}")
@@ -178,7 +178,7 @@ class ProcessSimulation(SimulationInterface):
             child.send(start)
             first = child.receive()
             if stopped and "end" in first:
-                child.refuse(first, f'has sent {shown(first)} after "stop", and not only after the next start')
+                child.refuse(first, f'has sent {shown(first)} after "stop"; it must be silent until the next start')
             child.may_exit = False
             link.begin(first)
         except BaseException:
@@ -213,7 +213,7 @@ class ProcessSimulation(SimulationInterface):
                 elif "remove" in frame:
                     self._remove(child, frame)
                 else:
-                    child.refuse(frame, f"has sent what is no frame of the wire: {shown(frame)}")
+                    child.refuse(frame, f"has sent {shown(frame)}, which is not a frame of the wire")
                 frame = child.receive()
             return self._end(child, frame["end"])
         except BaseException:
@@ -238,7 +238,7 @@ class ProcessSimulation(SimulationInterface):
         """A method that returns the process's time. The attribute is missing if the process tells no time."""
         link = self._link
         if link.time is None:
-            raise AttributeError("the process tells no time")
+            raise AttributeError("the process has not sent a time")
         return lambda: link.time  # type: ignore[return-value]
 
     def reseed(self, seed: int) -> None:
@@ -258,7 +258,7 @@ class ProcessSimulation(SimulationInterface):
         """Get the decision of a call; return the lines that answer it."""
         link, number = self._link, frame["decide"]
         if type(number) is not int or number != link.number + 1:
-            child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
+            child.fail(WireError(f"{child} made call {shown(number)}, but call {link.number + 1} was due"))
         entity = frame.get("entity")
         name, time = child.check_named(frame, entity)
         if time is not None:
@@ -275,7 +275,7 @@ class ProcessSimulation(SimulationInterface):
         try:
             line = answer(number, value)
         except WireError as error:
-            annotate(error, f"simenv_marl: it is the decision at {call.point} of {call.entity!r}")
+            annotate(error, f"simenv_marl: in the decision of {call.entity!r} at {call.point}")
             raise
         if link.seed is None:
             return line
@@ -335,7 +335,7 @@ def _by_function(points: Any) -> dict[Any, Definition]:
     for name, definition in points.items():
         if not isinstance(name, str) or not name or not isinstance(definition, Definition):
             raise DefinitionError(
-                "points must go from the process's names to what make_step returns, not"
-                f" {shown(name)}: {shown(definition)}"
+                f"points must be a dict from the process's names to what make_step returns, not {shown(name)}:"
+                f" {shown(definition)}"
             )
     return {point_named(name).decide: definition for name, definition in points.items()}

@@ -107,9 +107,7 @@ def _check_name(name: str, class_name: str, template: str) -> None:
     tree = ast.parse(template)
     imported = {node.names[0].name.partition(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import)}
     if name in sys.stdlib_module_names or name.lower() in imported or _installed(name):
-        raise OptionValueError(
-            f"{shown(name)} is the name of another module, which could not be imported any more{example}"
-        )
+        raise OptionValueError(f"{shown(name)} is the name of another module, which the new file would hide{example}")
     used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
     used |= {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)} - {PLACEHOLDER}
     if class_name in used or hasattr(builtins, class_name):

@@ -158,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seeds = range(100_000, 100_005 if quick else 100_030)
     metric = {"alive": lambda simulation: len(simulation.model.agents)}
     found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule", metric=metric, batched=True)
-    for of, title in (("return", "What all rabbits have eaten"), ("alive", "Rabbits alive in the end")):
+    for of, title in (("return", "What all rabbits have eaten"), ("alive", "Rabbits alive at the end")):
         print(f"{title}; differences are paired by seed, with 95 % intervals:")
         print(found.summary(of).round(1).to_string())
     print("Next: put your model into section 1, and run pytest. For a full report:")

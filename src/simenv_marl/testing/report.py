@@ -239,7 +239,7 @@ class CheckReport:
     def __str__(self) -> str:
         parts = [f"{self.simulation}: {self._counts()}", *map(str, self.findings)]
         if self.checked:
-            parts.append("\n".join(["What was looked at", *(_wrapped(line, "  ") for line in self.checked)]))
+            parts.append("\n".join(["What was checked", *(_wrapped(line, "  ") for line in self.checked)]))
         points = [indent(str(point), "  ") for point in self.observations]
         parts.append("\n".join([f"Episodes of random legal actions: {self.episodes}", *points]))
         if self.calls:
@@ -319,7 +319,7 @@ class Inspection:
             [
                 f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}",
                 *map(str, self.points),
-                f"Views that fit: {', '.join(self.views)}",
+                f"Possible views: {', '.join(self.views)}",
                 "\n".join(lines),
             ]
         )

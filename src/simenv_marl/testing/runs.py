@@ -199,7 +199,7 @@ class _Watch:
                 run.cut = True
                 run.fingerprint = self._look(self.simulation)
             raise Cut
-        note = [name, "nothing, but was left"]
+        note = [name, "left without a decision"]
         run.decisions.append(note)
 
         def end(value: Any) -> None:
@@ -373,9 +373,9 @@ def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> lis
         module, name = getattr(argument, "__module__", None), getattr(argument, "__name__", "")
         owner = getattr(argument, "__self__", None)
         if module == "time" and name in _CLOCKS:
-            asked(f"the clock is asked (time.{name})", frame)
+            asked(f"the clock is read (time.{name})", frame)
         elif name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
-            asked(f"the clock is asked (datetime.{name})", frame)
+            asked(f"the clock is read (datetime.{name})", frame)
         elif name == "urandom":
             asked("the operating system is asked for random bits (as by a generator without a seed)", frame)
         elif owner is shared and name in ("random", "getrandbits"):

@@ -147,7 +147,7 @@ def test_the_view_can_be_chosen():
     envs = vector_env(Counter, Counter.decide, num_envs=2, view="joint")
     assert isinstance(envs.single_action_space, spaces.Dict)
     envs.close()
-    with pytest.raises(ViewError, match="needs the name of one agent, or one active decision point"):
+    with pytest.raises(ViewError, match="needs one active decision point"):
         vector_env(Pair, [Pair.steer, Entity.grow], num_envs=2, view="single")
     with pytest.raises(OptionValueError, match="view must be"):
         vector_env(Counter, Counter.decide, num_envs=2, view="aec")

@@ -404,7 +404,7 @@ def one_argument(days):
         ("cannot be stored", {"design": {"days": [object()]}}),
         ("must be a DataFrame", {"design": 3}),
         ("there are none", {"seeds": []}),
-        ("'rule' is the model as it is", {"policies": {"rule": {"keeper": much}}}),
+        ("'rule' is always the model as it is", {"policies": {"rule": {"keeper": much}}}),
         ("stranger", {"policies": {"a": {"stranger": much}}}),
         ("unknown|no option", {"nonsense": 3}),
         ("team", {"team": 3}),

@@ -280,7 +280,7 @@ def test_what_only_the_rule_knows_is_grey():
         if len(cells.get_facecolor())
     ]
     assert any(greys)
-    assert any("by rule, unknown" in texts(axes.figure.axes[1]) for axes in of_each)
+    assert any("by rule, action unknown" in texts(axes.figure.axes[1]) for axes in of_each)
 
 
 def test_policies_are_called_by_the_last_of_their_dotted_names():

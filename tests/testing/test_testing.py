@@ -396,7 +396,7 @@ def test_state_that_is_left_over_in_the_class():
             return [self.place, len(self.episodes)]
 
     found = only_error(checked(Shared), "same seed does not give the same run")
-    assert "attributes of classes" in found.explanation.replace("\n", " ")
+    assert "class attributes" in found.explanation.replace("\n", " ")
 
 
 def test_environments_that_disturb_each_other():
@@ -932,7 +932,7 @@ def test_what_is_the_same_is_the_same(make):
 def test_things_that_refer_to_themselves_are_written_down():
     thing = Thing(1)
     thing.other = [thing]
-    assert holding(it=thing).parts["simulation.it.other[0]"] == "what is also simulation.it"
+    assert holding(it=thing).parts["simulation.it.other[0]"] == "the same object as simulation.it"
 
 
 def test_a_long_history_does_not_hide_the_rest():

@@ -184,7 +184,7 @@ class BaseDriver:
             if kind is STALLED:
                 problems += [error for error in box if not is_exit(error)]
                 box.clear()
-                self.given_up = f"neither decided anything nor ended for {seconds} s; it is abandoned"
+                self.given_up = f"neither decided anything nor ended within {seconds} s; it is abandoned"
                 break
             if kind is FINISHED or kind is FAILED:
                 value = box.pop()

@@ -76,7 +76,7 @@ class AskedEnv(SimulationEnv):
         Raises:
             ReentrancyError: Always.
         """
-        raise ReentrancyError("a policy cannot reset the environment that it is given")
+        raise ReentrancyError("a policy cannot reset the environment that it is given; it must return an action")
 
     def close(self) -> None:
         """End a branch.
@@ -85,7 +85,7 @@ class AskedEnv(SimulationEnv):
             ReentrancyError: This environment is not a branch.
         """
         if not self._branched:
-            raise ReentrancyError("a policy cannot close the environment that it is given")
+            raise ReentrancyError("a policy cannot close the environment that it is given; it must return an action")
         super().close()
 
     def replayed(self) -> AskedEnv:
@@ -109,10 +109,10 @@ class AskedEnv(SimulationEnv):
             raise
 
     def __deepcopy__(self, memory: dict[int, Any]) -> NoReturn:
-        raise CopyError("the environment that a policy is given cannot be copied; use branch")
+        raise CopyError("the environment that a policy is given cannot be copied; use branch to continue it")
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        raise CopyError("the environment that a policy is given cannot be pickled; use branch")
+        raise CopyError("the environment that a policy is given cannot be pickled; use branch to continue it")
 
 
 AskingPolicy.make = staticmethod(AskedEnv)

@@ -61,9 +61,9 @@ class SimulationEnv(OneAgentView):
         if plan.one_agent is None:
             points = ", ".join(binding.point.name for binding in plan.active)
             raise ViewError(
-                "the single view needs the name of one agent, or one active decision point whose agent= is a string;"
-                f" active are {points}. Name the agent with agent=, name one point in points=, answer the others with"
-                " policies=, or use aec_env"
+                "the single view needs one active decision point whose agent= is not a callable, or the name of one"
+                f" agent; active are {points}. Name the agent with agent=, name one point in points=, answer the"
+                " others with policies=, or use aec_env"
             )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

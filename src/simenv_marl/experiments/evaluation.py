@@ -395,7 +395,7 @@ def distinct_seeds(given: Iterable[int]) -> list[int]:
     """
     seeds = checked_seeds(given)
     if not seeds:
-        raise OptionValueError("seeds must be at least one integer, as in range(32); there are none")
+        raise OptionValueError("seeds must be integers, such as range(32), but there are none")
     twice = next((seed for seed in seeds if seeds.count(seed) > 1), None) if len(set(seeds)) < len(seeds) else None
     if twice is not None:
         raise OptionValueError(f"the seed {twice} occurs twice: its result would be counted twice")
@@ -404,7 +404,7 @@ def distinct_seeds(given: Iterable[int]) -> list[int]:
 
 def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: Any) -> None:
     if not contenders:
-        raise OptionValueError("contenders must have at least one entry, as in {'rule': {}}; there are none")
+        raise OptionValueError("contenders must be a dict, such as {'rule': {}}, but there are none")
     if baseline is not None and baseline not in list(contenders):
         raise OptionValueError(
             f"the baseline {shown(baseline)} is not one of the contenders:"

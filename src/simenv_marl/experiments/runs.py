@@ -197,8 +197,7 @@ def _contenders(policies: Any, *, batched: bool) -> dict[str, Policies]:
     found = checked_contenders(policies or {}, "policies", batched=batched)
     if found.pop(BY_RULE, {}):
         raise OptionValueError(
-            f"a contender cannot be called {BY_RULE!r}: that is the model as it is, which is always a contender;"
-            " rename yours"
+            f"the contender {BY_RULE!r} is always the model as it is; give your policies another name"
         )
     return {BY_RULE: {}, **found}
 

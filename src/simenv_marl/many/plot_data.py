@@ -95,7 +95,7 @@ def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
         return {None: trajectories}
     if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):
         raise OptionValueError(
-            f"pass the dict of Trajectories that collect_episodes returned, not {shown(trajectories)}"
+            f"only the dict of Trajectories that collect_episodes returned can be drawn, not {shown(trajectories)}"
         )
     if not trajectories:
         raise OptionValueError("there is nothing to draw: no policy has answered any decision")

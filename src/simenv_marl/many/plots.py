@@ -320,7 +320,7 @@ def _mark_legend(axes: "Axes", rows: Sequence[Row], *, charts: bool) -> None:
         else:
             marks["by rule"] = {"color": INK, "linewidth": 2}
             if not known:
-                marks["by rule, unknown"] = {"color": UNKNOWN, "linewidth": 2}
+                marks["by rule, action unknown"] = {"color": UNKNOWN, "linewidth": 2}
     for mark, text in ENDS.items():
         if any(mark in row.ends for row in rows):
             marks[text] = {"marker": mark, "color": INK, "linewidth": 0, "markersize": 6}

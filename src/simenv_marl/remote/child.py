@@ -318,7 +318,7 @@ class Child:
                 begun = begun or monotonic()
                 self._poll.unregister(process.reading)
                 self._poll.register(process.writing, select.POLLOUT)
-                self._wait(process.writing, begun, "nothing, and does not read")
+                self._wait(process.writing, begun, "nothing and read nothing")
                 self._poll.unregister(process.writing)
                 self._poll.register(process.reading, select.POLLIN)
             except OSError as error:  # its input is closed
@@ -365,7 +365,7 @@ class Child:
             self.fail(WireError(f"{self} {what}"))
         kind, text, trace = (error.get(name) or "" for name in ("type", "text", "trace"))
         where = f"\n{trace}" if trace else ""
-        self.fail(RemoteError(f"the model in {self} raised {kind or 'an error'}: {text}{where}"))
+        self.fail(RemoteError(f"the model in {self} has raised {kind or 'an error'}: {text}{where}"))
 
     def end(self, patience: float = GRACE) -> None:
         """Close its pipes, and end it and all processes that it started.

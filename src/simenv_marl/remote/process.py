@@ -258,7 +258,7 @@ class ProcessSimulation(SimulationInterface):
         """Get the decision of a call; return the lines that answer it."""
         link, number = self._link, frame["decide"]
         if type(number) is not int or number != link.number + 1:
-            child.fail(WireError(f"{child} made call {shown(number)}, but call {link.number + 1} was due"))
+            child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
         entity = frame.get("entity")
         name, time = child.check_named(frame, entity)
         if time is not None:

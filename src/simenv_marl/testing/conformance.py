@@ -63,7 +63,7 @@ def check_conformance(subject: Subject, report: Report) -> None:
     """Run the tests of PettingZoo and Gymnasium; explain their warnings."""
     if subject.late or report.has_errors:
         # They would only repeat these errors in other words.
-        report.checked.append("not, because of the errors: what PettingZoo and Gymnasium test themselves")
+        report.checked.append("skipped because of the errors: the tests of PettingZoo and Gymnasium")
         return
     passed = []
     seed_global_generators(0)

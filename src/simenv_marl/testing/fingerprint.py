@@ -101,7 +101,7 @@ def _written(name: str, root: Any) -> Fingerprint:
         elif isinstance(value, _NAMED):
             parts[path] = title(value)
         elif id(value) in met:
-            parts[path] = f"what is also {met[id(value)]}"
+            parts[path] = f"the same object as {met[id(value)]}"
         else:
             if not isinstance(value, (tuple, frozenset)):  # equal ones may or may not be the same object
                 met[id(value)] = path

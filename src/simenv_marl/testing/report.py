@@ -313,7 +313,7 @@ class Inspection:
         more = f" and {len(self.agents) - 8} more" if len(self.agents) > 8 else ""
         episode = {"calls": counts, "order": self.calls, "agents": ", ".join(self.agents[:8]) + more}
         empty = {"calls": "none", "order": "-", "agents": "-"}
-        lines = [f"One episode by the model's own rules: {self.ended}"]
+        lines = [f"One episode with the model's own rules: {self.ended}"]
         lines += [_wrapped(f"{name:<8} {text or empty[name]}", "  ", 11) for name, text in episode.items()]
         return "\n\n".join(
             [

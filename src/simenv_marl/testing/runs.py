@@ -295,7 +295,7 @@ class Step:
     def difference(self, other: Step) -> str:
         """Describe the difference from a step of another episode; empty if there is none."""
         if self.agent != other.agent:
-            return f"is first of {self.agent}, then of {other.agent}"
+            return f"the agent is first {self.agent}, then {other.agent}"
         names = ("observation", "reward", "terminated", "truncated", "info")
         for name, here, there in zip(names, self.told, other.told, strict=True):
             if not alike(here, there):

@@ -147,7 +147,7 @@ class Played:
         if other.error is not None:
             return f"the second one raises {error_in_words(other.error)}"
         if len(self.steps) != len(other.steps):
-            return f"there are first {len(self.steps)} steps, then {len(other.steps)}"
+            return f"first there are {len(self.steps)} steps, then {len(other.steps)}"
         return ""
 
 

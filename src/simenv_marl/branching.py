@@ -315,7 +315,7 @@ def _result(child: _Child) -> Any:
     if not child.received:
         code = os.waitstatus_to_exitcode(status)
         how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
-        raise BranchError(f"branch {number} died without a result, {how}")
+        raise BranchError(f"branch {number} has died without a result, {how}")
     answered, parcel = pickle.loads(child.received)
     if answered:
         try:

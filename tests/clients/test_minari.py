@@ -199,7 +199,7 @@ def test_nothing_is_overwritten_and_nothing_is_run_in_vain():
 
     with pytest.raises(OptionValueError, match="already"):
         record_dataset(NAME, script(never), {ant: ones}, points=ant, seeds=[1])
-    with pytest.raises(OptionValueError, match="no name"):
+    with pytest.raises(OptionValueError, match="not a name"):
         record_dataset("no name", script(never), {ant: ones}, points=ant, seeds=[1])
     with pytest.raises(OptionValueError, match="nothing to write"):
         record_dataset("simenv/none-v0", script(lambda simulation: None), {ant: ones}, points=ant, seeds=[1])

@@ -735,7 +735,7 @@ def test_somebody_elses_patch_meanwhile_is_left_alone():
     def replacement(self, good, limit=5):
         return 0
 
-    with pytest.raises(HandlerError, match="no handler attached"):
+    with pytest.raises(HandlerError, match="no handler is attached"):
         remove_handler(f"{MARKET}.price", "instead")
     exposed = Trader.bid
     Trader.bid = replacement

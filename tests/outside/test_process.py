@@ -627,7 +627,7 @@ def test_options_that_are_no_json_are_refused_before_anything_is_sent(make_env, 
 def test_a_decision_that_is_no_json_is_told_with_its_point(make_env):
     env = make_env(aec_env, reservoirs({"broker.price": replace(PRICE, action_space_mapping=lambda action: {1, 2})}))
     env.reset(seed=1)
-    with pytest.raises(WireError, match="no JSON") as caught:
+    with pytest.raises(WireError, match="not JSON") as caught:
         env.step(1)
     assert "broker.price" in "".join(caught.value.__notes__)
     all_told(env, 1, ruled)

@@ -60,7 +60,7 @@ def test_what_numpy_and_python_have_is_sent_as_json(value, sent):
 
 @pytest.mark.parametrize(
     ("value", "where"),
-    [({1}, "no JSON"), ([1, [object()]], r"\[1\]\[0\]"), ({"a": {2: 3}}, "'a'"), (b"a", "b'a'"), (1j, "1j")],
+    [({1}, "not JSON"), ([1, [object()]], r"\[1\]\[0\]"), ({"a": {2: 3}}, "'a'"), (b"a", "b'a'"), (1j, "1j")],
 )
 def test_what_is_no_json_is_refused_with_its_place(value, where):
     with pytest.raises(WireError, match=where):

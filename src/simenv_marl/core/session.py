@@ -259,7 +259,7 @@ class Session:
             raise BranchError(
                 f"{type(self.simulation).__name__} does not repeat its decisions with the same seed and the same"
                 ' actions: some of its random numbers do not follow from the seed. Use method="fork", or'
-                " global_rng=True if it draws from Python's or NumPy's global generators"
+                " global_rng=True if it draws from random or numpy.random"
             )
         return again
 
@@ -290,9 +290,9 @@ class Session:
         """
         if self._rng is None and not callable(getattr(self.simulation, "reseed", None)):
             raise BranchError(
-                f"seeds= needs a way to reseed {type(self.simulation).__name__}: give it a method reseed(seed)"
-                " that seeds its generators in place (simenv_marl.reseed_generators(self, seed) finds them), or make"
-                " the environment with global_rng=True if it draws from Python's or NumPy's global generators"
+                f"seeds= needs a way to reseed {type(self.simulation).__name__}: give it a method reseed(seed), which"
+                " may call simenv_marl.reseed_generators(self, seed), or make the environment with global_rng=True if"
+                " it draws from random or numpy.random"
             )
 
     def reseed(self, seed: int) -> None:

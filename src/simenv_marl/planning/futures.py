@@ -56,8 +56,8 @@ class Futures:
             warn_user(
                 f"{type(player.view.simulation).__name__} cannot draw new random numbers in a branch: the planner"
                 " tries all candidates on the one future that will happen, and so foresees chance. Give it a method"
-                " reseed(seed), empty if nothing in it is random, or make the environment with global_rng=True if it"
-                " draws from random or numpy.random"
+                " reseed(seed), empty if nothing is random, or set global_rng=True if it draws from random or"
+                " numpy.random"
             )
 
     def run(self, candidates: Iterable[int], more: int, *, progress: bool = False) -> None:

@@ -56,27 +56,30 @@ def _parser() -> argparse.ArgumentParser:
     _add_new(commands)
     check = commands.add_parser(
         "check",
-        help="run it alone and in environments, and report what is wrong",
+        help="run a simulation alone and in environments, and report what is wrong",
         description="Run a simulation alone and in environments, and report what is wrong. Exit code: 0 without errors,"
         " 1 with errors, 2 if the simulation cannot run.",
     )
     look = commands.add_parser(
         "inspect",
-        help="list its decision points and the order in which they are called",
+        help="list the decision points of a simulation and the order of their calls",
         description="List the decision points of a simulation, and the order in which the model calls them.",
     )
     check.set_defaults(look=_checked)
     look.set_defaults(look=_inspected)
     for command in (check, look):
         command.add_argument(
-            "simulation", metavar="module:Simulation", help="its class, an instance, or a factory without arguments"
+            "simulation", metavar="module:Simulation", help="a class, an instance, or a factory without arguments"
         )
         command.add_argument(
-            "--points", nargs="+", metavar="NAME", help="dotted names of its decision points (default: its own)"
+            "--points",
+            nargs="+",
+            metavar="NAME",
+            help="dotted names of decision points (default: the simulation's own)",
         )
         command.add_argument("--seed", type=_number(0), default=0, metavar="N", help="the first seed (default: 0)")
-        command.add_argument("--json", action="store_true", help="print JSON in place of text")
-    check.add_argument("--episodes", type=_number(1), default=10, metavar="N", help="of random actions (default: 10)")
+        command.add_argument("--json", action="store_true", help="print JSON instead of text")
+    check.add_argument("--episodes", type=_number(1), default=10, metavar="N", help="random episodes (default: 10)")
     check.add_argument(
         "--max-steps", type=_number(1), default=1000, metavar="N", help="the longest run, in decisions (default: 1000)"
     )
@@ -95,7 +98,7 @@ def _add_new(commands: Any) -> None:
     )
     new.set_defaults(look=lambda options: write_template(options.kind, options.name, options.folder), json=False)
     new.add_argument("kind", choices=KINDS, help="a plain loop, processes of SimPy, or agents of Mesa")
-    new.add_argument("name", metavar="NAME", help="of the module; its class is named after it")
+    new.add_argument("name", metavar="NAME", help="the module; its class is named after it")
     new.add_argument(
         "--folder", type=Path, metavar="DIR", help="the folder for both files (default: a new folder NAME)"
     )
@@ -123,7 +126,7 @@ def _add_wire_check(commands: Any) -> None:
     wire.add_argument(
         "--timeout", type=_seconds, default=30.0, metavar="SECONDS", help="the longest wait for a line (default: 30)"
     )
-    wire.add_argument("--json", action="store_true", help="print JSON in place of text")
+    wire.add_argument("--json", action="store_true", help="print JSON instead of text")
     wire.add_argument("program", metavar="COMMAND", nargs=argparse.REMAINDER, help="the program and its arguments")
 
 

@@ -240,7 +240,7 @@ class _Check:
             return WRONG, "the same seed has led to two futures"
         if one == other:
             return NOTE, "two seeds have led to the same future; is nothing in the model random?"
-        return OK, f"two seeds at call {middle} lead to two futures, and one seed twice to the same"
+        return OK, f"at call {middle}, two seeds lead to two futures, and the same seed to the same future"
 
     def _refusal(self, line: bytes) -> tuple[str, str]:
         with self._child() as child:

@@ -176,7 +176,7 @@ def _compare_view(subject: Subject, report: Report, view: str, driver: str) -> D
         if names := run.drawn - subject.drawn:
             subject.drawn |= names
             report.add("drawing_mappings", names=" and ".join(sorted(names)))
-        words = ("plainly", "behind the environment")
+        words = ("plainly", "in the environment")
         decisions, parts = plain.difference(run, *words), subject.differences(plain, run)
         if decisions or parts:
             told = decisions or differences_in_words(parts, *words)

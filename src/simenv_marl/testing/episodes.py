@@ -89,9 +89,7 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, known: dict[i
             _compare_side_by_side(subject, report, (fresh, beside), known)
         _compare_seeds(subject, report, known)
         _compare_actions(subject, report, used, first, known[first])
-        report.checked.append(
-            "the same seed and actions in a new environment, in one that was used before, and beside another one"
-        )
+        report.checked.append("the same seed and actions in a new environment, in a used one, and beside another one")
 
 
 def _left_over(subject: Subject, report: Report, seed: int) -> str:

@@ -182,8 +182,8 @@ class Timing:
 
     def __str__(self) -> str:
         return (
-            f"{in_digits(self.plain)} us per decision in the plain run, {in_digits(self.environment)} us behind the"
-            f" environment"
+            f"{in_digits(self.plain)} us per decision in the plain run, {in_digits(self.environment)} us in the"
+            " environment"
         )
 
 

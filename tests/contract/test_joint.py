@@ -511,7 +511,7 @@ def test_what_is_partly_discrete_cannot_be_flattened():
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_flatten_is_the_joint_views_alone(make):
     ant, bee = points(**BOX)
-    with pytest.raises(UnknownOptionError, match="an option of the joint view alone"):
+    with pytest.raises(UnknownOptionError, match="an option of the joint view only"):
         make(calling(ant, bee), [ant, bee], flatten=True)
 
 

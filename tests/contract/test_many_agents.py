@@ -881,7 +881,7 @@ def test_a_bare_name_means_who_the_entity_was_where_it_is_named_no_more(kind):
 
 def test_a_bare_name_that_can_never_mean_an_agent_is_warned_of():
     """A method of something else is called on that, and not on an entity."""
-    with pytest.warns(UserWarning, match=r"leave.*no Being.*ends no agent.*callable"):
+    with pytest.warns(UserWarning, match=r"leave.*not on a Being.*ends no agent.*callable"):
         env = aec_env(script(lambda simulation: Being(0).act()), beings(removed_by=f"{HERE}.Other.leave"))
     assert len(play(env, 1)) == 2
 

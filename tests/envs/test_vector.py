@@ -606,7 +606,7 @@ def test_one_that_raises_while_it_is_unwound_does_not_keep_the_others():
     with pytest.raises(LookupError) as caught:
         envs.close()
     assert "sub-environment 1" in notes(caught.value)
-    assert "sub-environment 2: LookupError" in notes(caught.value)
+    assert "sub-environment 2 raised LookupError" in notes(caught.value)
     assert all(simulation.unwound for simulation in simulations)
     assert envs.closed
     assert stacks(stacks_before) == stacks_before

@@ -93,16 +93,17 @@ def world(
 # -- learning, in the home world ------------------------------------------------------------------
 
 
-def rate(contenders: Iterable[Policies], seeds: Iterable[int], workers: int) -> NDArray[np.float64]:
+def rate(contenders: Iterable[Policies], points: Any, seeds: Iterable[int], workers: int) -> NDArray[np.float64]:
     """Compute the mean welfare of each of several policies.
 
     Args:
         contenders: The policies.
+        points: The decision points of these policies. Returns of others would only take time.
         seeds: The seeds of the funds, the same for all policies.
         workers: The number of processes.
     """
     named = {str(number): policies for number, policies in enumerate(contenders)}
-    found = evaluate(world, named, seeds=seeds, points=POINTS, metric=FundSim.welfare, workers=workers)
+    found = evaluate(world, named, seeds=seeds, points=points, metric=FundSim.welfare, workers=workers)
     means: NDArray[np.float64] = found.values("metric").mean().to_numpy()
     return means
 
@@ -110,24 +111,25 @@ def rate(contenders: Iterable[Policies], seeds: Iterable[int], workers: int) -> 
 def best_constants(seeds: int, workers: int) -> dict[str, Constant]:
     """Find the best pair of a constant mix and a constant indexation."""
     pairs = [{MANAGER: Constant(mix), INDEXER: Constant(by)} for mix, by in _pairs(MIXES, INDEXATIONS)]
-    return pairs[int(np.argmax(rate(pairs, range(seeds), workers)))]
+    return pairs[int(np.argmax(rate(pairs, TEAM, range(seeds), workers)))]
 
 
 def best_premium(seeds: int, workers: int) -> dict[str, Constant]:
     """Find the best constant surcharge on the premiums of all clients."""
     surcharges = [{PREMIUM: Constant(level)} for level in range(len(SURCHARGES))]
-    return surcharges[int(np.argmax(rate(surcharges, range(seeds), workers)))]
+    return surcharges[int(np.argmax(rate(surcharges, PREMIUMS, range(seeds), workers)))]
 
 
 def _pairs(first: Sequence[Any], second: Sequence[Any]) -> Iterable[tuple[int, int]]:
     return itertools.product(range(len(first)), range(len(second)))
 
 
-def train(start: Mapping[str, Linear], generations: int, seed: int, workers: int) -> dict[str, Linear]:
+def train(start: Mapping[str, Linear], points: Any, generations: int, seed: int, workers: int) -> dict[str, Linear]:
     """Train policies jointly, by evolution of their weights.
 
     Args:
         start: The initial policies, by agent or decision point.
+        points: Their decision points.
         generations: The number of generations.
         seed: The seed of the training.
         workers: The number of processes.
@@ -138,7 +140,7 @@ def train(start: Mapping[str, Linear], generations: int, seed: int, workers: int
         return {name: Linear(tuple(own.tolist())) for name, own in zip(start, np.split(weights, sizes), strict=True)}
 
     def rated(candidates: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-        return rate(map(team, candidates), rng.integers(HELD_OUT, size=8).tolist(), workers)
+        return rate(map(team, candidates), points, rng.integers(HELD_OUT, size=8).tolist(), workers)
 
     rng = np.random.default_rng(seed)
     first = np.concatenate([policy.weights for policy in start.values()])
@@ -162,8 +164,8 @@ def learned(folder: Path, generations: int, seeds: int, workers: int) -> dict[st
     ways: dict[str, tuple[type, Callable[[], Mapping[str, Any]]]] = {
         "constant pair": (Constant, lambda: best_constants(seeds, workers)),
         "constant premium": (Constant, lambda: best_premium(seeds, workers)),
-        "trained pair": (Linear, lambda: train(pair, generations, 1, workers)),
-        "trained premiums": (Linear, lambda: train(premiums, generations, 2, workers)),
+        "trained pair": (Linear, lambda: train(pair, TEAM, generations, 1, workers)),
+        "trained premiums": (Linear, lambda: train(premiums, PREMIUMS, generations, 2, workers)),
     }
     found: dict[str, dict[str, Any]] = {}
     for name, (kind, learn) in ways.items():

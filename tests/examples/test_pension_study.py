@@ -178,7 +178,7 @@ def test_worlds_are_what_they_are_called():
 @pytest.mark.usefixtures("small")
 def test_training_is_determined_by_its_seed():
     start = {INDEXER: Linear.start(0.5, len(OBSERVED))}
-    first, again, other = (study.train(start, 1, seed, 0) for seed in (1, 1, 2))
+    first, again, other = (study.train(start, study.TEAM, 1, seed, 0) for seed in (1, 1, 2))
     assert first == again != other
     assert set(first) == {INDEXER}
 
@@ -187,7 +187,7 @@ def test_training_is_determined_by_its_seed():
 def test_the_best_constants_are_no_worse_than_any(monkeypatch):
     best = study.best_constants(2, 0)
     every = [{"manager_0": Constant(mix), INDEXER: Constant(by)} for mix in range(len(MIXES)) for by in range(5)]
-    assert study.rate([best], range(2), 0)[0] == max(study.rate(every, range(2), 0))
+    assert study.rate([best], study.TEAM, range(2), 0)[0] == max(study.rate(every, study.TEAM, range(2), 0))
 
 
 @pytest.mark.usefixtures("small")

@@ -268,7 +268,9 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
             before, EVALUATING[here] = EVALUATING.get(here), agent
         try:
             reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-            agent.reward = checked_reward(agent, reward)
+            if type(reward) is not float or reward - reward != 0.0:  # spares nearly all rewards the call
+                reward = checked_reward(agent, reward)
+            agent.reward = reward
             agent.info = {} if agent.clock is None else agent.tell_time()
             agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
         finally:
@@ -297,8 +299,6 @@ def checked_reward(agent: Agent, reward: Any) -> float:
     Raises:
         RewardError: The reward is not one finite number.
     """
-    if type(reward) is float and reward - reward == 0.0:  # as a rule: a finite number
-        return reward
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):
         raise RewardError(f"the reward {shown(reward)} is not one number")

@@ -27,7 +27,8 @@ from mesa.examples.basic.boltzmann_wealth_model.model import BoltzmannWealth
 from pandas import DataFrame
 
 from benchmarks.measure import Contender, Section, alone, now, ratio, side_by_side
-from simenv_marl import SteppedSimulation, design, run_experiment
+from simenv_marl import SteppedSimulation
+from simenv_marl.experiments import design, run_experiment
 
 FACTORS = {"n": [50, 100, 200], "width": [5, 10, 20]}
 SEEDS = range(8)

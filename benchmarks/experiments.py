@@ -20,7 +20,8 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from benchmarks.measure import Section, alone, now
 from benchmarks.noop import Model
-from simenv_marl import design, evaluate, run_experiment
+from simenv_marl import evaluate
+from simenv_marl.experiments import design, run_experiment
 
 ROWS = 10_000
 WORK = 10e-3

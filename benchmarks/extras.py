@@ -12,7 +12,8 @@ from typing import Any
 
 from benchmarks.measure import Elsewhere, Section, Times, ratio, serve, side_by_side
 from benchmarks.noop import DEFINITION, Alone, Model, Turns, aec, single
-from simenv_marl import aec_env, difference, expose_to_plugins, make_step, single_env
+from simenv_marl import aec_env, difference, make_step, single_env
+from simenv_marl.plugins import expose_to_plugins
 
 GENERATIONS = 5
 """How often the processes are restarted, because two equal processes differ by some per cent."""

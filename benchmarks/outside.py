@@ -22,7 +22,8 @@ from benchmarks.branches import on
 from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE
 from benchmarks.measure import ROOT, Section, Times, alone, ratio, side_by_side, timed
 from benchmarks.noop import Model, Turns, aec, last_and_step
-from simenv_marl import ProcessSimulation, aec_env, make_step
+from simenv_marl import aec_env, make_step
+from simenv_marl.remote import ProcessSimulation
 
 COMPILER = shutil.which("g++") or shutil.which("clang++")
 

@@ -11,7 +11,8 @@ from typing import Any
 
 from benchmarks.hand_written import ACTION_SPACE, OBSERVATION_SPACE, State
 from benchmarks.measure import Contender, Section, ratio, side_by_side, timed
-from simenv_marl import ChangedResult, expose_to_plugins, handlers, make_step, single_env
+from simenv_marl import make_step, single_env
+from simenv_marl.plugins import ChangedResult, expose_to_plugins, handlers
 
 DEFINITION: dict[str, Any] = {
     "observation_space": OBSERVATION_SPACE,

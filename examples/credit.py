@@ -24,7 +24,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import RULE, action_values, aec_env, collect_episodes
+from simenv_marl import RULE, aec_env
+from simenv_marl.data import collect_episodes
+from simenv_marl.planning import action_values
 
 from .greenhouse_coop.env import DAYS, GreenhouseSim
 from .greenhouse_coop.plan import BEST, VENTILATOR, WATERER

@@ -23,7 +23,8 @@ from gymnasium.wrappers import RescaleAction
 from optuna.trial import TrialState
 from stable_baselines3 import PPO
 
-from simenv_marl import design, effects, evaluate, run_experiment, simulate
+from simenv_marl import evaluate, simulate
+from simenv_marl.experiments import design, effects, run_experiment
 
 from .greenhouse_coop.env import WATERING, GreenhouseSim, watering_env
 

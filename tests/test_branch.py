@@ -24,8 +24,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from simenv_marl import (
-    RULE,
+from simenv_marl import RULE, aec_env, branch, difference, joint_env, parallel_env, single_env
+from simenv_marl.core import episode, forking
+from simenv_marl.core.forking import loops_on
+from simenv_marl.errors import (
     BranchError,
     ClosedError,
     EpisodeOverError,
@@ -33,15 +35,7 @@ from simenv_marl import (
     OptionValueError,
     ReentrancyError,
     ViewError,
-    aec_env,
-    branch,
-    difference,
-    joint_env,
-    parallel_env,
-    single_env,
 )
-from simenv_marl.core import episode, forking
-from simenv_marl.core.forking import loops_on
 from tests.worlds import exactness, filing
 from tests.worlds.copied import Walk
 from tests.worlds.filing import Archive

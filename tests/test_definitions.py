@@ -14,19 +14,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    Definition,
-    DefinitionError,
-    InvalidActionError,
-    MaskError,
-    PatchError,
-    aec_env,
-    difference,
-    make_step,
-    single_env,
-)
+from simenv_marl import RULE, TRUNCATED, Definition, aec_env, difference, make_step, single_env
+from simenv_marl.errors import DefinitionError, InvalidActionError, MaskError, PatchError
 from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, rewards_of, script
 
 # -- outside any environment ----------------------------------------------------------------------

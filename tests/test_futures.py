@@ -12,17 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from simenv_marl import (
-    BranchError,
-    NotResetError,
-    OptionValueError,
-    aec_env,
-    branch,
-    joint_env,
-    parallel_env,
-    reseed_generators,
-    single_env,
-)
+from simenv_marl import aec_env, branch, joint_env, parallel_env, reseed_generators, single_env
+from simenv_marl.errors import BranchError, NotResetError, OptionValueError
 from tests.core.test_global_rng import world
 from tests.test_branch import METHODS, POINTS, move, rest_of, short
 from tests.worlds.copied import Walk

@@ -17,15 +17,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import HumanRendering
 from pettingzoo.test import api_test, parallel_api_test
 
-from simenv_marl import (
-    RULE,
-    OptionValueError,
-    SimEnvError,
-    UnknownOptionError,
-    UnknownPointError,
-    Variant,
-    register_simulation,
-)
+from simenv_marl import RULE, SimEnvError, register_simulation
+from simenv_marl.errors import OptionValueError, UnknownOptionError, UnknownPointError
+from simenv_marl.experiments import Variant
 from tests.worlds import many_registered
 from tests.worlds.many_registered import Boat, Voyage
 from tests.worlds.many_worlds import Being, beings

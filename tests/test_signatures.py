@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 import simenv_marl
 from simenv_marl.core.options import CheckOptions, EpisodeOptions, Options, ViewOptions
-from simenv_marl.errors import meant
+from simenv_marl.errors import did_you_mean
 
 MAKERS = ("aec_env", "parallel_env", "single_env", "joint_env", "vector_env", "generate_env")
 OPTIONS = {field.name for field in fields(Options)}
@@ -58,7 +58,7 @@ def test_help_begins_with_what_the_library_is():
     ],
 )
 def test_hints_name_what_is_close(name, known, hint):
-    assert meant(name, known) == hint
+    assert did_you_mean(name, known) == hint
 
 
 class Tank(simenv_marl.SimulationInterface):
@@ -104,7 +104,7 @@ def environment():
         (lambda: simenv_marl.generate_env(Tank, {Tank.choose: CHOOSE}, view="paralel"), "parallel"),
         (lambda: environment().observe("pump_1"), "pump_0"),
         (lambda: simenv_marl.branch(environment(), 1, method="frok"), "fork"),
-        (lambda: simenv_marl.design({"a": [1, 2]}, "full_factorail"), "full_factorial"),
+        (lambda: simenv_marl.experiments.design({"a": [1, 2]}, "full_factorail"), "full_factorial"),
         (lambda: evaluation().summary("retrun"), "return"),
         (lambda: evaluation(baseline="rul"), "rule"),
     ],

@@ -9,20 +9,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    OptionValueError,
-    SimulationError,
-    SteppedSimulation,
-    UnknownPointError,
-    aec_env,
-    design,
-    evaluate,
-    make_step,
-    run_experiment,
-    simulate,
-    single_env,
-)
+from simenv_marl import RULE, SteppedSimulation, aec_env, evaluate, make_step, simulate, single_env
+from simenv_marl.errors import OptionValueError, SimulationError, UnknownPointError
+from simenv_marl.experiments import design, run_experiment
 
 
 class Walk:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from simenv_marl.__main__ import main
-from simenv_marl.templates import KINDS
+from simenv_marl.testing.templates import KINDS
 
 SOURCE = Path(__file__).parent.parent / "src"
 PAGE = (SOURCE.parent / "docs/templates.md").read_text()
@@ -40,7 +40,7 @@ def test_what_is_written_passes_its_own_tests(kind, tmp_path):
     assert kind != "plain" or f"$ python -m simenv_marl new plain water_tank\n{done.stdout}" in PAGE
     for name in written:
         text = (tmp_path / name).read_text()
-        assert "simenv_marl.templates" not in text
+        assert "simenv_marl.testing.templates" not in text
         assert "MyModel" not in text
         assert "WaterTankSimulation" in text
     tested = run(tmp_path / "water_tank", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error")
@@ -78,7 +78,7 @@ def test_templates_import_nothing_but_packages_that_the_user_is_told_of(kind):
 
 @pytest.mark.parametrize("kind", ["simpy", "mesa"])
 def test_policies_answer_one_observation_as_they_answer_many(kind):
-    template = import_module(f"simenv_marl.templates.{kind}")
+    template = import_module(f"simenv_marl.testing.templates.{kind}")
     policy = template.train(1, 1)
     env = template.env()
     env.reset(seed=3)

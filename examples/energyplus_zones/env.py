@@ -19,16 +19,8 @@ from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import ClipOutOfBoundsWrapper, OrderEnforcingWrapper
 
 import simenv_marl
-from simenv_marl import (
-    TRUNCATED,
-    Definition,
-    SimulationAECEnv,
-    SimulationInterface,
-    SimulationParallelEnv,
-    aec_env,
-    difference,
-    make_step,
-)
+from simenv_marl import TRUNCATED, Definition, SimulationInterface, aec_env, difference, make_step
+from simenv_marl.envs import SimulationAECEnv, SimulationParallelEnv
 
 from .model import HIGHEST_SETPOINT, LOWEST_SETPOINT, STEPS_PER_HOUR, Building, Zone
 

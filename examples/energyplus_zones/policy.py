@@ -10,7 +10,8 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from simenv_marl import Evaluation, evaluate
+from simenv_marl import evaluate
+from simenv_marl.experiments import Evaluation
 
 from .env import AGENTS, BuildingSim, to_action
 from .model import COMFORT

@@ -18,7 +18,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import Evaluation, evaluate, simulate
+from simenv_marl import evaluate, simulate
+from simenv_marl.experiments import Evaluation
 
 from ..evolution import evolve
 from .collections import HALF_LIFE

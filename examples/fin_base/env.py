@@ -35,8 +35,6 @@ from numpy.typing import NDArray
 from simenv_marl import (
     TRUNCATED,
     Definition,
-    SimulationAECEnv,
-    SimulationEnv,
     SimulationInterface,
     aec_env,
     difference,
@@ -44,6 +42,7 @@ from simenv_marl import (
     register_simulation,
     single_env,
 )
+from simenv_marl.envs import SimulationAECEnv, SimulationEnv
 
 from .company import Company, Manager, Regulator
 from .law import MINIMUM, REQUIRED, SPREAD

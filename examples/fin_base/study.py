@@ -21,7 +21,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import RULE, RolloutPolicy, design, evaluate, run_experiment
+from simenv_marl import RULE, evaluate
+from simenv_marl.experiments import design, run_experiment
+from simenv_marl.planning import RolloutPolicy
 
 from ..evolution import evolve
 from .economy import Climate, Mortality

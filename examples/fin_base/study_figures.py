@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from pandas import DataFrame
 
-from simenv_marl import Evaluation, effects, simulate
+from simenv_marl import simulate
+from simenv_marl.experiments import Evaluation, effects
 
 from ..report import markdown, new_figure
 from .env import INDEXATIONS, MIXES, SURCHARGES

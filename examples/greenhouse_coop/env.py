@@ -36,15 +36,17 @@ import simenv_marl
 from simenv_marl import (
     TRUNCATED,
     Definition,
-    SimulationAECEnv,
-    SimulationEnv,
     SimulationInterface,
-    SimulationJointEnv,
-    SimulationParallelEnv,
     aec_env,
     difference,
     make_step,
     single_env,
+)
+from simenv_marl.envs import (
+    SimulationAECEnv,
+    SimulationEnv,
+    SimulationJointEnv,
+    SimulationParallelEnv,
 )
 
 from .model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, POT_CAPACITY, Greenhouse

@@ -27,15 +27,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import MLP
 from torchrl.objectives import BCLoss
 
-from simenv_marl import (
-    RULE,
-    Variant,
-    collect_episodes,
-    compare_with_rule,
-    make_step,
-    record_dataset,
-    simulate,
-)
+from simenv_marl import RULE, make_step, simulate
+from simenv_marl.data import collect_episodes, compare_with_rule, record_dataset
+from simenv_marl.experiments import Variant
 
 from .env import (
     ACTION_SPACE,

@@ -37,7 +37,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import action_values, collect_episodes, record_dataset
+from simenv_marl.data import collect_episodes, record_dataset
+from simenv_marl.planning import action_values
 
 from .env import DAYS, MOST_WATER, OBSERVED, GreenhouseSim
 from .plan import BEST, HELD_OUT, LITRES, VENTILATOR, WATERER, Constant, days_left, keep, water_planner

@@ -18,7 +18,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import design, evaluate, run_experiment
+from simenv_marl import evaluate
+from simenv_marl.experiments import design, run_experiment
 
 from .plan import HELD_OUT, WATERER, PortionPlanner
 from .train import OUT, Constant, Linear, Team, learn

@@ -12,7 +12,7 @@ from pandas import DataFrame
 from statsmodels.formula.api import ols
 from statsmodels.stats.anova import anova_lm
 
-from simenv_marl import Evaluation, effects
+from simenv_marl.experiments import Evaluation, effects
 
 from ..report import markdown, new_figure
 from .matrix import FACTORS, HOME, SCHOOLS

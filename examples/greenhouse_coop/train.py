@@ -29,7 +29,8 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from simenv_marl import RULE, SimulationAECEnv
+from simenv_marl import RULE
+from simenv_marl.envs import SimulationAECEnv
 
 from ..evolution import evolve
 from .env import DAYS, MOST_WATER, OBSERVED, raw_env

@@ -17,7 +17,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from simenv_marl import Variant, make_step, provenance, simulate
+from simenv_marl import make_step, simulate
+from simenv_marl.experiments import Variant, provenance
 
 from .env import ACTION_SPACE, OBSERVATION_SPACE, WATERING, GreenhouseSim, observe, reward, to_fraction
 from .model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, OUTSIDE_HUMIDITY, PLANTS, Greenhouse, Plant

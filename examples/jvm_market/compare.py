@@ -15,7 +15,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from simenv_marl import Evaluation, ProcessSimulation, evaluate
+from simenv_marl import evaluate
+from simenv_marl.experiments import Evaluation
+from simenv_marl.remote import ProcessSimulation
 
 from .env import PLOTS, SOW, WEEKS, market
 

@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 import simenv_marl
-from simenv_marl import Definition, ProcessSimulation, SimulationAECEnv, SimulationParallelEnv, difference, make_step
+from simenv_marl import Definition, difference, make_step
+from simenv_marl.envs import SimulationAECEnv, SimulationParallelEnv
+from simenv_marl.remote import ProcessSimulation
 
 from .build import build, java
 

@@ -32,9 +32,11 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from simenv_marl import Definition, ProcessSimulation, SimulationAECEnv, SimulationParallelEnv, difference, make_step
+from simenv_marl import Definition, difference, make_step
 from simenv_marl import aec_env as aec
 from simenv_marl import parallel_env as parallel
+from simenv_marl.envs import SimulationAECEnv, SimulationParallelEnv
+from simenv_marl.remote import ProcessSimulation
 
 HERE: Final = Path(__file__).parent
 SOURCES: Final = (HERE / "senders.cpp", HERE.parents[1] / "clients" / "cpp" / "simenv.hpp")

@@ -17,7 +17,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import Evaluation, evaluate
+from simenv_marl import evaluate
+from simenv_marl.experiments import Evaluation
 
 from ..evolution import evolve
 from .env import OBSERVED, POINTS, program, senders

@@ -19,7 +19,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import RULE, RolloutPolicy, collect_episodes
+from simenv_marl import RULE
+from simenv_marl.data import collect_episodes
+from simenv_marl.planning import RolloutPolicy
 
 from .env import MOVE, Meadow, sheep_points
 

@@ -19,7 +19,8 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from simenv_marl import RULE, Trajectories, collect_episodes
+from simenv_marl import RULE
+from simenv_marl.data import Trajectories, collect_episodes
 
 from .env import DIRECTIONS, MOVE, SIGHT, Meadow, cells, numbers, sheep_points
 from .train import HELD_OUT, OUT, SIGHTS, Herd, policies_of

@@ -30,7 +30,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from simenv_marl import Trajectories, collect_episodes
+from simenv_marl.data import Trajectories, collect_episodes
 
 from .env import DIRECTIONS, MOVE, Meadow, cells, sheep_points
 

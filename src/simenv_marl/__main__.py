@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .errors import SimEnvError, meant, told
-from .templates import KINDS, write_template
+from .errors import SimEnvError, describe_error, did_you_mean
+from .testing.templates import KINDS, write_template
 
 
 class _UsageError(Exception):
@@ -192,7 +192,7 @@ def _inspected(options: argparse.Namespace) -> Any:
     except SimEnvError:
         raise
     except Exception as error:
-        raise _UsageError(f"{options.simulation} cannot be run: {told(error)}") from error
+        raise _UsageError(f"{options.simulation} cannot be run: {describe_error(error)}") from error
 
 
 def _found(text: str) -> Any:
@@ -226,16 +226,16 @@ def _module(name: str) -> Any:
         if where is None and parent == "":
             where = [os.getcwd()]
         known = [module.name for module in pkgutil.iter_modules(where)]
-        hint = meant(last, known, f"{parent}." if parent else "")
+        hint = did_you_mean(last, known, f"{parent}." if parent else "")
         raise _UsageError(
             f"there is no module {error.name!r}{hint} (looked for in {os.getcwd()} and on Python's path)"
         ) from None
     except Exception as error:
-        raise _UsageError(f"the module {name!r} cannot be imported: {told(error)}") from error
+        raise _UsageError(f"the module {name!r} cannot be imported: {describe_error(error)}") from error
 
 
 def _alternatives(name: str, owner: Any) -> str:
-    hint = meant(name, dir(owner))
+    hint = did_you_mean(name, dir(owner))
     if hint:
         return hint
     runnable = [

@@ -17,7 +17,7 @@ import numpy as np
 from greenlet import getcurrent
 from gymnasium import spaces
 
-from .errors import DefinitionError, PatchError, shown
+from .errors import DefinitionError, PatchError, short_repr
 from .hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
 from .hooks.places import stays, unbind
 from .hooks.stacks import DIFFERENCES, EVALUATING
@@ -87,7 +87,7 @@ class Definition:
             hook = Hook(given, name, bound=binding is not staticmethod)
         elif not isinstance(hook.function, FunctionType):
             raise PatchError(
-                f"{shown(hook.function)} cannot be a decision point: it is not a function written in Python"
+                f"{short_repr(hook.function)} cannot be a decision point: it is not a function written in Python"
             )
         elif not hook.for_good:  # fetched while its hook was set temporarily
             stays(hook)
@@ -172,18 +172,18 @@ def _check_kinds(definition: Definition) -> None:
     for name in ("observation_space", "action_space", "goal_space"):
         space = getattr(definition, name)
         if not isinstance(space, spaces.Space) and (name != "goal_space" or space is not None):
-            raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {shown(space)}")
+            raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {short_repr(space)}")
     for name in (*REQUIRED, *ANSWERS[1:], "action_mask_mapping", *GOALS[1:]):
         function = getattr(definition, name)
         if not callable(function) and (name in REQUIRED or function is not None):
-            raise DefinitionError(f"make_step: {name} must be callable, not {shown(function)}")
+            raise DefinitionError(f"make_step: {name} must be callable, not {short_repr(function)}")
     for name in ("action_space_mapping", "rule_action_mapping"):
         mapping = getattr(definition, name)
         if mapping is not None and not callable(mapping) and not isinstance(mapping, Mapping):
-            raise DefinitionError(f"make_step: {name} must be a callable or a dict, not {shown(mapping)}")
+            raise DefinitionError(f"make_step: {name} must be a callable or a dict, not {short_repr(mapping)}")
     agent = definition.agent
     if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
-        raise DefinitionError(f"make_step: agent must be a name or a callable, not {shown(agent)}")
+        raise DefinitionError(f"make_step: agent must be a name or a callable, not {short_repr(agent)}")
 
 
 def _check_together(definition: Definition) -> None:
@@ -216,8 +216,8 @@ def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
     for name, agent in named.items():
         if not isinstance(name, str) or not (agent is None or callable(agent)):
             raise DefinitionError(
-                f"make_step: removed_by must be a dict from dotted names to callables, not {shown(name)}:"
-                f" {shown(agent)}"
+                f"make_step: removed_by must be a dict from dotted names to callables, not {short_repr(name)}:"
+                f" {short_repr(agent)}"
             )
     return dict(named)
 
@@ -383,7 +383,7 @@ class Difference:
 
     def __init__(self, function: Mapped) -> None:
         if not DIFFERENCES:  # one is enough
-            DIFFERENCES.append(getattr(function, "__qualname__", None) or shown(function))
+            DIFFERENCES.append(getattr(function, "__qualname__", None) or short_repr(function))
         self._function = function
         update_wrapper(self, function)
 
@@ -419,5 +419,5 @@ def difference(function: Mapped) -> Difference:
         DefinitionError: ``function`` is not callable.
     """
     if not callable(function):
-        raise DefinitionError(f"difference: {shown(function)} is not callable")
+        raise DefinitionError(f"difference: {short_repr(function)} is not callable")
     return Difference(function)

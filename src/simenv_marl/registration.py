@@ -13,9 +13,8 @@ from gymnasium.wrappers import HumanRendering, RenderCollection
 from .core.options import ViewOptions
 from .core.plan import Plan
 from .core.points import Points
-from .core.variant import Variant
-from .envs import aec_env, parallel_env, vector_env, view_class
-from .errors import OptionValueError, UnknownPointError, shown
+from .envs.make import aec_env, parallel_env, vector_env, view_class
+from .errors import OptionValueError, UnknownPointError, short_repr
 from .simulation import RULE
 
 
@@ -56,16 +55,17 @@ def register_simulation(
     Raises:
         SimEnvError: Something cannot work. The subclass tells what.
     """
+    is_variant = hasattr(simulation, "environment_arguments")
     if name is None:
-        if not isinstance(simulation, Variant):
+        if not is_variant:
             raise OptionValueError("register_simulation needs a name= for the ids")
         name = simulation.name
     if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
-        raise OptionValueError(f"name must consist of letters, digits, _ and -, not {shown(name)}")
+        raise OptionValueError(f"name must consist of letters, digits, _ and -, not {short_repr(name)}")
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
-        raise OptionValueError(f"version must be a non-negative integer, not {shown(version)}")
+        raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
     flatten = options.pop("flatten", False)
-    if isinstance(simulation, Variant) and "flatten" in simulation.options:  # an option of the joint view alone
+    if is_variant and "flatten" in simulation.options:  # an option of the joint view alone
         others = dict(simulation.options)
         flatten = flatten or others.pop("flatten")
         simulation = replace(simulation, options=others)

@@ -10,18 +10,16 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    DefinitionError,
+from simenv_marl import RULE, TRUNCATED
+from simenv_marl.data import (
     Mixture,
-    OptionValueError,
     collect_episodes,
     compare_with_rule,
+    demonstrations,
     record_dataset,
     save_dataset,
 )
-from simenv_marl.many import demonstrations
+from simenv_marl.errors import DefinitionError, OptionValueError
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script
 from tests.worlds.undone import models_of_pages_forgotten

@@ -9,7 +9,7 @@ import torch
 from examples.wolf_sheep import picture, results, train
 from examples.wolf_sheep.env import MOVE, TICKS, Meadow, sheep_points
 
-from simenv_marl import collect_episodes
+from simenv_marl.data import collect_episodes
 
 from . import commands
 

@@ -14,7 +14,9 @@ import joblib
 import numpy as np
 from gymnasium import spaces
 
-from simenv_marl import collect_episodes, make_step, run_experiment, simulate_many
+from simenv_marl import make_step, simulate_many
+from simenv_marl.data import collect_episodes
+from simenv_marl.experiments import run_experiment
 
 
 class Model:

@@ -20,7 +20,9 @@ from tempfile import mkdtemp
 import greenlet
 import pytest
 
-from simenv_marl import RULE, CallbackGuard, aec_env, branch, handlers, parallel_env, simulate, single_env
+from simenv_marl import RULE, aec_env, branch, parallel_env, simulate, single_env
+from simenv_marl.plugins import handlers
+from simenv_marl.remote import CallbackGuard
 from tests.contract.test_faults import interrupt_at
 from tests.worlds.models import Script, alive, culprits, decision, notes, script, stacks
 
@@ -485,7 +487,7 @@ def test_the_hook_of_what_cannot_be_raised_is_left_to_others(monkeypatch):
 @pytest.fixture
 def _impatient(monkeypatch):
     monkeypatch.setattr("simenv_marl.core.threads.SECONDS_TO_UNWIND", 0.1)
-    monkeypatch.setattr("simenv_marl.callbacks.SECONDS_TO_UNWIND", 0.05)
+    monkeypatch.setattr("simenv_marl.remote.callbacks.SECONDS_TO_UNWIND", 0.05)
 
 
 def endless(decide):
@@ -597,9 +599,9 @@ def test_a_process_with_c_code_that_was_given_up_ends(request):
         from simenv_marl import single_env
         from tests.contract import test_callbacks as tests
         from tests.worlds.models import decision
-        import simenv_marl.callbacks, simenv_marl.core.threads
+        import simenv_marl.remote.callbacks, simenv_marl.core.threads
 
-        simenv_marl.callbacks.SECONDS_TO_UNWIND = simenv_marl.core.threads.SECONDS_TO_UNWIND = 0.05
+        simenv_marl.remote.callbacks.SECONDS_TO_UNWIND = simenv_marl.core.threads.SECONDS_TO_UNWIND = 0.05
         decide = decision()
         env = single_env(tests.endless(decide), decide, driver={driver!r})
         env.reset()

@@ -10,10 +10,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from simenv_marl import (
-    ReentrancyError,
     aec_env,
     branch,
-    collect_episodes,
     joint_env,
     make_step,
     parallel_env,
@@ -22,6 +20,8 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
+from simenv_marl.data import collect_episodes
+from simenv_marl.errors import ReentrancyError
 
 BOOK = f"{__name__}.Shop.book"
 LOG = []

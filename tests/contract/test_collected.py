@@ -8,18 +8,10 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    AgentError,
-    NoDecisionError,
-    OptionValueError,
-    UnknownPointError,
-    Variant,
-    aec_env,
-    collect_episodes,
-    difference,
-)
+from simenv_marl import RULE, TRUNCATED, aec_env, difference
+from simenv_marl.data import collect_episodes
+from simenv_marl.errors import AgentError, NoDecisionError, OptionValueError, UnknownPointError
+from simenv_marl.experiments import Variant
 from tests.contract.test_simulate_many import by_row
 from tests.worlds import worlds
 from tests.worlds.many_worlds import Announcing, Being, Colony, Other, beings, colony_points, designs, others

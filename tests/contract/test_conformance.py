@@ -12,7 +12,8 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from pettingzoo.test import api_test, seed_test
 from pettingzoo.utils import wrappers
 
-from simenv_marl import RULE, TRUNCATED, InvalidActionError, aec_env, generate_env, make_step, single_env
+from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, make_step, single_env
+from simenv_marl.errors import InvalidActionError
 from tests.worlds.models import play
 
 OBSERVATION = spaces.Box(-10, 10, (3,), np.float32)

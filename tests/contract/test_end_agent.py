@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import RULE, AgentError, SimulationInterface, aec_env, make_step, parallel_env, simulate, single_env
+from simenv_marl import (
+    RULE,
+    SimulationInterface,
+    aec_env,
+    make_step,
+    parallel_env,
+    simulate,
+    single_env,
+)
+from simenv_marl.errors import AgentError
 
 MOVE = f"{__name__}.Seat.move"
 

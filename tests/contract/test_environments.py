@@ -7,9 +7,8 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
+from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, joint_env, parallel_env, single_env
+from simenv_marl.errors import (
     AgentError,
     DefinitionError,
     InvalidActionError,
@@ -17,11 +16,6 @@ from simenv_marl import (
     UnknownOptionError,
     UnknownPointError,
     ViewError,
-    aec_env,
-    generate_env,
-    joint_env,
-    parallel_env,
-    single_env,
 )
 from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, rewards_of, script
 
@@ -129,7 +123,7 @@ def test_spaces_of_agents_that_are_named_by_a_callable():
 def test_agents_that_nobody_knows_are_lookup_errors(method):
     env = aec_env(BOTH, [PUMP, FAN])
     env.reset()
-    with pytest.raises(simenv_marl.UnknownAgentError) as caught:
+    with pytest.raises(simenv_marl.errors.UnknownAgentError) as caught:
         getattr(env, method)("nobody_0")
     assert isinstance(caught.value, LookupError)
 
@@ -210,7 +204,7 @@ def test_max_steps_runs_on_to_the_next_decision_and_truncates(actions):
         assert env.step(actions)[1:4] == (3.0, False, True)
         assert counted == [0, 1, 2]
         assert len(env.unwrapped.simulation.log) == 2
-        with pytest.raises(simenv_marl.EpisodeOverError):
+        with pytest.raises(simenv_marl.errors.EpisodeOverError):
             env.step(actions)
     env.close()
 

@@ -11,14 +11,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    InvalidActionError,
-    ObservationError,
-    RewardError,
-    aec_env,
-    single_env,
-)
+from simenv_marl import RULE, aec_env, single_env
+from simenv_marl.errors import InvalidActionError, ObservationError, RewardError
 from tests.worlds.models import Script, calling, decision, decisions, define, play, rewards_of, script
 
 # -- 5.2: the order of agents ---------------------------------------------------------------------

@@ -9,21 +9,15 @@ import pytest
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import (
-    RULE,
+from simenv_marl import RULE, SimEnvError, aec_env, errors, joint_env, parallel_env, single_env
+from simenv_marl.errors import (
     ClosedError,
     EpisodeOverError,
     InvalidActionError,
     NotResetError,
     ReentrancyError,
     ResetNeededError,
-    SimEnvError,
     WrongThreadError,
-    aec_env,
-    errors,
-    joint_env,
-    parallel_env,
-    single_env,
 )
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, calling, culprits, decision, decisions, define, notes, play, script, step

@@ -16,19 +16,18 @@ from gymnasium import spaces
 import simenv_marl
 from simenv_marl import (
     RULE,
-    ResetNeededError,
     aec_env,
     difference,
-    handlers,
     joint_env,
     parallel_env,
     simulate,
     simulate_many,
     single_env,
-    trace,
     vector_env,
 )
+from simenv_marl.errors import ResetNeededError
 from simenv_marl.hooks.stacks import EVALUATING
+from simenv_marl.plugins import handlers, trace
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, culprits, decision, define, nobody_is_asked, notes, play, step
 

@@ -15,18 +15,20 @@ from pettingzoo.utils import wrappers
 from simenv_marl import (
     RULE,
     TRUNCATED,
-    DefinitionError,
-    InvalidActionError,
-    NotResetError,
-    ObservationError,
-    OptionValueError,
-    ViewError,
     aec_env,
     generate_env,
     joint_env,
     parallel_env,
     simulate,
     single_env,
+)
+from simenv_marl.errors import (
+    DefinitionError,
+    InvalidActionError,
+    NotResetError,
+    ObservationError,
+    OptionValueError,
+    ViewError,
 )
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, define, play, rewards_of, script

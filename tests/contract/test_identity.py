@@ -8,17 +8,8 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import (
-    RULE,
-    InvalidActionError,
-    ResetNeededError,
-    SimEnvError,
-    aec_env,
-    joint_env,
-    parallel_env,
-    simulate,
-    single_env,
-)
+from simenv_marl import RULE, SimEnvError, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl.errors import InvalidActionError, ResetNeededError
 from tests.worlds import random_worlds
 from tests.worlds.models import follow_the_rule
 from tests.worlds.random_worlds import PLAN, POINTS, ROSTER, Yard, advised, designs, outcome, plain, seeds

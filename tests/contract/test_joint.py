@@ -9,9 +9,8 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from hypothesis import given, settings
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
+from simenv_marl import RULE, TRUNCATED, aec_env, generate_env, joint_env, parallel_env, vector_env
+from simenv_marl.errors import (
     AgentError,
     EpisodeOverError,
     InvalidActionError,
@@ -19,11 +18,6 @@ from simenv_marl import (
     NotResetError,
     UnknownOptionError,
     ViewError,
-    aec_env,
-    generate_env,
-    joint_env,
-    parallel_env,
-    vector_env,
 )
 from tests.worlds.many_worlds import ROSTER, Announcing, Answered, Being, Colony, answer, beings, colony, designs, seeds
 from tests.worlds.models import calling, decision

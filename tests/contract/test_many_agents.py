@@ -14,19 +14,21 @@ from pettingzoo.test import api_test, seed_test
 from simenv_marl import (
     RULE,
     TRUNCATED,
-    AgentError,
-    DefinitionError,
-    EpisodeOverError,
-    NoDecisionError,
-    OptionValueError,
     SimEnvError,
-    UnknownAgentError,
-    UnknownPointError,
     aec_env,
     difference,
     joint_env,
     parallel_env,
     single_env,
+)
+from simenv_marl.errors import (
+    AgentError,
+    DefinitionError,
+    EpisodeOverError,
+    NoDecisionError,
+    OptionValueError,
+    UnknownAgentError,
+    UnknownPointError,
 )
 from tests.worlds.many_worlds import (
     HERE,

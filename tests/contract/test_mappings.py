@@ -15,7 +15,6 @@ from simenv_marl import (
     RULE,
     SimulationInterface,
     aec_env,
-    collect_episodes,
     difference,
     joint_env,
     make_step,
@@ -25,6 +24,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
+from simenv_marl.data import collect_episodes
 
 DEAL = f"{__name__}.Dealer.deal"
 LEAVE = f"{__name__}.Dealer.leave"

@@ -18,7 +18,17 @@ from mesa.examples.advanced.wolf_sheep import model as wolf_sheep
 from mesa.examples.advanced.wolf_sheep.agents import GrassPatch, Sheep, Wolf
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
-from simenv_marl import RULE, TRUNCATED, AgentError, aec_env, difference, joint_env, make_step, parallel_env, simulate
+from simenv_marl import (
+    RULE,
+    TRUNCATED,
+    aec_env,
+    difference,
+    joint_env,
+    make_step,
+    parallel_env,
+    simulate,
+)
+from simenv_marl.errors import AgentError
 from tests.worlds.models import play
 
 EXAMPLES = "mesa.examples.advanced"

@@ -7,24 +7,10 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import (
-    AgentError,
-    DefinitionError,
-    HandlerError,
-    InvalidActionError,
-    ObservationError,
-    OptionValueError,
-    RewardError,
     SimEnvError,
-    SimulationError,
-    UnknownAgentError,
-    UnknownPointError,
-    Variant,
     aec_env,
-    attach_handler,
     branch,
-    collect_episodes,
     difference,
-    handlers,
     joint_env,
     make_step,
     parallel_env,
@@ -32,7 +18,26 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.errors import LONGEST, annotate, shown, text_of, told
+from simenv_marl.data import collect_episodes
+from simenv_marl.errors import (
+    LONGEST,
+    AgentError,
+    DefinitionError,
+    HandlerError,
+    InvalidActionError,
+    ObservationError,
+    OptionValueError,
+    RewardError,
+    SimulationError,
+    UnknownAgentError,
+    UnknownPointError,
+    annotate,
+    describe_error,
+    error_text,
+    short_repr,
+)
+from simenv_marl.experiments import Variant
+from simenv_marl.plugins import attach_handler, handlers
 from tests.worlds.models import PAIR, Script, calling, decision, define, notes, play, script
 
 MOST = 1000
@@ -83,19 +88,19 @@ unwieldy = pytest.mark.parametrize("make", UNWIELDY.values(), ids=UNWIELDY)
 
 @unwieldy
 def test_any_value_is_shown_in_short(make):
-    assert 0 < len(shown(make())) <= LONGEST
-    assert len(shown(make(), 60)) <= 60
-    shown(make()).encode()
+    assert 0 < len(short_repr(make())) <= LONGEST
+    assert len(short_repr(make(), 60)) <= 60
+    short_repr(make()).encode()
 
 
 def test_short_values_are_shown_as_they_are():
     for value in (1.5, "text", [1, 2.0, None], {"b": 1, "a": (2,)}, np.arange(3), spaces.Discrete(3)):
-        assert sorted(shown(value)) == sorted(repr(value))  # keys may be sorted
+        assert sorted(short_repr(value)) == sorted(repr(value))  # keys may be sorted
 
 
 def test_the_text_of_an_error_may_be_missing():
-    assert told(ValueError("bad")) == "ValueError: bad"
-    assert told(BrokenError()) == f"BrokenError: {text_of(BrokenError())}"
+    assert describe_error(ValueError("bad")) == "ValueError: bad"
+    assert describe_error(BrokenError()) == f"BrokenError: {error_text(BrokenError())}"
 
 
 @unwieldy

@@ -13,17 +13,8 @@ from hypothesis import strategies as st
 
 from simenv_marl import (
     RULE,
-    AgentError,
-    EpisodeOverError,
-    InvalidActionError,
-    NoDecisionError,
-    OptionValueError,
     SimulationInterface,
-    UnknownOptionError,
-    UnknownPointError,
-    ViewError,
     aec_env,
-    collect_episodes,
     generate_env,
     joint_env,
     make_step,
@@ -33,6 +24,17 @@ from simenv_marl import (
     simulate_many,
     single_env,
     vector_env,
+)
+from simenv_marl.data import collect_episodes
+from simenv_marl.errors import (
+    AgentError,
+    EpisodeOverError,
+    InvalidActionError,
+    NoDecisionError,
+    OptionValueError,
+    UnknownOptionError,
+    UnknownPointError,
+    ViewError,
 )
 
 NAMES = ("player_red", "player_blue")

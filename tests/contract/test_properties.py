@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, rule
 
-from simenv_marl import RULE, EpisodeOverError, InvalidActionError, ResetNeededError, aec_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env, parallel_env, single_env
+from simenv_marl.errors import EpisodeOverError, InvalidActionError, ResetNeededError
 from tests.worlds.models import follow_the_rule, notes
 from tests.worlds.worlds import (
     Design,

@@ -6,16 +6,9 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from simenv_marl import (
-    RULE,
-    ReentrancyError,
-    aec_env,
-    handlers,
-    joint_env,
-    parallel_env,
-    single_env,
-    vector_env,
-)
+from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env, vector_env
+from simenv_marl.errors import ReentrancyError
+from simenv_marl.plugins import handlers
 from tests.worlds.models import decision, script
 
 VIEWS = {

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from simenv_marl import RewardError, aec_env, joint_env, parallel_env, single_env
+from simenv_marl import aec_env, joint_env, parallel_env, single_env
+from simenv_marl.errors import RewardError
 from tests.worlds.models import calling, decision
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env, parallel_env, joint_env])

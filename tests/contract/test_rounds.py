@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.utils.conversions import parallel_to_aec, turn_based_aec_to_parallel
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
+from simenv_marl import RULE, TRUNCATED, aec_env, difference, generate_env, parallel_env
+from simenv_marl.errors import (
     AgentError,
     ClosedError,
     EpisodeOverError,
@@ -27,10 +26,6 @@ from simenv_marl import (
     ResetNeededError,
     RewardError,
     UnknownAgentError,
-    aec_env,
-    difference,
-    generate_env,
-    parallel_env,
 )
 from tests.worlds import worlds
 from tests.worlds.many_worlds import (

@@ -7,9 +7,8 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
+from simenv_marl import RULE, TRUNCATED, aec_env, difference, simulate, simulate_many
+from simenv_marl.errors import (
     AgentError,
     InvalidActionError,
     NoDecisionError,
@@ -18,10 +17,6 @@ from simenv_marl import (
     SimulationError,
     UnknownOptionError,
     UnknownPointError,
-    aec_env,
-    difference,
-    simulate,
-    simulate_many,
 )
 from tests.worlds.many_worlds import (
     HERE,

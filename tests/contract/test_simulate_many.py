@@ -12,17 +12,15 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import (
-    RULE,
+from simenv_marl import RULE, simulate, simulate_many
+from simenv_marl.errors import (
     InvalidActionError,
     MissingExtraError,
     OptionValueError,
     UnknownOptionError,
     UnknownPointError,
-    Variant,
-    simulate,
-    simulate_many,
 )
+from simenv_marl.experiments import Variant
 from tests.worlds import worlds
 from tests.worlds.many_worlds import Colony, Creature, colony_points, designs
 from tests.worlds.models import Script, calling, decision, define, notes, plainly, script, stacks

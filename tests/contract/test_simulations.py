@@ -8,18 +8,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    NoDecisionError,
-    NotResetError,
-    OptionValueError,
-    SimulationError,
-    SimulationInterface,
-    aec_env,
-    generate_env,
-    single_env,
-)
+from simenv_marl import RULE, TRUNCATED, SimulationInterface, aec_env, generate_env, single_env
+from simenv_marl.errors import NoDecisionError, NotResetError, OptionValueError, SimulationError
 from tests.worlds.many_worlds import beings
 from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play, script
 

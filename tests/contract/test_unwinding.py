@@ -9,16 +9,8 @@ from contextlib import suppress
 import greenlet
 import pytest
 
-from simenv_marl import (
-    RULE,
-    ClosedError,
-    InvalidActionError,
-    ReentrancyError,
-    aec_env,
-    joint_env,
-    parallel_env,
-    single_env,
-)
+from simenv_marl import RULE, aec_env, joint_env, parallel_env, single_env
+from simenv_marl.errors import ClosedError, InvalidActionError, ReentrancyError
 from tests.worlds.models import Script, alive, calling, decision, notes, script, stacks, step, unwinding
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])

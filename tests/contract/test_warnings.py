@@ -12,8 +12,6 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
-    ObservationError,
-    UnknownPointError,
     aec_env,
     joint_env,
     make_step,
@@ -24,6 +22,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.core import draws
+from simenv_marl.errors import ObservationError, UnknownPointError
 from tests.worlds.models import calling, decision, define, script
 
 DRAWS = "draws from the global generator"

@@ -13,7 +13,8 @@ from textwrap import dedent
 
 import pytest
 
-from simenv_marl import WrongThreadError, single_env
+from simenv_marl import single_env
+from simenv_marl.errors import WrongThreadError
 from simenv_marl.hooks.stacks import STACKS
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, calling, culprits, decision, nobody_is_asked, notes, script
@@ -348,7 +349,8 @@ def run(code):
     """Run code in a process of its own; return what it has printed."""
     preamble = """
         import os, sys, threading
-        from simenv_marl import WrongThreadError, aec_env, single_env
+        from simenv_marl import aec_env, single_env
+        from simenv_marl.errors import WrongThreadError
         from tests.worlds.models import calling, decision, script
         def in_a_child(function):
             child = os.fork()

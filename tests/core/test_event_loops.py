@@ -9,7 +9,8 @@ from functools import partial
 
 import pytest
 
-from simenv_marl import SimulationError, SimulationInterface, single_env
+from simenv_marl import SimulationInterface, single_env
+from simenv_marl.errors import SimulationError
 from tests.conftest import DRIVERS
 from tests.worlds.models import decision, script
 

@@ -21,7 +21,8 @@ PREAMBLE = """
 
     import greenlet
 
-    from simenv_marl import WrongThreadError, single_env
+    from simenv_marl import single_env
+    from simenv_marl.errors import WrongThreadError
     from tests.worlds.models import Script, decision, script
 
     signal.alarm(30)  # so that none waits for ever

@@ -19,7 +19,8 @@ PREAMBLE = """
     import gc, signal, sys
     import gevent
     from gevent.pool import Group
-    from simenv_marl import WrongThreadError, single_env
+    from simenv_marl import single_env
+    from simenv_marl.errors import WrongThreadError
     from tests.worlds.models import decision, script
 
     if hasattr(signal, "alarm"):

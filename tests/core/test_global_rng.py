@@ -8,18 +8,9 @@ import threading
 import numpy as np
 import pytest
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    OptionValueError,
-    WrongThreadError,
-    aec_env,
-    joint_env,
-    parallel_env,
-    simulate,
-    single_env,
-)
+from simenv_marl import RULE, TRUNCATED, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.core import rng
+from simenv_marl.errors import OptionValueError, WrongThreadError
 from tests.worlds.models import decision, define, play
 
 

@@ -5,12 +5,13 @@ import weakref
 
 import pytest
 
-from simenv_marl import UnknownPointError, handlers
 from simenv_marl.core import processes
 from simenv_marl.core.points import find_point, find_points, locate, portable
 from simenv_marl.core.processes import pack, unpack
 from simenv_marl.decision import point_of, registered, unwrapped
+from simenv_marl.errors import UnknownPointError
 from simenv_marl.hooks.hook import hook_of
+from simenv_marl.plugins import handlers
 from tests.worlds.models import define
 
 HERE = __name__

@@ -13,19 +13,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    BranchError,
-    InvalidActionError,
-    NoDecisionError,
-    WorkerError,
-    branch,
-    make_step,
-    simulate_many,
-    single_env,
-    vector_env,
-)
+from simenv_marl import branch, make_step, simulate_many, single_env, vector_env
 from simenv_marl.core.processes import RemoteTraceback, pack_error, unpack_error
-from simenv_marl.errors import text_of
+from simenv_marl.errors import BranchError, InvalidActionError, NoDecisionError, WorkerError, error_text
 from tests.worlds.counters import FORK, FORKS
 
 # -- errors of all kinds ------------------------------------------------------------------------------
@@ -230,7 +220,7 @@ def members_of(error):
 def assert_alike(one, other, seen=()):
     """What came is what went, with all that belongs to it."""
     assert type(one) is type(other)
-    assert text_of(one) == text_of(other)
+    assert error_text(one) == error_text(other)
     assert members_of(one) == members_of(other)
     assert {**vars(one), "lock": 0, "__notes__": 0} == {**vars(other), "lock": 0, "__notes__": 0}
     notes = getattr(one, "__notes__", [])
@@ -298,7 +288,7 @@ def test_what_cannot_cross_is_told_of_with_its_notes_and_causes(make):
     error.__cause__ = raised(open, "/nowhere")
     again = unpack_error(pack_error(error))
     assert type(again) is WorkerError
-    assert f"cannot be pickled: {type(error).__name__}: {text_of(error)}" in str(again)
+    assert f"cannot be pickled: {type(error).__name__}: {error_text(error)}" in str(again)
     assert again.__notes__ == ["a note"]
     assert again.__cause__.filename == "/nowhere"
     group = ExceptionGroup("several", [error, Keywords(count=3)])
@@ -376,7 +366,7 @@ def test_errors_come_from_workers_as_themselves():
 def assert_alike_but_raised(one, other):
     """... for notes, and for what another process has written into its causes."""
     assert type(one) is type(other)
-    assert text_of(one) == text_of(other)
+    assert error_text(one) == error_text(other)
     assert members_of(one) == members_of(other)
     mine = {name for name in vars(one) if name != "__notes__"}
     assert {name: vars(other)[name] for name in mine if name != "lock"} == {

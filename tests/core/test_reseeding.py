@@ -14,7 +14,8 @@ from examples.wolf_sheep.env import Meadow
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simenv_marl import OptionValueError, SimulationError, reseed_generators
+from simenv_marl import reseed_generators
+from simenv_marl.errors import OptionValueError, SimulationError
 from tests.core.test_global_rng import world
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import MaskError, ObservationError
 from simenv_marl.core.actions import ILLEGAL, action_check, mask_allows, mask_cast, open_mask
 from simenv_marl.core.spaces import blank, duplicate, observation_cast, same
+from simenv_marl.errors import MaskError, ObservationError
 
 BOX = spaces.Box(-1.0, 3.0, (2,), np.float32)
 BYTES = spaces.Box(0, 255, (2,), np.uint8)

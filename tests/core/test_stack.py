@@ -14,7 +14,8 @@ from textwrap import dedent
 import greenlet
 import pytest
 
-from simenv_marl import RULE, WrongThreadError, aec_env, generate_env, parallel_env, single_env
+from simenv_marl import RULE, aec_env, generate_env, parallel_env, single_env
+from simenv_marl.errors import WrongThreadError
 from simenv_marl.hooks.stacks import EVALUATING, STACKS
 from tests.core.test_threads import in_a_thread
 from tests.worlds.models import Script, calling, decision, script, stacks, unwinding
@@ -538,7 +539,8 @@ def test_a_worker_that_a_model_has_forked_is_refused(driver):
     code = f"""
         import multiprocessing, warnings
         warnings.simplefilter("ignore", DeprecationWarning)
-        from simenv_marl import WrongThreadError, single_env
+        from simenv_marl import single_env
+        from simenv_marl.errors import WrongThreadError
         from tests.worlds.models import decision, script
         decide = decision()
         def work(queue):

@@ -16,10 +16,11 @@ import greenlet
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, ReentrancyError, aec_env, joint_env, parallel_env, simulate, single_env
+from simenv_marl import RULE, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.core import threads
 from simenv_marl.core.contexts import Claim
 from simenv_marl.core.plan import Plan
+from simenv_marl.errors import ReentrancyError
 from tests.worlds.models import Script, calling, decision, notes, play, script
 
 VIEWS = pytest.mark.parametrize("view", [aec_env, single_env])

@@ -15,21 +15,22 @@ from examples.greenhouse_coop.model import Greenhouse
 
 from simenv_marl import (
     RULE,
-    ChangedResult,
+    aec_env,
+    generate_env,
+    joint_env,
+    register_simulation,
+    simulate,
+    single_env,
+)
+from simenv_marl.errors import (
     HandlerError,
     OptionValueError,
     SimulationError,
     UnknownOptionError,
     UnknownPointError,
-    Variant,
-    aec_env,
-    generate_env,
-    joint_env,
-    provenance,
-    register_simulation,
-    simulate,
-    single_env,
 )
+from simenv_marl.experiments import Variant, provenance
+from simenv_marl.plugins import ChangedResult
 from tests.worlds.models import Script, decision, define, play
 from tests.worlds.undone import registries_put_back
 

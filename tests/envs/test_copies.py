@@ -15,18 +15,9 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from simenv_marl import (
-    RULE,
-    ClosedError,
-    NotResetError,
-    Variant,
-    aec_env,
-    difference,
-    generate_env,
-    joint_env,
-    parallel_env,
-    single_env,
-)
+from simenv_marl import RULE, aec_env, difference, generate_env, joint_env, parallel_env, single_env
+from simenv_marl.errors import ClosedError, NotResetError
+from simenv_marl.experiments import Variant
 from tests.worlds.copied import Walk, WalkEnv, blow, define, learned
 from tests.worlds.many_worlds import beings
 

@@ -12,17 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.test import api_test, parallel_api_test, seed_test
 
-from simenv_marl import (
-    RULE,
-    AgentError,
-    OptionValueError,
-    UnknownAgentError,
-    aec_env,
-    generate_env,
-    joint_env,
-    parallel_env,
-    single_env,
-)
+from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, single_env
+from simenv_marl.errors import AgentError, OptionValueError, UnknownAgentError
 from tests.worlds.many_worlds import (
     ROSTER,
     Announcing,

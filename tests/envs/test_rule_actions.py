@@ -11,10 +11,7 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
-    DefinitionError,
-    InvalidActionError,
     aec_env,
-    collect_episodes,
     joint_env,
     make_step,
     parallel_env,
@@ -23,6 +20,8 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
+from simenv_marl.data import collect_episodes
+from simenv_marl.errors import DefinitionError, InvalidActionError
 from tests.worlds.models import calling, decision, notes, play, script
 
 DRIVERS = pytest.mark.parametrize("driver", ["greenlet", "thread"])

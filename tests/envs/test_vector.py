@@ -20,6 +20,13 @@ from hypothesis import strategies as st
 from simenv_marl import (
     RULE,
     TRUNCATED,
+    joint_env,
+    make_step,
+    register_simulation,
+    single_env,
+    vector_env,
+)
+from simenv_marl.errors import (
     ClosedError,
     CopyError,
     EpisodeOverError,
@@ -31,11 +38,6 @@ from simenv_marl import (
     UnknownOptionError,
     ViewError,
     WrongThreadError,
-    joint_env,
-    make_step,
-    register_simulation,
-    single_env,
-    vector_env,
 )
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, Timed, agree, definition, made, same
 from tests.worlds.many_worlds import Being, beings
@@ -165,7 +167,7 @@ def test_options_mean_what_they_mean_to_one_environment(options):
 
 
 def halve(model: Any, _result: int) -> Any:
-    from simenv_marl import ChangedResult
+    from simenv_marl.plugins import ChangedResult
 
     return ChangedResult((_result + 1) // 2)
 

@@ -21,17 +21,16 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import (
+from simenv_marl import make_step, vector_env
+from simenv_marl.envs.worker import is_shareable
+from simenv_marl.errors import (
     ClosedError,
     EpisodeOverError,
     InvalidActionError,
     OptionValueError,
     RewardError,
     WorkerError,
-    make_step,
-    vector_env,
 )
-from simenv_marl.envs.worker import is_shareable
 from tests.processes import alone, descriptors, gone
 from tests.worlds.counters import FORK, FORKS, MODES, POINT, VARIETY, Counter, agree, definition, made, same
 from tests.worlds.models import notes

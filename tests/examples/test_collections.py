@@ -32,7 +32,6 @@ from pettingzoo.test import api_test, parallel_api_test, seed_test
 
 from simenv_marl import (
     RULE,
-    InvalidActionError,
     aec_env,
     branch,
     joint_env,
@@ -41,6 +40,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
+from simenv_marl.errors import InvalidActionError
 from simenv_marl.testing import check_simulation
 from tests.worlds.models import follow_the_rule
 

@@ -35,8 +35,9 @@ from examples.fin_base.people import Client, clients_of
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
-from simenv_marl import RULE, InvalidActionError, aec_env, branch, joint_env, parallel_env, single_env, vector_env
+from simenv_marl import RULE, aec_env, branch, joint_env, parallel_env, single_env, vector_env
 from simenv_marl.__main__ import main
+from simenv_marl.errors import InvalidActionError
 from simenv_marl.testing import check_simulation
 from tests.worlds.models import follow_the_rule
 

@@ -34,7 +34,8 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from pettingzoo.test import api_test, seed_test
 
-from simenv_marl import RULE, TRUNCATED, InvalidActionError, branch
+from simenv_marl import RULE, TRUNCATED, branch
+from simenv_marl.errors import InvalidActionError
 
 ROOT = Path(__file__).parents[2]
 UNDECORATED = vars(Greenhouse)["update_air_exchange"], vars(Greenhouse)["choose_water_amount"]

@@ -7,7 +7,8 @@ from examples.greenhouse_coop import plan, plan_figures
 from examples.greenhouse_coop.env import DAYS, GreenhouseSim
 from examples.greenhouse_coop.train import play, raw_env
 
-from simenv_marl import RULE, collect_episodes
+from simenv_marl import RULE
+from simenv_marl.data import collect_episodes
 
 
 class Short(GreenhouseSim):
@@ -93,7 +94,7 @@ def test_a_sheep_that_plans_beside_its_herd():
     pytest.importorskip("mesa")
     from examples.wolf_sheep.plan import lives
 
-    from simenv_marl import RolloutPolicy
+    from simenv_marl.planning import RolloutPolicy
 
     own, same, others = lives(3, RolloutPolicy(horizon=2, futures=1), 4)
     assert 1 <= same <= 4

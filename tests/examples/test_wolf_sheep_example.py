@@ -9,7 +9,8 @@ from examples.wolf_sheep.env import DIRECTIONS, MOVE, Meadow, cells, go, look, n
 from gymnasium.utils.env_checker import check_env
 from mesa.examples.advanced.wolf_sheep.agents import GrassPatch, Sheep, Wolf
 
-from simenv_marl import RULE, aec_env, branch, collect_episodes, joint_env, simulate_many
+from simenv_marl import RULE, aec_env, branch, joint_env, simulate_many
+from simenv_marl.data import collect_episodes
 from tests.worlds.models import play
 
 SMALL = {"width": 8, "height": 8, "initial_sheep": 20, "initial_wolves": 5}

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simenv_marl import OptionValueError, design
+from simenv_marl.errors import OptionValueError
+from simenv_marl.experiments import design
 
 SIZED = ("latin_hypercube", "sobol", "halton")
 TWO_LEVELS = ("fractional_factorial", "plackett_burman")

@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from simenv_marl import OptionValueError, design, effects, run_experiment, sobol_indices
+from simenv_marl.errors import OptionValueError
+from simenv_marl.experiments import design, effects, run_experiment, sobol_indices
 
 
 class Sum:

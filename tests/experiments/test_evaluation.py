@@ -11,23 +11,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from simenv_marl import (
-    RULE,
-    AgentError,
-    ChangedResult,
-    MissingExtraError,
-    Mixture,
-    OptionValueError,
-    RolloutPolicy,
-    TreeSearchPolicy,
-    UnknownPointError,
-    Variant,
-    aec_env,
-    evaluate,
-    make_step,
-    simulate,
-)
+from simenv_marl import RULE, aec_env, evaluate, make_step, simulate
+from simenv_marl.data import Mixture
+from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
+from simenv_marl.experiments import Variant
 from simenv_marl.experiments.statistics import interval, seeds_needed
+from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy
+from simenv_marl.plugins import ChangedResult
 from tests.conftest import DRIVERS
 from tests.worlds.many_worlds import Colony, Design, colony_points
 from tests.worlds.models import notes

@@ -20,20 +20,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simenv_marl import (
-    ChangedResult,
-    Mixture,
-    OptionValueError,
-    RolloutPolicy,
-    StoreError,
-    UnknownPointError,
-    Variant,
-    evaluate,
-    run_experiment,
-    simulate,
-)
+from simenv_marl import evaluate, simulate
+from simenv_marl.data import Mixture
+from simenv_marl.errors import OptionValueError, StoreError, UnknownPointError
+from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.experiments import store as stores
 from simenv_marl.experiments.playing import Outcome
+from simenv_marl.planning import RolloutPolicy
+from simenv_marl.plugins import ChangedResult
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import notes
 from tests.worlds.shops import NEAR, POINTS, Shop, level, much, much_of_many, some, some_of_many
@@ -570,7 +564,7 @@ SCRIPT = """
     import sys
     sys.path.insert(0, sys.argv[3])
     import pandas as pd
-    from simenv_marl import run_experiment
+    from simenv_marl.experiments import run_experiment
     from tests.worlds.shops import POINTS, Shop, level, some
 
     if __name__ == "__main__":
@@ -624,7 +618,8 @@ def test_a_process_that_is_killed_loses_only_what_it_was_running(workers, tmp_pa
 NAMED = """
     import sys, numpy as np
     from gymnasium import spaces
-    from simenv_marl import evaluate, make_step, run_experiment
+    from simenv_marl import evaluate, make_step
+    from simenv_marl.experiments import run_experiment
 
     class Sum:
         def __init__(self, a=1):
@@ -668,7 +663,7 @@ def test_what_a_script_names_is_found_in_its_workers(workers, tmp_path):
 
 PURE = """
     import sys, pandas as pd
-    from simenv_marl import run_experiment
+    from simenv_marl.experiments import run_experiment
 
     class Sum:
         def __init__(self, a):

@@ -14,10 +14,12 @@ from unittest import mock
 import pytest
 from greenlet import getcurrent
 
-from simenv_marl import (
-    PatchError,
-    UnknownTargetError,
-    aec_env,
+from simenv_marl import aec_env
+from simenv_marl.errors import PatchError, UnknownTargetError
+from simenv_marl.hooks.hook import hook_of
+from simenv_marl.hooks.places import Held, Place, hook_at, places_of, plain, resolve
+from simenv_marl.hooks.targets import TARGET
+from simenv_marl.plugins import (
     attach_handler,
     attached_handlers,
     expose_to_plugins,
@@ -25,9 +27,6 @@ from simenv_marl import (
     remove_handler,
     trace,
 )
-from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.places import Held, Place, hook_at, places_of, plain, resolve
-from simenv_marl.hooks.targets import TARGET
 from tests.contract.test_faults import interrupt_at
 from tests.worlds.models import calling, define
 

@@ -13,14 +13,11 @@ import weakref
 import pytest
 
 import simenv_marl
-from simenv_marl import (
+from simenv_marl import SimEnvError, aec_env
+from simenv_marl.errors import HandlerError, PatchError, UnknownTargetError
+from simenv_marl.plugins import (
     ChangedArgs,
     ChangedResult,
-    HandlerError,
-    PatchError,
-    SimEnvError,
-    UnknownTargetError,
-    aec_env,
     attach_handler,
     attached_handlers,
     decision_points,

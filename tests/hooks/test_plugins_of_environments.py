@@ -14,29 +14,28 @@ from gymnasium import spaces
 import simenv_marl
 from simenv_marl import (
     RULE,
-    ChangedArgs,
-    ChangedResult,
-    HandlerError,
-    NoDecisionError,
-    OptionValueError,
-    UnknownTargetError,
     aec_env,
-    attached_handlers,
     difference,
-    expose_to_plugins,
     generate_env,
-    handlers,
     joint_env,
     parallel_env,
-    remove_handler,
     simulate,
     single_env,
-    trace,
     vector_env,
 )
 from simenv_marl.core import agent as agent_module
+from simenv_marl.errors import HandlerError, NoDecisionError, OptionValueError, UnknownTargetError
 from simenv_marl.hooks.hook import hook_of
 from simenv_marl.hooks.stacks import EVALUATING
+from simenv_marl.plugins import (
+    ChangedArgs,
+    ChangedResult,
+    attached_handlers,
+    expose_to_plugins,
+    handlers,
+    remove_handler,
+    trace,
+)
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Trader
 from tests.worlds.models import (
@@ -583,7 +582,7 @@ def test_whoever_comes_and_goes_nobody_is_in_anothers_way(seed):
         def handler(*args, **kwargs):
             return None
 
-        simenv_marl.attach_handler(handler, name, "before")
+        simenv_marl.plugins.attach_handler(handler, name, "before")
         return lambda: remove_handler(name, "before", handler)
 
     def environment(name, *others):
@@ -741,7 +740,7 @@ def test_a_plugin_may_remove_everybodys_handlers_in_mid_episode():
             remove_handler(WORD, "after")
 
     env = single_env(House, House.water, plugins=[(remove, WORD, "before")])
-    simenv_marl.attach_handler(lambda self: log.append(1), WORD, "after")
+    simenv_marl.plugins.attach_handler(lambda self: log.append(1), WORD, "after")
     env.reset()
     env.step(1)
     env.close()

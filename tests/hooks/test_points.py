@@ -10,15 +10,8 @@ from textwrap import dedent
 import pytest
 
 import simenv_marl
-from simenv_marl import (
-    RULE,
-    AgentError,
-    DefinitionError,
-    PatchError,
-    SimEnvError,
-    UnknownPointError,
-    generate_env,
-)
+from simenv_marl import RULE, SimEnvError, generate_env
+from simenv_marl.errors import AgentError, DefinitionError, PatchError, UnknownPointError
 from tests.foreign import market, shop
 from tests.foreign.market import Broker, Cautious, Dealer, Junior, Trader
 from tests.worlds.models import Script, calling, decision, decisions, define, plainly, play
@@ -190,7 +183,8 @@ def test_without_points_all_registered_ones_are_meant(tmp_path):
 def test_without_points_those_of_more_than_one_package_are_refused(tmp_path):
     main = """
         import pytest, other
-        from simenv_marl import aec_env, single_env, UnknownPointError
+        from simenv_marl import aec_env, single_env
+        from simenv_marl.errors import UnknownPointError
         from model import Simulation, first
         with pytest.raises(UnknownPointError, match="model.*other|other.*model"):
             aec_env(Simulation)
@@ -205,7 +199,8 @@ def test_without_points_those_of_more_than_one_package_are_refused(tmp_path):
 def test_without_any_point_nothing_can_be_made(tmp_path):
     main = """
         import pytest
-        from simenv_marl import aec_env, UnknownPointError
+        from simenv_marl import aec_env
+        from simenv_marl.errors import UnknownPointError
         class Simulation:
             def reset(self): pass
             def run(self): pass

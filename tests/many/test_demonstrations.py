@@ -7,20 +7,21 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    DefinitionError,
-    InvalidActionError,
-    MissingExtraError,
+from simenv_marl import RULE, simulate_many
+from simenv_marl.data import (
     Mixture,
-    OptionValueError,
     collect_episodes,
     compare_with_rule,
     record_dataset,
     save_dataset,
-    simulate_many,
 )
-from simenv_marl.many.mixture import _drawn
+from simenv_marl.data.mixture import _drawn
+from simenv_marl.errors import (
+    DefinitionError,
+    InvalidActionError,
+    MissingExtraError,
+    OptionValueError,
+)
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import calling, decision, plainly, script
 
@@ -210,7 +211,7 @@ def test_what_cannot_be_saved():
 
 
 def test_what_the_rule_decides_must_be_known_before_anything_runs(monkeypatch):
-    monkeypatch.setattr("simenv_marl.many.demonstrations._check_free", lambda names: [])
+    monkeypatch.setattr("simenv_marl.data.demonstrations._check_free", lambda names: [])
 
     def never(simulation):
         raise AssertionError

@@ -11,17 +11,10 @@ from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 
-from simenv_marl import (
-    RULE,
-    TRUNCATED,
-    MissingExtraError,
-    OptionValueError,
-    UnknownAgentError,
-    collect_episodes,
-    plot_returns,
-    plot_timeline,
-)
-from simenv_marl.many.plots import COLOURS, UNKNOWN
+from simenv_marl import RULE, TRUNCATED
+from simenv_marl.data import collect_episodes, plot_returns, plot_timeline
+from simenv_marl.data.plots import COLOURS, UNKNOWN
+from simenv_marl.errors import MissingExtraError, OptionValueError, UnknownAgentError
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script
 

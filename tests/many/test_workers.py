@@ -14,18 +14,12 @@ import numpy as np
 import pytest
 from joblib._parallel_backends import ThreadingBackend
 
-from simenv_marl import (
-    RULE,
-    InvalidActionError,
-    Variant,
-    WorkerError,
-    collect_episodes,
-    difference,
-    expose_to_plugins,
-    make_step,
-    simulate_many,
-)
+from simenv_marl import RULE, difference, make_step, simulate_many
+from simenv_marl.data import collect_episodes
+from simenv_marl.errors import InvalidActionError, WorkerError
+from simenv_marl.experiments import Variant
 from simenv_marl.many import spread
+from simenv_marl.plugins import expose_to_plugins
 from tests.processes import alone, descriptors
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
 from tests.worlds.models import PAIR, decision, define, notes, script

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 from gymnasium import spaces
 
-from simenv_marl import TRUNCATED, ProcessSimulation, SimulationInterface, difference, make_step
+from simenv_marl import TRUNCATED, SimulationInterface, difference, make_step
+from simenv_marl.remote import ProcessSimulation
 from tests.worlds import faulty, outside
 
 INFLOW = make_step(

@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import (
-    RULE,
-    ProcessDiedError,
-    ProcessSimulation,
-    RemoteError,
-    aec_env,
-    make_step,
-    simulate,
-)
+from simenv_marl import RULE, aec_env, make_step, simulate
+from simenv_marl.errors import ProcessDiedError, RemoteError
+from simenv_marl.remote import ProcessSimulation
 from tests.outside.compiling import COMPILER, ROOT, compiled
 from tests.processes import gone
 

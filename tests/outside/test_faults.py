@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simenv_marl import (
-    RULE,
+from simenv_marl import RULE, aec_env, single_env
+from simenv_marl.errors import (
     ProcessDiedError,
     ProcessError,
     ProcessTimeoutError,
@@ -18,8 +18,6 @@ from simenv_marl import (
     UnknownPointError,
     WireError,
     WrongThreadError,
-    aec_env,
-    single_env,
 )
 from simenv_marl.remote.child import _Process
 from tests.outside.reservoirs import BOTH, INFLOW, PRICE, broken, by_its_rule, reservoirs

@@ -15,7 +15,8 @@ from examples.jvm_market.compare import CONTENDERS, METRICS, by_the_granary, com
 from examples.jvm_market.env import PRICE, PRICES, SOW, env, market, parallel_env, raw_env
 from pettingzoo import test as kit
 
-from simenv_marl import RULE, InvalidActionError, ProcessDiedError, RemoteError, branch, simulate, simulate_many
+from simenv_marl import RULE, branch, simulate, simulate_many
+from simenv_marl.errors import InvalidActionError, ProcessDiedError, RemoteError
 from simenv_marl.remote.check import check_wire
 from tests.worlds.models import play
 

@@ -19,7 +19,8 @@ from examples.ns3_senders.env import POINTS, missing, parallel_env, program, raw
 from examples.ns3_senders.train import POINT, Linear, compare, learn
 from pettingzoo import test as kit
 
-from simenv_marl import RULE, ProcessDiedError, branch, simulate, simulate_many
+from simenv_marl import RULE, branch, simulate, simulate_many
+from simenv_marl.errors import ProcessDiedError
 from tests.outside.compiling import ROOT
 
 pytestmark = [

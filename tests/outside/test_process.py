@@ -19,32 +19,32 @@ from pettingzoo.test import api_test, parallel_api_test
 from simenv_marl import (
     RULE,
     TRUNCATED,
-    AgentError,
-    BranchError,
-    DefinitionError,
-    OptionValueError,
-    ProcessSimulation,
-    RolloutPolicy,
-    SimulationError,
-    UnknownPointError,
-    Variant,
-    WireError,
     aec_env,
     branch,
-    design,
     evaluate,
     generate_env,
-    handlers,
     joint_env,
     make_step,
     parallel_env,
-    run_experiment,
     simulate,
     simulate_many,
     single_env,
     vector_env,
 )
-from simenv_marl.remote.kept import processes_kept
+from simenv_marl.core.reuse import processes_kept
+from simenv_marl.errors import (
+    AgentError,
+    BranchError,
+    DefinitionError,
+    OptionValueError,
+    SimulationError,
+    UnknownPointError,
+    WireError,
+)
+from simenv_marl.experiments import Variant, design, run_experiment
+from simenv_marl.planning import RolloutPolicy
+from simenv_marl.plugins import handlers
+from simenv_marl.remote import ProcessSimulation
 from tests.outside.reservoirs import (
     BOTH,
     BOTH_HERE,

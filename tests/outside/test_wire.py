@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simenv_marl import WireError
+from simenv_marl.errors import WireError
 from simenv_marl.remote.wire import decode, encode
 
 VALUES = st.recursive(

@@ -10,15 +10,7 @@ from pettingzoo.utils.wrappers import AssertOutOfBoundsWrapper, BaseParallelWrap
 
 from simenv_marl import (
     RULE,
-    BranchError,
-    EpisodeOverError,
-    InvalidActionError,
-    NotResetError,
-    OptionValueError,
     SimulationInterface,
-    UnknownAgentError,
-    ViewError,
-    action_values,
     aec_env,
     difference,
     joint_env,
@@ -26,6 +18,16 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
+from simenv_marl.errors import (
+    BranchError,
+    EpisodeOverError,
+    InvalidActionError,
+    NotResetError,
+    OptionValueError,
+    UnknownAgentError,
+    ViewError,
+)
+from simenv_marl.planning import action_values
 from simenv_marl.planning.futures import Futures
 from simenv_marl.planning.lookahead import Lookahead
 from tests.conftest import DRIVERS

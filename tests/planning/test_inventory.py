@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from simenv_marl import RULE, RolloutPolicy, action_values, simulate, single_env
+from simenv_marl import RULE, simulate, single_env
+from simenv_marl.planning import RolloutPolicy, action_values
 from tests.worlds.inventory import MOST, Shop, best_values, state
 
 VALUES = best_values()

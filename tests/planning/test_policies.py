@@ -12,26 +12,24 @@ from gymnasium import spaces
 
 from simenv_marl import (
     RULE,
-    BranchError,
-    CopyError,
-    InvalidActionError,
-    Mixture,
-    OptionValueError,
-    ReentrancyError,
-    RolloutPolicy,
-    action_values,
     aec_env,
     branch,
-    collect_episodes,
-    compare_with_rule,
     joint_env,
     parallel_env,
-    record_dataset,
     simulate,
     simulate_many,
     single_env,
     vector_env,
 )
+from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset
+from simenv_marl.errors import (
+    BranchError,
+    CopyError,
+    InvalidActionError,
+    OptionValueError,
+    ReentrancyError,
+)
+from simenv_marl.planning import RolloutPolicy, action_values
 from tests.conftest import DRIVERS
 from tests.planning.test_action_values import GRAZING, Herd, Mortal, greedy, made
 from tests.worlds.duels import LEFT, RIGHT, Duel, Unseeded, points, worth

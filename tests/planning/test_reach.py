@@ -12,14 +12,9 @@ from gymnasium.wrappers import TransformAction, TransformObservation, TransformR
 from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 
 from simenv_marl import (
-    BranchError,
-    OptionValueError,
-    RolloutPolicy,
     SimulationInterface,
-    action_values,
     aec_env,
     branch,
-    collect_episodes,
     difference,
     joint_env,
     make_step,
@@ -29,6 +24,9 @@ from simenv_marl import (
     simulate_many,
     single_env,
 )
+from simenv_marl.data import collect_episodes
+from simenv_marl.errors import BranchError, OptionValueError
+from simenv_marl.planning import RolloutPolicy, action_values
 from tests.processes import gone
 
 SPACE = spaces.Box(-99, 99, (2,), np.float32)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from simenv_marl import OptionValueError, RolloutPolicy, TreeSearchPolicy, simulate, single_env
+from simenv_marl import simulate, single_env
+from simenv_marl.errors import OptionValueError
+from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy
 from tests.planning.test_action_values import made, points
 from tests.worlds.duels import Duel
 from tests.worlds.models import define

@@ -20,18 +20,15 @@ from examples.greenhouse_coop.env import GreenhouseSim
 from gymnasium import spaces
 
 import simenv_marl
-from simenv_marl import (
-    TRUNCATED,
-    ChangedResult,
+from simenv_marl import TRUNCATED, SimEnvError, aec_env, testing
+from simenv_marl.errors import (
     CheckFailedError,
     OptionValueError,
-    SimEnvError,
     SimulationError,
     UnknownOptionError,
     UnknownPointError,
-    aec_env,
-    testing,
 )
+from simenv_marl.plugins import ChangedResult
 from simenv_marl.testing import CheckReport, Finding, check_simulation, inspect_simulation
 from simenv_marl.testing.fingerprint import fingerprint
 from simenv_marl.testing.report import compressed, short_names

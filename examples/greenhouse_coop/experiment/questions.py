@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from simenv_marl import SimulationAECEnv
+from simenv_marl.envs import SimulationAECEnv
 
 from ..train import HELD_OUT, VENTILATOR, WATERER, Constant, Outcome, Policy, Team, play
 

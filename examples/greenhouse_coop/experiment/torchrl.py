@@ -34,7 +34,8 @@ from torchrl.envs import ExplorationType
 from torchrl.modules import MLP, IndependentNormal, MultiAgentMLP, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
-from simenv_marl import SimulationParallelEnv, parallel_env
+from simenv_marl import parallel_env
+from simenv_marl.envs import SimulationParallelEnv
 
 from ..env import DAYS, OBSERVED, GreenhouseSim
 from ..model import HIGHEST_TEMPERATURE, LOWEST_TEMPERATURE, POT_CAPACITY

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..errors import MaskError, shown
+from ..errors import MaskError, short_repr
 from ..simulation import Sentinel
 from .spaces import duplicate
 
@@ -174,7 +174,7 @@ def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
 
         def cast(value: Any) -> Any:
             if not isinstance(value, (tuple, list)) or len(value) != len(parts):
-                raise MaskError(f"the mask {shown(value)} must have the {len(parts)} parts of {shown(space)}")
+                raise MaskError(f"the mask {short_repr(value)} must have the {len(parts)} parts of {short_repr(space)}")
             return tuple(part(item) for part, item in zip(parts, value, strict=True))
 
         return cast
@@ -188,16 +188,16 @@ def _mask_of(number: int, space: spaces.Space[Any]) -> Callable[[Any], NDArray[n
     def cast(value: Any) -> NDArray[np.int8]:
         mask = np.asarray(value)
         if mask.shape != shape:
-            raise MaskError(f"the mask {shown(value)} has shape {mask.shape}; {shown(space)} needs {shape}")
+            raise MaskError(f"the mask {short_repr(value)} has shape {mask.shape}; {short_repr(space)} needs {shape}")
         if mask.dtype.char not in _ONE_BYTE:
             given, mask = mask, mask.astype(bool)
             if not (mask == given).all():
-                raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
+                raise MaskError(f"the mask {short_repr(value)} has values other than 0 and 1")
         marks = mask.tobytes()  # comparing bytes is faster than three calls of NumPy
         if marks.strip(b"\0\1"):
-            raise MaskError(f"the mask {shown(value)} has values other than 0 and 1")
+            raise MaskError(f"the mask {short_repr(value)} has values other than 0 and 1")
         if 1 not in marks:
-            raise MaskError(f"the mask {shown(value)} leaves no legal action of {shown(space)}")
+            raise MaskError(f"the mask {short_repr(value)} leaves no legal action of {short_repr(space)}")
         return mask.astype(int8)
 
     return cast

@@ -12,7 +12,7 @@ from weakref import ref
 import numpy as np
 from greenlet import getcurrent
 
-from ..errors import MaskError, RewardError, shown
+from ..errors import MaskError, RewardError, short_repr
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import MASK
@@ -301,11 +301,11 @@ def checked_reward(agent: Agent, reward: Any) -> float:
     """
     value = reward.item() if isinstance(reward, np.ndarray) and reward.size == 1 else reward
     if not isinstance(value, (Real, np.bool_)):
-        raise RewardError(f"the reward {shown(reward)} is not one number")
+        raise RewardError(f"the reward {short_repr(reward)} is not one number")
     try:
         value = float(value)
     except OverflowError:
-        raise RewardError(f"the reward {shown(reward)} is too large for a float") from None
+        raise RewardError(f"the reward {short_repr(reward)} is too large for a float") from None
     if not isfinite(value):
         raise RewardError(f"the reward of {agent.name!r} is {value}, which is not finite")
     return value

@@ -16,7 +16,7 @@ from contextvars import ContextVar
 from typing import Any, Final
 from weakref import ref
 
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, short_repr
 from ..simulation import RULE, positional
 from .bound import asks_for
 
@@ -88,7 +88,8 @@ class AskingPolicy:
         session = self._session()
         if session is None:
             raise OptionValueError(
-                f"the policy {shown(self.policy)} asks for {ENVIRONMENT}, but there is no environment to give it here;"
+                f"the policy {short_repr(self.policy)} asks for {ENVIRONMENT}, but there is no"
+                " environment to give it here;"
                 " pass the policy in policies="
             )
         episode = session.episode

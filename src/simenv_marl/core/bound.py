@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
-from ..errors import InvalidActionError, MaskError, shown, warn_user
+from ..errors import InvalidActionError, MaskError, short_repr, warn_user
 from . import actions, spaces
 from .actions import ILLEGAL, MASK
 from .points import NamedPoint
@@ -217,11 +217,13 @@ class BoundPoint:
         legal = self.check(action)
         if legal is ILLEGAL:
             raise InvalidActionError(
-                f"the action {shown(action)} of {agent!r} is not in its action space"
-                f" {shown(self.definition.action_space)}"
+                f"the action {short_repr(action)} of {agent!r} is not in its action space"
+                f" {short_repr(self.definition.action_space)}"
             )
         if mask is not None and not self.allows(mask, legal):
-            raise InvalidActionError(f"the action {shown(action)} of {agent!r} is masked; its mask is {shown(mask)}")
+            raise InvalidActionError(
+                f"the action {short_repr(action)} of {agent!r} is masked; its mask is {short_repr(mask)}"
+            )
         return legal
 
     def rule_action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any], choices: Any) -> Any:
@@ -245,8 +247,9 @@ class BoundPoint:
             legal = None if action is None else self.check(action)
             if legal is ILLEGAL:
                 raise InvalidActionError(
-                    f"rule_action_mapping of {self.point.name} maps the rule's decision {shown(decision)} to the"
-                    f" action {shown(action)}, which is not in its action space {shown(definition.action_space)}"
+                    f"rule_action_mapping of {self.point.name} maps the rule's decision {short_repr(decision)} to the"
+                    f" action {short_repr(action)}, which is not in its action space"
+                    f" {short_repr(definition.action_space)}"
                 )
             return legal
         if choices is not None:
@@ -288,7 +291,8 @@ def _look_back(actions: Mapping[Any, Any]) -> Callable[..., Any]:
             return known[decision]
         except (KeyError, TypeError):
             raise InvalidActionError(
-                f"the dict rule_action_mapping has no action for the rule's decision {shown(decision)}; add one, or"
+                "the dict rule_action_mapping has no action for the rule's decision"
+                f" {short_repr(decision)}; add one, or"
                 " pass a callable that returns None where no action corresponds"
             ) from None
 

@@ -17,7 +17,7 @@ from ..errors import (
     UnknownAgentError,
     annotate,
     clear_frames,
-    shown,
+    short_repr,
     warn_user,
 )
 from ..hooks.stacks import EVALUATING
@@ -176,7 +176,8 @@ class Ending(Participants):
         """Warn that many rounds had no action for the agent whose decision is pending."""
         assert self.pending is not None
         warn_user(
-            f"the simulation stands still: {shown(self.pending.name)} must decide, but {MANY_ROUNDS} rounds in a row"
+            f"the simulation stands still: {short_repr(self.pending.name)} must decide, but"
+            f" {MANY_ROUNDS} rounds in a row"
             ' had no action for it; the info of the agent that must decide has "deciding": True'
         )
 
@@ -193,14 +194,14 @@ class Ending(Participants):
         if pending is None:
             raise self.refusal()
         if type(actions) is not dict and not isinstance(actions, Mapping):
-            raise InvalidActionError(f"a round takes a dict of actions by agent, not {shown(actions)}")
+            raise InvalidActionError(f"a round takes a dict of actions by agent, not {short_repr(actions)}")
         for name, action in actions.items():
             agent = agents.get(name)
             if agent is None and name in self.ended and self.ended[name] in self.untold:
                 continue
             if agent is None:
                 raise UnknownAgentError(
-                    f"there is an action for {shown(name)}, which is not a live agent; live agents: {self.names()}"
+                    f"there is an action for {short_repr(name)}, which is not a live agent; live agents: {self.names()}"
                 )
             if action is not RULE:
                 check = agent.point.check
@@ -221,7 +222,7 @@ class Ending(Participants):
         except Warning as warning:  # warnings may be errors; this one must not replace the original error
             problems = [warning]
         for problem in problems:
-            annotate(error, f"simenv_marl: unwinding the simulation raised {shown(problem)} as well")
+            annotate(error, f"simenv_marl: unwinding the simulation raised {short_repr(problem)} as well")
         clear_frames(error)
 
     def annotate(self, error: BaseException) -> None:
@@ -264,7 +265,7 @@ class Ending(Participants):
             return  # the simulation's own thread unwinds it at its next switch
         with self.at_work():
             for problem in self._unwind():
-                warn_user(f"a simulation that was abandoned raised {shown(problem)}", ResourceWarning)
+                warn_user(f"a simulation that was abandoned raised {short_repr(problem)}", ResourceWarning)
 
     def _unwind(self) -> list[BaseException]:
         """Unwind the simulation if it is suspended. Return the errors that it raised."""

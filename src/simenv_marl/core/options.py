@@ -15,8 +15,8 @@ from gymnasium import spaces
 from ..errors import (
     OptionValueError,
     UnknownOptionError,
-    meant,
-    shown,
+    did_you_mean,
+    short_repr,
 )
 from ..simulation import RULE
 
@@ -105,36 +105,42 @@ class Options:
 
     def __post_init__(self) -> None:
         if self.driver not in ("greenlet", "thread"):
-            raise OptionValueError(f'driver must be "greenlet" or "thread", not {shown(self.driver)}')
+            raise OptionValueError(f'driver must be "greenlet" or "thread", not {short_repr(self.driver)}')
         if isinstance(self.possible_agents, str):
             raise OptionValueError(
-                f"possible_agents must be a list of names, not the one name {shown(self.possible_agents)}"
+                f"possible_agents must be a list of names, not the one name {short_repr(self.possible_agents)}"
             )
         if self.undeclared not in ("error", "rule"):
-            raise OptionValueError(f'undeclared must be "error" or "rule", not {shown(self.undeclared)}')
+            raise OptionValueError(f'undeclared must be "error" or "rule", not {short_repr(self.undeclared)}')
         if self.agent is not None and not (isinstance(self.agent, str) and self.agent):
-            raise OptionValueError(f"agent must be the name of an agent or None, not {shown(self.agent)}")
+            raise OptionValueError(f"agent must be the name of an agent or None, not {short_repr(self.agent)}")
         for name in ("clip_actions", "global_rng", "padded", "skip_forced"):
             if not isinstance(getattr(self, name), bool):
-                raise OptionValueError(f"{name} must be True or False, not {shown(getattr(self, name))}")
+                raise OptionValueError(f"{name} must be True or False, not {short_repr(getattr(self, name))}")
         state_space = self.state_space
         if not (state_space is None or isinstance(state_space, spaces.Space) or state_space == "observations"):
-            raise OptionValueError(f'state_space must be a gymnasium space or "observations", not {shown(state_space)}')
+            raise OptionValueError(
+                f'state_space must be a gymnasium space or "observations", not {short_repr(state_space)}'
+            )
         steps = self.max_steps
         if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
-            raise OptionValueError(f"max_steps must be a positive integer or None, not {shown(steps)}")
+            raise OptionValueError(f"max_steps must be a positive integer or None, not {short_repr(steps)}")
         if self.policies is not None and not isinstance(self.policies, Mapping):
             raise OptionValueError(
-                f"policies must be a dict from agents or points to callables, not {shown(self.policies)}"
+                f"policies must be a dict from agents or points to callables, not {short_repr(self.policies)}"
             )
         if self.possible_agents is not None:  # it may be an iterator, and is read by every environment
             object.__setattr__(self, "possible_agents", _listed(self.possible_agents))
         for key, policy in (self.policies or {}).items():
             if policy is not RULE and not callable(policy):
-                raise OptionValueError(f"the policy of {shown(key)} must be a callable or RULE, not {shown(policy)}")
+                raise OptionValueError(
+                    f"the policy of {short_repr(key)} must be a callable or RULE, not {short_repr(policy)}"
+                )
 
         if isinstance(self.plugins, (str, Mapping)) or not isinstance(self.plugins, Iterable):
-            raise OptionValueError(f"plugins must be a list of (handler, target, position), not {shown(self.plugins)}")
+            raise OptionValueError(
+                f"plugins must be a list of (handler, target, position), not {short_repr(self.plugins)}"
+            )
         object.__setattr__(self, "plugins", tuple(self.plugins))  # an iterator is to serve more than once
 
     def amended(self, options: Mapping[str, Any]) -> Options:
@@ -148,7 +154,9 @@ class Options:
         for name in options:
             if name not in known:
                 listed = ", ".join(known)
-                raise UnknownOptionError(f"there is no option {name!r}{meant(name, known)} (the options are {listed})")
+                raise UnknownOptionError(
+                    f"there is no option {name!r}{did_you_mean(name, known)} (the options are {listed})"
+                )
         return replace(self, **options)
 
 
@@ -170,5 +178,5 @@ def _listed(names: Any) -> Any:
         return list(names)
     except TypeError:
         raise OptionValueError(
-            f"possible_agents must be names, or a dict from points to names, not {shown(names)}"
+            f"possible_agents must be names, or a dict from points to names, not {short_repr(names)}"
         ) from None

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from ..errors import AgentError, shown
+from ..errors import AgentError, short_repr
 from ..hooks.hook import Hook
 from ..simulation import RULE
 from .agent import WAIT, Agent
@@ -77,7 +77,7 @@ class Participants:
             AgentError: The name is not a string, or belongs to another point, or to an agent that has ended.
         """
         if not isinstance(name, str):
-            raise AgentError(f"agent= of {point.point.name} must return a string or None, not {shown(name)}")
+            raise AgentError(f"agent= of {point.point.name} must return a string or None, not {short_repr(name)}")
         agent = self.answered.get(name) or self.agents.get(name)
         if agent is None:
             if name in self.ended:

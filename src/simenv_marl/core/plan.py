@@ -19,8 +19,8 @@ from ..errors import (
     OptionValueError,
     UnknownOptionError,
     UnknownPointError,
-    meant,
-    shown,
+    did_you_mean,
+    short_repr,
     warn_user,
 )
 from ..hooks.hook import Hook
@@ -45,7 +45,6 @@ from .points import (
     stand_ins,
 )
 from .roster import assign, call_the_roll, declared_agents, name_agents, names_agents
-from .variant import Variant
 
 RENDER_MODES = ("ansi", "human", "rgb_array")
 """The render modes of a simulation with a method ``render`` that does not define ``render_modes``."""
@@ -98,7 +97,7 @@ class Plan:
         render_fps: float = RENDER_FPS,
         ends_agents: bool = False,
         spare: list[Spare] | None = None,
-        variant: Variant | None = None,
+        variant: Any = None,
         own: Mapping[DecisionPoint, Definition] = MappingProxyType({}),
     ) -> None:
         self.source, self.options, self._named, self._own = source, options, named, own
@@ -107,16 +106,16 @@ class Plan:
         self.render_modes, self.render_fps = render_modes, render_fps
         if options.render_mode is not None and options.render_mode not in render_modes:
             raise OptionValueError(
-                f"render_mode {shown(options.render_mode)} is not one of the simulation's:"
-                f" {render_modes or 'it has none'}{meant(options.render_mode, render_modes)}"
+                f"render_mode {short_repr(options.render_mode)} is not one of the simulation's:"
+                f" {render_modes or 'it has none'}{did_you_mean(options.render_mode, render_modes)}"
             )
         self.unanswered, self.rewarded, self._ends_agents = unanswered, rewarded, ends_agents
         self._others = others
         agents = name_agents(named)
         if options.agent is not None and options.agent not in agents and None not in agents:
             raise AgentError(
-                f"agent={shown(options.agent)} names no agent; the agents are {', '.join(filter(None, agents))}"
-                f"{meant(options.agent, filter(None, agents))}"
+                f"agent={short_repr(options.agent)} names no agent; the agents are {', '.join(filter(None, agents))}"
+                f"{did_you_mean(options.agent, filter(None, agents))}"
             )
         by_point, self.policies, extra = assign(options.policies or {}, named, agents, own)
         self._everything, self._by_point = [*named, *extra], by_point
@@ -180,7 +179,7 @@ class Plan:
         made._bind_points(first=False)
         return made
 
-    def with_source(self, source: Any, variant: Variant | None, spare: Spare) -> Plan:
+    def with_source(self, source: Any, variant: Any, spare: Spare) -> Plan:
         """Copy the plan for simulations from another source, of which one is already made."""
         made = self._copied()
         made.source, made.variant, made._spare = source, variant, [spare]
@@ -233,17 +232,18 @@ class Plan:
         """
         if agent in self.policies:
             raise OptionValueError(
-                f"agent={shown(agent)} is answered by policies, and no decision is left to the environment"
+                f"agent={short_repr(agent)} is answered by policies, and no decision is left to the environment"
             )
         if self.complete and agent not in self.roster:
             raise AgentError(
-                f"agent={shown(agent)} names no agent of the environment; its agents are {', '.join(self.roster)}"
-                f"{meant(agent, self.roster)}"
+                f"agent={short_repr(agent)} names no agent of the environment; its agents are {', '.join(self.roster)}"
+                f"{did_you_mean(agent, self.roster)}"
             )
         points = [self.roster[agent]] if self.complete else self.active
         if len(points) > 1:
             raise AgentError(
-                f"the agent {shown(agent)} may decide at {', '.join(point.point.name for point in points)}; name its"
+                f"the agent {short_repr(agent)} may decide at"
+                f" {', '.join(point.point.name for point in points)}; name its"
                 " decision point in points=, or declare the agents of each with possible_agents="
             )
         self.active, self.roster, self.complete = points, {agent: points[0]}, True
@@ -330,9 +330,9 @@ class Plan:
         Raises:
             SimEnvError: The arguments do not work. The subclass of the error says why.
         """
-        variant = source if isinstance(source, Variant) else None
+        variant = source if hasattr(source, "environment_arguments") else None
         if variant is not None:
-            source, points, options = variant.applied(points, options)
+            source, points, options = variant.environment_arguments(points, options)
         checked = Options().amended(options)
         if unanswered and checked.agent is not None:
             raise UnknownOptionError("agent is an option of single views only, as single_env makes them")
@@ -422,7 +422,7 @@ class Plan:
         )  # fmt: skip
 
 
-def _remade(source: Any, points: Any, options: dict[str, Any], variant: Variant | None, unanswered: bool) -> Plan:
+def _remade(source: Any, points: Any, options: dict[str, Any], variant: Any, unanswered: bool) -> Plan:
     plan = Plan.draw_up(source, points, options, unanswered=unanswered)
     plan.variant = variant
     return plan

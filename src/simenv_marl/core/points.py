@@ -14,7 +14,7 @@ from types import FunctionType, MappingProxyType
 from typing import Any, Final
 
 from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
-from ..errors import DefinitionError, PatchError, UnknownPointError, shown
+from ..errors import DefinitionError, PatchError, UnknownPointError, short_repr
 from ..hooks.attached import title
 from ..hooks.hook import Hook, beneath, hook_of
 from ..hooks.places import (
@@ -174,7 +174,7 @@ def find_point(
         UnknownPointError, DefinitionError, PatchError: See ``find_points``.
     """
     if definition is not None and not isinstance(definition, Definition):
-        raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {shown(definition)}")
+        raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {short_repr(definition)}")
     point, given = locate(key, own)
     definition = definition or given or own.get(point) or point.definition
     if definition is None:

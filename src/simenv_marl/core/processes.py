@@ -22,7 +22,7 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import cloudpickle
 
 from ..decision import DecisionPoint, Definition, point_of, unwrapped
-from ..errors import WorkerError, annotate, notes_of, told
+from ..errors import WorkerError, annotate, describe_error, error_notes
 from ..hooks.hook import Hook, hook_of, made_with
 
 
@@ -99,7 +99,7 @@ def pack_error(error: BaseException) -> bytes:
     try:
         text = "".join(traceback.format_exception(error))
     except Exception:  # formatting runs code of the error's class, which may fail
-        text = told(error)
+        text = describe_error(error)
     errors, numbers = [error], {id(error): 0}
     for known in errors:  # the loop appends to the list
         for other in (_cause_of(known), *_members_of(known)):
@@ -109,8 +109,8 @@ def pack_error(error: BaseException) -> bytes:
     packed = [
         _Packed(
             parts=_packed(known),
-            message=told(known),
-            notes=notes_of(known),
+            message=describe_error(known),
+            notes=error_notes(known),
             members=[numbers[id(member)] for member in _members_of(known)],
             cause=numbers.get(id(_cause_of(known))),
             direct=known.__cause__ is not None,
@@ -206,7 +206,7 @@ def _rebuild(number: int, packed: list[_Packed], errors: dict[int, BaseException
             with suppress(Exception):
                 error = _made_again(parts, members)
         for note in notes:
-            if note not in notes_of(error):
+            if note not in error_notes(error):
                 annotate(error, note)
         errors[number] = error
     return errors[number]

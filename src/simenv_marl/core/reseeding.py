@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..errors import OptionValueError, SimulationError, shown
+from ..errors import OptionValueError, SimulationError, short_repr
 from .rng import HELD, SHARED, is_seed, reseed_one, streams
 
 _GENERATORS: Final = (random.Random, np.random.Generator, np.random.RandomState, np.random.BitGenerator)
@@ -41,11 +41,12 @@ def reseed_generators(simulation: Any, seed: int) -> int:
         OptionValueError: The seed is not a non-negative integer.
     """
     if not is_seed(seed):
-        raise OptionValueError(f"seed must be a non-negative integer, not {shown(seed)}")
+        raise OptionValueError(f"seed must be a non-negative integer, not {short_repr(seed)}")
     found = list(_generators(simulation))
     if not found:
         raise SimulationError(
-            f"{shown(simulation)} holds no random generator to seed: keep a random.Random or numpy.random.Generator in"
+            f"{short_repr(simulation)} holds no random generator to seed: keep a random.Random or"
+            " numpy.random.Generator in"
             " an attribute; make the environment with global_rng=True if the model draws from random or numpy.random;"
             " seed other libraries' generators in the simulation's reseed"
         )

@@ -7,7 +7,7 @@ from sys import modules
 from typing import Any
 
 from ..decision import DecisionPoint, Definition, unwrapped
-from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, shown
+from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, short_repr
 from ..simulation import RULE
 from .asking import AskingPolicy, asks_for_environment, takes_info
 from .bound import BoundPoint, Policy
@@ -57,7 +57,7 @@ def call_the_roll(
             point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
             if point is None:
                 raise OptionValueError(
-                    f"possible_agents names {shown(key)}, which is not an active decision point with a callable as"
+                    f"possible_agents names {short_repr(key)}, which is not an active decision point with a callable as"
                     f" agent=; these are: {[b.point.name for b in named]}"
                 )
             names[point] = value
@@ -73,7 +73,7 @@ def call_the_roll(
     for binding in active:
         for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
             if not isinstance(name, str) or name in roster:
-                raise AgentError(f"possible_agents must be different strings, not {shown(name)}")
+                raise AgentError(f"possible_agents must be different strings, not {short_repr(name)}")
             roster[name] = binding
     return roster, not named or declared is not None
 
@@ -115,7 +115,7 @@ def assign(
                     continue
                 names = sorted([a for a in agents if a] + [p.point.name for p in named])
                 raise UnknownPointError(
-                    f"policies names {shown(key)}, which is neither an agent nor a decision point ({error});"
+                    f"policies names {short_repr(key)}, which is neither an agent nor a decision point ({error});"
                     f" known are {', '.join(names)}"
                 ) from error
             if not any(point.point is other.point for other in (*named, *extra)):

@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
 
-from ..errors import BranchError, OptionValueError, annotate, shown, warn_user
+from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..hooks.places import Held
 from ..simulation import closer, make_simulation, resetter
 from .contexts import Claim, at_work
@@ -403,7 +403,7 @@ class Session:
         try:
             self._close_simulation(last=True)
         except Exception as error:
-            warn_user(f"a simulation that was abandoned raised {shown(error)} when it was closed", ResourceWarning)
+            warn_user(f"a simulation that was abandoned raised {short_repr(error)} when it was closed", ResourceWarning)
 
     def _reachable(self) -> bool:
         return self._driver is not None and self._driver.reachable()
@@ -441,7 +441,7 @@ def checked_seed(seed: Any) -> int | None:
     if seed is None:
         return None
     if not is_seed(seed):
-        raise OptionValueError(f"seed must be a non-negative integer or None, not {shown(seed)}")
+        raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
     return int(seed)
 
 

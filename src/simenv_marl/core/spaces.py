@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..errors import ObservationError, shown
+from ..errors import ObservationError, short_repr
 from ..simulation import Sentinel
 
 Cast = Callable[[Any], Any]
@@ -45,7 +45,7 @@ def observation_cast(space: spaces.Space[Any]) -> Cast:
 
     def cast(value: Any) -> Any:
         if not space.contains(value):
-            raise ObservationError(f"the observation {shown(value)} is not in {shown(space)}")
+            raise ObservationError(f"the observation {short_repr(value)} is not in {short_repr(space)}")
         return copy.deepcopy(value)
 
     return cast
@@ -70,23 +70,25 @@ def _convert(value: Any, space: spaces.Space[Any]) -> NDArray[Any]:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise ObservationError(f"the observation {shown(value)} does not fit {shown(space)}: {error}") from error
+        raise ObservationError(
+            f"the observation {short_repr(value)} does not fit {short_repr(space)}: {error}"
+        ) from error
     if array.shape != space.shape:
         raise ObservationError(
-            f"the observation has shape {array.shape}, its space {shown(space)} has shape {space.shape}; it was"
-            f" {shown(value)}"
+            f"the observation has shape {array.shape}, its space {short_repr(space)} has shape {space.shape}; it was"
+            f" {short_repr(value)}"
         )
     if array.dtype.kind not in "biuf":
-        raise ObservationError(f"the observation {shown(value)} has dtype {array.dtype}, which is not numeric")
+        raise ObservationError(f"the observation {short_repr(value)} has dtype {array.dtype}, which is not numeric")
     assert space.dtype is not None
     if space.dtype.kind in "iu" and array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ObservationError(
-            f"the observation {shown(value)} is not finite, and {space.dtype} holds only finite numbers"
+            f"the observation {short_repr(value)} is not finite, and {space.dtype} holds only finite numbers"
         )
     if space.dtype.kind in "iu" and array.size and not np.can_cast(array.dtype, space.dtype):
         limits = np.iinfo(space.dtype)
         if array.min() < limits.min or array.max() > limits.max:
-            raise ObservationError(f"the observation {shown(value)} has numbers that {space.dtype} cannot hold")
+            raise ObservationError(f"the observation {short_repr(value)} has numbers that {space.dtype} cannot hold")
     return array.astype(space.dtype, copy=True)
 
 
@@ -103,7 +105,7 @@ def _discrete_cast(space: spaces.Discrete) -> Cast:
                     return number
             except (TypeError, ValueError, OverflowError):
                 pass
-        raise ObservationError(f"the observation {shown(value)} must be an integer for {shown(space)}")
+        raise ObservationError(f"the observation {short_repr(value)} must be an integer for {short_repr(space)}")
 
     return cast
 
@@ -118,7 +120,8 @@ def _dict_cast(space: spaces.Dict) -> Cast:
         except (TypeError, KeyError):
             pass
         raise ObservationError(
-            f"the observation {shown(value)} must have exactly the keys {shown(sorted(casts))} of {shown(space)}"
+            f"the observation {short_repr(value)} must have exactly the keys"
+            f" {short_repr(sorted(casts))} of {short_repr(space)}"
         )
 
     return cast
@@ -129,7 +132,9 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
 
     def cast(value: Any) -> tuple[Any, ...]:
         if not isinstance(value, (tuple, list)) or len(value) != len(casts):
-            raise ObservationError(f"the observation {shown(value)} must have the {len(casts)} parts of {shown(space)}")
+            raise ObservationError(
+                f"the observation {short_repr(value)} must have the {len(casts)} parts of {short_repr(space)}"
+            )
         return tuple(part(item) for part, item in zip(casts, value, strict=True))
 
     return cast
@@ -163,7 +168,7 @@ def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
         # Usually all numbers are finite, and searching bytes finds that out faster than NumPy's ``all``.
         if 0 in np.isfinite(observation).tobytes() and not np.isfinite(observation[bounded]).all():
             raise ObservationError(
-                f"the observation {shown(observation)} is not finite, but its space {shown(space)} is bounded"
+                f"the observation {short_repr(observation)} is not finite, but its space {short_repr(space)} is bounded"
             )
 
     return check_numbers

@@ -9,7 +9,7 @@ from ..core.agent import Agent
 from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.spaces import duplicate
-from ..errors import InvalidActionError, shown
+from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
 from .base import View
 from .padded import presence
@@ -253,7 +253,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         """Take the final step of an agent that has ended."""
         if action is not None and action is not RULE:
             raise InvalidActionError(
-                f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not {shown(action)}"
+                f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not"
+                f" {short_repr(action)}"
             )
         self._take_back_rewards()
         name = self._leaving.pop()

@@ -107,7 +107,7 @@ class View:
         """Return the provenance of this environment, with the seed of its latest episode, ready for ``json.dump``.
 
         Returns:
-            The dict that ``simenv_marl.provenance`` describes.
+            The dict that ``simenv_marl.experiments.provenance`` describes.
         """
         return describe(self._plan, self._session.seed)
 

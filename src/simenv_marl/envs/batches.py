@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, iterate
 
 from ..core.bound import BoundPoint
-from ..errors import InvalidActionError, shown
+from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
 
 IGNORED: Final = None
@@ -94,10 +94,12 @@ class Actions:
             apart = list(iterate(self._batch, actions))
         except Exception as error:
             raise InvalidActionError(
-                f"{shown(actions)} is not a batch of {self._number} actions of {shown(self._space)}"
+                f"{short_repr(actions)} is not a batch of {self._number} actions of {short_repr(self._space)}"
             ) from error
         if len(apart) != self._number:
-            raise InvalidActionError(f"there are {len(apart)} actions for {self._number} simulations: {shown(actions)}")
+            raise InvalidActionError(
+                f"there are {len(apart)} actions for {self._number} simulations: {short_repr(actions)}"
+            )
         return apart
 
 

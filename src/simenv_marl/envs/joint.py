@@ -12,7 +12,7 @@ from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.session import Session
 from ..core.spaces import duplicate
-from ..errors import InvalidActionError, ViewError, shown
+from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE
 from .gymnasium_base import OneAgentView
 
@@ -56,12 +56,15 @@ class Joint:
             actions = dict.fromkeys(self.roster, RULE)
         elif self._flatten:
             if not isinstance(action, np.ndarray) or action.shape != self.action_space.shape:
-                raise InvalidActionError(f"the joint action {shown(action)} is not in {shown(self.action_space)}")
+                raise InvalidActionError(
+                    f"the joint action {short_repr(action)} is not in {short_repr(self.action_space)}"
+                )
             actions = {name: action[place] for name, place in self._places.items()}
         elif not isinstance(action, Mapping) or set(action) != set(self.roster):
             given = list(action) if isinstance(action, Mapping) else action
             raise InvalidActionError(
-                f"a joint action is a dict with an action for each of {', '.join(self.roster)}; given: {shown(given)}"
+                f"a joint action is a dict with an action for each of {', '.join(self.roster)}; given:"
+                f" {short_repr(given)}"
             )
         else:
             actions = action

@@ -12,7 +12,7 @@ from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.session import checked_seed, seed_space
 from ..core.spaces import duplicate
-from ..errors import OptionValueError, UnknownAgentError, ViewError, meant, shown
+from ..errors import OptionValueError, UnknownAgentError, ViewError, did_you_mean, short_repr
 from .base import View
 
 
@@ -114,8 +114,8 @@ class AgentsView(View):
             found = None if episode is None else episode.agent(agent)
             if found is None:
                 raise UnknownAgentError(
-                    f"there is no agent {shown(agent)}; the agents now are {self.agents[:10]}"
-                    f"{meant(agent, self.agents)}"
+                    f"there is no agent {short_repr(agent)}; the agents now are {self.agents[:10]}"
+                    f"{did_you_mean(agent, self.agents)}"
                 )
             point = found.point
         return point

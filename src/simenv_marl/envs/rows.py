@@ -18,7 +18,7 @@ from ..core.plan import Plan
 from ..core.session import Session
 from ..core.stacking import stacker
 from ..core.together import step_all
-from ..errors import InvalidActionError, OptionValueError, annotate, shown
+from ..errors import InvalidActionError, OptionValueError, annotate, short_repr
 from .batches import IGNORED, Batch, of_one
 from .gymnasium_base import OneAgentView
 from .joint import Joint, SimulationJointEnv
@@ -51,7 +51,7 @@ class SubEnvironments:
         if view is None:
             view = "joint" if plan.one_agent is None else "single"
         if view not in ("single", "joint"):
-            raise OptionValueError(f'view must be None, "single" or "joint", not {shown(view)}')
+            raise OptionValueError(f'view must be None, "single" or "joint", not {short_repr(view)}')
         self.joint: Joint | None = None
         self._view: type[OneAgentView]
         if view == "single":
@@ -344,7 +344,8 @@ class Row:
                     raised = error
                 else:
                     annotate(
-                        raised, f"simenv_marl: sub-environment {self._offset + number} raised {shown(error)} as well"
+                        raised,
+                        f"simenv_marl: sub-environment {self._offset + number} raised {short_repr(error)} as well",
                     )
         if raised is not None:
             raise raised

@@ -19,7 +19,7 @@ from ..errors import (
     NotResetError,
     OptionValueError,
     ReentrancyError,
-    shown,
+    short_repr,
 )
 from .batches import Actions, Batch
 from .gymnasium_base import OneAgentView
@@ -190,7 +190,9 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             return numbers, options
         mask = options["reset_mask"]
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
-            raise OptionValueError(f"reset_mask must be a bool array of shape ({self.num_envs},), not {shown(mask)}")
+            raise OptionValueError(
+                f"reset_mask must be a bool array of shape ({self.num_envs},), not {short_repr(mask)}"
+            )
         chosen: list[int] = np.flatnonzero(mask).tolist()
         if not chosen:
             raise OptionValueError("reset_mask selects no simulation to reset")
@@ -327,7 +329,7 @@ def _column(key: str, indices: list[int], values: list[Any], number: int) -> Any
 
 def _count(value: Any, name: str, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise OptionValueError(f"{name} must be an integer of at least {least}, not {shown(value)}")
+        raise OptionValueError(f"{name} must be an integer of at least {least}, not {short_repr(value)}")
     return int(value)
 
 
@@ -337,5 +339,5 @@ def _mode(mode: Any) -> AutoresetMode:
     except ValueError:
         raise OptionValueError(
             f"autoreset_mode must be one of {', '.join(repr(known.value) for known in AutoresetMode)}, not"
-            f" {shown(mode)}"
+            f" {short_repr(mode)}"
         ) from None

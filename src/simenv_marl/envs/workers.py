@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate
 
 from ..core.processes import pack_plainly, unpack_error
-from ..errors import OptionValueError, WorkerError, annotate, shown, told, warn_user
+from ..errors import OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 from .rows import SubEnvironments, Told
 from .worker import EXIT, Recipe, is_shareable, share_memory, shared_batch, work
 
@@ -173,7 +173,8 @@ class Workers:
             self._recipe = pack_plainly(recipe.spelt_out(common))
         except Exception as error:
             raise OptionValueError(
-                f"the simulation, its points or its options cannot be sent to another process ({told(error)}); pass a"
+                "the simulation, its points or its options cannot be sent to another process"
+                f" ({describe_error(error)}); pass a"
                 " class or a factory of a module, or workers=0"
             ) from error
         self._memory = share_memory(self._space, number, self._context)
@@ -381,8 +382,8 @@ def _context(context: Any) -> Any:
         except ValueError:
             raise OptionValueError(
                 f"context must be one of {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
-                f" of multiprocessing, not {shown(context)}"
+                f" of multiprocessing, not {short_repr(context)}"
             ) from None
     if not hasattr(context, "Process"):
-        raise OptionValueError(f"context must be a name or a context of multiprocessing, not {shown(context)}")
+        raise OptionValueError(f"context must be a name or a context of multiprocessing, not {short_repr(context)}")
     return context

@@ -1,1 +1,20 @@
-"""Experiments: contenders on the same seeds, designs, sweeps that can be resumed, and effects of factors."""
+"""Experiments: policies compared on the same seeds, designs, resumable experiments, effects, variants of a model."""
+
+from ..core.provenance import provenance
+from .designs import design
+from .effects import Effects, effects, sobol_indices
+from .evaluation import Evaluation, evaluate
+from .runs import run_experiment
+from .variants import Variant
+
+__all__ = [
+    "Effects",
+    "Evaluation",
+    "Variant",
+    "design",
+    "effects",
+    "evaluate",
+    "provenance",
+    "run_experiment",
+    "sobol_indices",
+]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.rng import is_seed
-from ..errors import OptionValueError, meant, shown
-from .extras import needed
+from ..errors import OptionValueError, did_you_mean, short_repr
+from ..many.spread import import_extra
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -107,16 +107,16 @@ def design(
         OptionValueError: A factor has no levels, the method does not exist, or it does not fit these factors and ``n``.
         MissingExtraError: pandas, pyDOE or SALib is missing.
     """
-    pandas = needed("pandas", "design")
+    pandas = import_extra("pandas", "design")
     found = _checked(factors)
     if method not in list(METHODS):
         raise OptionValueError(
-            f"method must be one of {', '.join(METHODS)}, not {shown(method)}{meant(method, METHODS)}"
+            f"method must be one of {', '.join(METHODS)}, not {short_repr(method)}{did_you_mean(method, METHODS)}"
         )
     if n is not None and (isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1):
-        raise OptionValueError(f"n must be a positive integer, not {shown(n)}")
+        raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     if seed is not None and not is_seed(seed):
-        raise OptionValueError(f"seed must be a non-negative integer or None, not {shown(seed)}")
+        raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
     columns = METHODS[method](found, None if n is None else int(n), int(seed or 0))
     series = {
         factor.name: pandas.Series(values, dtype=_dtype(factor)) for factor, values in zip(found, columns, strict=True)
@@ -127,37 +127,42 @@ def design(
 
 def _checked(factors: Any) -> list[Factor]:
     if not isinstance(factors, Mapping) or not factors:
-        raise OptionValueError(f"factors must be a dict from names to ranges or lists of levels, not {shown(factors)}")
+        raise OptionValueError(
+            f"factors must be a dict from names to ranges or lists of levels, not {short_repr(factors)}"
+        )
     return [_factor(name, given) for name, given in factors.items()]
 
 
 def _factor(name: Any, given: Any) -> Factor:
     if not isinstance(name, str) or not name:
-        raise OptionValueError(f"the name of a factor must be a string, not {shown(name)}")
+        raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
     if isinstance(given, tuple):
         numbers = [value.item() if isinstance(value, np.generic) else value for value in given]
         if len(numbers) != 2 or not all(type(value) in (int, float) and isfinite(value) for value in numbers):
             raise OptionValueError(
-                f"the factor {name!r} is {shown(given)}: a tuple is a range (low, high) of two finite numbers; levels"
+                f"the factor {name!r} is {short_repr(given)}: a tuple is a range (low, high) of two"
+                " finite numbers; levels"
                 " come as a list"
             )
         low, high = numbers
         if not low < high:
-            raise OptionValueError(f"the range of {name!r} is empty: in {shown(given)}, low must be less than high")
+            raise OptionValueError(
+                f"the range of {name!r} is empty: in {short_repr(given)}, low must be less than high"
+            )
         whole = type(low) is type(high) is int
         return Factor(name, low=low if whole else float(low), high=high if whole else float(high), whole=whole)
     if isinstance(given, (set, frozenset)):
-        raise OptionValueError(f"the levels of {name!r} must have an order, as in a list: {shown(given)} has none")
+        raise OptionValueError(f"the levels of {name!r} must have an order, as in a list: {short_repr(given)} has none")
     if isinstance(given, (str, bytes, Mapping)) or not isinstance(given, Iterable):
         raise OptionValueError(
-            f"the factor {name!r} must be a range (low, high) or a list of levels, not {shown(given)}"
+            f"the factor {name!r} must be a range (low, high) or a list of levels, not {short_repr(given)}"
         )
     levels = tuple(value.item() if isinstance(value, np.generic) else value for value in given)
     if not levels:
         raise OptionValueError(f"the factor {name!r} has no levels")
     for place, level in enumerate(levels):
         if any(level is other or (type(level) is type(other) and _same(level, other)) for other in levels[:place]):
-            raise OptionValueError(f"the factor {name!r} has the level {shown(level)} twice")
+            raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
     return Factor(name, levels)
 
 
@@ -189,7 +194,7 @@ def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Colu
         raise OptionValueError("a full factorial design takes n values of each range; n must be at least 2")
     steps = [factor.steps(n or 2) for factor in factors]
     _checked_rows(prod(map(len, steps)))
-    places = needed("pydoe", "design").fullfact([len(own) for own in reversed(steps)])[:, ::-1].astype(int)
+    places = import_extra("pydoe", "design").fullfact([len(own) for own in reversed(steps)])[:, ::-1].astype(int)
     return [[own[place] for place in column] for own, column in zip(steps, places.T.tolist(), strict=True)]
 
 
@@ -202,7 +207,7 @@ def _of_two_levels(factors: Sequence[Factor], matrix: Any) -> Columns:
 
 
 def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe, number = needed("pydoe", "design"), len(factors)
+    pydoe, number = import_extra("pydoe", "design"), len(factors)
     for factor in factors:
         factor.ends()
     least = 2 ** ceil(np.log2(number + 1))
@@ -249,7 +254,7 @@ def _extend(sums: list[set[int]], column: int) -> None:
 
 
 def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe, number = needed("pydoe", "design"), len(factors)
+    pydoe, number = import_extra("pydoe", "design"), len(factors)
     for factor in factors:
         factor.ends()
     matrix = None
@@ -267,7 +272,7 @@ def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Col
 
 
 def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe = needed("pydoe", "design")
+    pydoe = import_extra("pydoe", "design")
     ranges = [factor for factor in factors if factor.levels is None]
     if len(ranges) < 2:
         raise OptionValueError(f"a central composite design needs at least two ranges (low, high), not {len(ranges)}")
@@ -289,17 +294,17 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
 
 
 def _latin_hypercube(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    return _spread(factors, needed("pydoe", "design").lhs(len(factors), samples=_rows(n), seed=seed))
+    return _spread(factors, import_extra("pydoe", "design").lhs(len(factors), samples=_rows(n), seed=seed))
 
 
 def _sobol(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe = needed("pydoe", "design")
+    pydoe = import_extra("pydoe", "design")
     points = pydoe.sobol_sequence(_rows(n), len(factors), scramble=True, seed=seed, use_pow_of_2=False)
     return _spread(factors, points)
 
 
 def _halton(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    pydoe = needed("pydoe", "design")
+    pydoe = import_extra("pydoe", "design")
     return _spread(factors, pydoe.cranley_patterson_shift(pydoe.halton_sequence(_rows(n), len(factors)), seed=seed))
 
 
@@ -309,7 +314,7 @@ def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
         raise OptionValueError(f"the number of samples of a Saltelli design must be a power of two, not {rows}")
     _checked_rows(rows * (2 * len(names) + 2))
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
-    return _spread(factors, needed("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
+    return _spread(factors, import_extra("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
 
 
 def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionValueError, meant, shown
-from .extras import needed
+from ..errors import OptionValueError, did_you_mean, short_repr
+from ..many.spread import import_extra
 from .playing import TEAM
 from .statistics import check_confidence, interval, numbers
 
@@ -55,7 +55,7 @@ class Effects:
                 return table
             if pair == (other, one):
                 return table.T
-        raise OptionValueError(f"{shown(one)} and {shown(other)} are not two factors of {list(self.levels)}")
+        raise OptionValueError(f"{short_repr(one)} and {short_repr(other)} are not two factors of {list(self.levels)}")
 
     def plot(self, *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw the main effects of all factors and, below them, the strongest interactions.
@@ -102,7 +102,7 @@ def effects(
     Raises:
         OptionValueError: There is no such column, contender or agent, the values are not numbers, or nothing varies.
     """
-    pandas = needed("pandas", "effects")
+    pandas = import_extra("pandas", "effects")
     check_confidence(confidence)
     table, factors = _taken(frame, of, contender, agent)
     if contender is None and table["contender"].nunique() > 1:
@@ -149,11 +149,15 @@ def _taken(frame: "DataFrame", of: str, contender: str | None, agent: str) -> "t
     factors = columns[: columns.index("contender")]
     if of not in columns or of in (*factors, "contender", "seed", "agent", "status", "error"):
         values = columns[columns.index("return") : columns.index("status")]
-        raise OptionValueError(f"of={shown(of)} is not a column of numbers; these are: {values}{meant(of, values)}")
+        raise OptionValueError(
+            f"of={short_repr(of)} is not a column of numbers; these are: {values}{did_you_mean(of, values)}"
+        )
     for what, value in (("contender", contender), ("agent", agent)):
         if value is not None and value not in set(frame[what]):
             known = sorted(set(frame[what]))
-            raise OptionValueError(f"there is no {what} {shown(value)}; there are {known}{meant(value, known)}")
+            raise OptionValueError(
+                f"there is no {what} {short_repr(value)}; there are {known}{did_you_mean(value, known)}"
+            )
     chosen = (frame["agent"] == agent) & (frame["status"] == "ok")
     table = frame[chosen if contender is None else chosen & (frame["contender"] == contender)]
     if not len(table):
@@ -163,7 +167,7 @@ def _taken(frame: "DataFrame", of: str, contender: str | None, agent: str) -> "t
 
 def _levels(column: Any) -> Any:
     """Return the level of each row; numeric factors with many values are grouped into quarters."""
-    pandas = needed("pandas", "effects")
+    pandas = import_extra("pandas", "effects")
     if column.nunique() > MANY and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
         return pandas.qcut(column, GROUPS, duplicates="drop")
     return column
@@ -188,7 +192,7 @@ def _at(levels: Any, level: Any) -> NDArray[np.bool_]:
 
 def _cells(pair: tuple[str, str], levels: Any, at: Any, values: NDArray[np.float64]) -> "DataFrame":
     """Return the means of all combinations of two factors."""
-    pandas, (one, other) = needed("pandas", "effects"), pair
+    pandas, (one, other) = import_extra("pandas", "effects"), pair
     means = [[values[a & b].mean() if (a & b).any() else np.nan for b in at[other]] for a in at[one]]
     table: DataFrame = pandas.DataFrame(means, index=pandas.Index(levels[one], name=one))
     table.columns = pandas.Index(levels[other], name=other)
@@ -231,7 +235,8 @@ def sobol_indices(
         OptionValueError: The frame has another design, runs have failed, or the value is not a number or does not vary.
         MissingExtraError: SALib is missing.
     """
-    pandas, analyze = needed("pandas", "sobol_indices"), needed("SALib.analyze.sobol", "sobol_indices").analyze
+    pandas = import_extra("pandas", "sobol_indices")
+    analyze = import_extra("SALib.analyze.sobol", "sobol_indices").analyze
     check_confidence(confidence)
     table, names = _taken(frame, of, contender, agent)
     if ((frame["contender"] == contender) & (frame["status"] != "ok")).any():

@@ -12,11 +12,10 @@ from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
 from ..core.processes import pack
-from ..errors import OptionValueError, meant, shown
-from ..many.collect import check_numbers, checked_seeds
-from ..many.spread import progress_bar, spread
-from ..remote.kept import processes_kept
-from .extras import needed
+from ..core.reuse import processes_kept
+from ..errors import OptionValueError, did_you_mean, short_repr
+from ..many.simulate import check_numbers, checked_seeds
+from ..many.spread import import_extra, progress_bar, spread
 from .playing import (
     TEAM,
     Metrics,
@@ -78,7 +77,9 @@ class Evaluation:
         """
         if of not in self.frame.columns or of in ("contender", "seed", "agent"):
             known = list(self.frame.columns[3:])
-            raise OptionValueError(f"of={shown(of)} is not a column of numbers; these are: {known}{meant(of, known)}")
+            raise OptionValueError(
+                f"of={short_repr(of)} is not a column of numbers; these are: {known}{did_you_mean(of, known)}"
+            )
         team = self.frame[self.frame["agent"] == TEAM]
         names = list(dict.fromkeys(team["contender"]))
         seeds = list(dict.fromkeys(team["seed"]))
@@ -98,7 +99,7 @@ class Evaluation:
         Raises:
             OptionValueError: There is no such column.
         """
-        pandas, values, rows = needed("pandas", "summary"), numbers(self.values(of), of), {}
+        pandas, values, rows = import_extra("pandas", "summary"), numbers(self.values(of), of), {}
         for name in values.columns:
             own = values[name].to_numpy()
             rows[name] = [own.mean(), *interval(own, self.confidence)]
@@ -123,7 +124,7 @@ class Evaluation:
         Raises:
             OptionValueError: There is no baseline, or no such column.
         """
-        pandas, rows = needed("pandas", "improvement"), {}
+        pandas, rows = import_extra("pandas", "improvement"), {}
         for name, apart in self._differences(of).items():
             rows[name] = improvement(apart, self.confidence)
         table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=["probability", "low", "high"])
@@ -151,10 +152,10 @@ class Evaluation:
         if difference == 0:
             raise OptionValueError("difference must not be 0: no number of seeds is enough to detect that")
         if not 0 < power < 1:
-            raise OptionValueError(f"power must lie between 0 and 1, such as 0.8, not {shown(power)}")
+            raise OptionValueError(f"power must lie between 0 and 1, such as 0.8, not {short_repr(power)}")
         apart = self._differences(of)
         found = {name: seeds_needed(own, difference, self.confidence, power) for name, own in apart.items()}
-        counts: Series[float] = needed("pandas", "seeds_needed").Series(found, name="seeds", dtype=float)
+        counts: Series[float] = import_extra("pandas", "seeds_needed").Series(found, name="seeds", dtype=float)
         return counts.rename_axis("contender")
 
     def _differences(self, of: str) -> dict[str, NDArray[np.float64]]:
@@ -238,7 +239,7 @@ def evaluate(
         BaseException: Any exception of a model, a mapping, a policy, a metric or ``team``, with notes that name the
             contender and the seed.
     """
-    needed("pandas", "evaluate"), needed("scipy.stats", "evaluate")
+    import_extra("pandas", "evaluate"), import_extra("scipy.stats", "evaluate")
     found = checked_contenders(contenders, batched=bool(batched))
     _check(found, baseline, confidence, width, team)
     places = distinct_seeds(seeds)
@@ -359,7 +360,7 @@ def _frame(seeds: Sequence[int], outcomes: Mapping[str, Sequence[Outcome]], metr
 
 def typed(columns: Mapping[str, Sequence[Any]]) -> "DataFrame":
     """Return a table whose columns keep the types of their values. A numeric column with missing values is float."""
-    pandas = needed("pandas", "a table")
+    pandas = import_extra("pandas", "a table")
     table: DataFrame = pandas.DataFrame(
         {name: pandas.Series(values, dtype=_dtype(values)) for name, values in columns.items()}
     )
@@ -407,12 +408,12 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: An
         raise OptionValueError("contenders must be a dict, such as {'rule': {}}, but there are none")
     if baseline is not None and baseline not in list(contenders):
         raise OptionValueError(
-            f"the baseline {shown(baseline)} is not one of the contenders:"
-            f" {', '.join(contenders)}{meant(baseline, contenders)}"
+            f"the baseline {short_repr(baseline)} is not one of the contenders:"
+            f" {', '.join(contenders)}{did_you_mean(baseline, contenders)}"
         )
     check_confidence(confidence)
     if width is not None:
         check_number("width", width)
         if width <= 0:
-            raise OptionValueError(f"width must be positive, not {shown(width)}")
+            raise OptionValueError(f"width must be positive, not {short_repr(width)}")
     checked_team(team)

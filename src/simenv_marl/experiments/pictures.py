@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ..many.plots import ABSENT, COLOURS, INK, PALE, style
+from ..data.plots import ABSENT, COLOURS, INK, PALE, style
 
 if TYPE_CHECKING:
     from pandas import DataFrame

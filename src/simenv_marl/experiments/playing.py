@@ -13,11 +13,11 @@ from ..core.agent import Agent
 from ..core.episode import Episode, When
 from ..core.plan import Plan
 from ..core.session import Session
+from ..data.collect import learners_plan
 from ..decision import decision_points
-from ..errors import AgentError, OptionValueError, UnknownPointError, annotate, close_after, shown, warn_user
+from ..errors import AgentError, OptionValueError, UnknownPointError, annotate, close_after, short_repr, warn_user
 from ..hooks.stacks import outside_simulation
 from ..many.batch import Group, run, takes_identities
-from ..many.collect import learners_plan
 from ..simulation import RULE
 
 TEAM: Final = "team"
@@ -95,7 +95,7 @@ def checked_team(team: Any) -> None:
         OptionValueError: It is not a callable or None.
     """
     if team is not None and not callable(team):
-        raise OptionValueError(f"team must be a callable of the returns, or None, not {shown(team)}")
+        raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
 
 
 def team_value(team: Callable[[Returns], Any] | None, returns: Mapping[str, float]) -> float:
@@ -110,7 +110,7 @@ def team_value(team: Callable[[Returns], Any] | None, returns: Mapping[str, floa
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise OptionValueError(f"team must return a number, not {shown(value)}") from None
+        raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
 
 
 # -- what is checked before anything runs ---------------------------------------------------------
@@ -128,21 +128,24 @@ def checked_contenders(contenders: Any, what: str = "contenders", *, batched: bo
         OptionValueError: These are not contenders.
     """
     if not isinstance(contenders, Mapping):
-        raise OptionValueError(f"{what} must be a dict from a name to policies, not {shown(contenders)}")
+        raise OptionValueError(f"{what} must be a dict from a name to policies, not {short_repr(contenders)}")
     for name, policies in contenders.items():
         if not isinstance(name, str) or not name:
-            raise OptionValueError(f"the name of a contender must be a string, not {shown(name)}")
+            raise OptionValueError(f"the name of a contender must be a string, not {short_repr(name)}")
         if not isinstance(policies, Mapping):
             raise OptionValueError(
                 f"the contender {name!r} must be a dict from agents or points to policies, {{}} for the model as it is,"
-                f" not {shown(policies)}"
+                f" not {short_repr(policies)}"
             )
         for key, policy in policies.items():
             if policy is not RULE and not callable(policy):
-                raise OptionValueError(f"the policy of {shown(key)} in {name!r} must be callable, not {shown(policy)}")
+                raise OptionValueError(
+                    f"the policy of {short_repr(key)} in {name!r} must be callable, not {short_repr(policy)}"
+                )
             if not batched and policy is not RULE and takes_identities(policy):
                 raise OptionValueError(
-                    f"the policy of {shown(key)} in {name!r}, {shown(policy)}, answers many decisions at once, as"
+                    f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)}, answers many"
+                    " decisions at once, as"
                     " mixtures do; pass batched=True, and only policies as simulate_many takes them"
                 )
     return dict(contenders)
@@ -164,7 +167,7 @@ def checked_metrics(metric: Any, taken: Sequence[str] = ()) -> dict[str, Callabl
     for name, function in metrics.items():
         if not isinstance(name, str) or not callable(function):
             raise OptionValueError(
-                f"metric must be a callable of the simulation, or a dict of them, not {shown(metric)}"
+                f"metric must be a callable of the simulation, or a dict of them, not {short_repr(metric)}"
             )
         if name in COLUMNS or name in taken:
             raise OptionValueError(f"the metric {name!r} has the name of another column; rename it")
@@ -291,7 +294,7 @@ def _plain(name: str, value: Any) -> Any:
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
         value = value.item()
     if value is not None and type(value) not in (bool, int, float, str):
-        raise OptionValueError(f"the metric {name!r} must be a number, a string or None, not {shown(value)}")
+        raise OptionValueError(f"the metric {name!r} must be a number, a string or None, not {short_repr(value)}")
     return value
 
 

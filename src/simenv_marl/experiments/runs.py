@@ -16,12 +16,11 @@ import numpy as np
 from ..core.options import EpisodeOptions
 from ..core.points import Points
 from ..core.processes import pack
-from ..errors import OptionValueError, SimEnvError, StoreError, shown, told
-from ..many.collect import check_numbers
-from ..many.spread import progress_bar, spread
-from ..remote.kept import processes_kept
+from ..core.reuse import processes_kept
+from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
+from ..many.simulate import check_numbers
+from ..many.spread import import_extra, progress_bar, spread
 from .evaluation import distinct_seeds, rows_of, typed
-from .extras import needed
 from .playing import (
     COLUMNS,
     TEAM,
@@ -124,7 +123,7 @@ def run_experiment(
         MissingExtraError: pandas, joblib or tqdm is missing.
         SimEnvError: Something else cannot work. The subclass tells what.
     """
-    needed("pandas", "run_experiment")
+    import_extra("pandas", "run_experiment")
     contenders = _contenders(policies, batched=bool(batched))
     table, rows = checked_design(design)
     metrics, size = checked_metrics(metric, list(table.columns)), int(batch_size) if batched else 0
@@ -208,15 +207,17 @@ def checked_design(design: Any) -> "tuple[DataFrame, list[Row]]":
     Raises:
         OptionValueError: It is not a design.
     """
-    pandas = needed("pandas", "a design")
+    pandas = import_extra("pandas", "a design")
     try:
         table = design if isinstance(design, pandas.DataFrame) else pandas.DataFrame(design)
     except (TypeError, ValueError) as error:
-        raise OptionValueError(f"design must be a DataFrame, or data to make one from, not {shown(design)}") from error
+        raise OptionValueError(
+            f"design must be a DataFrame, or data to make one from, not {short_repr(design)}"
+        ) from error
     names = list(table.columns)
     for name in names:
         if not isinstance(name, str):
-            raise OptionValueError(f"the name of a factor must be a string, not {shown(name)}")
+            raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
         if name in COLUMNS:
             raise OptionValueError(f"the factor {name!r} has the name of another column of the table; rename it")
         if names.count(name) > 1:
@@ -232,7 +233,8 @@ def _plain(name: str, value: Any) -> Any:
         value = value.item()
     if value is not None and type(value) not in (bool, int, float, str):
         raise OptionValueError(
-            f"the factor {name!r} has the value {shown(value)}, which cannot be stored: factors are numbers, strings,"
+            f"the factor {name!r} has the value {short_repr(value)}, which cannot be stored: factors"
+            " are numbers, strings,"
             " bools or None. Use a name as the value, and look it up in make"
         )
     return value
@@ -242,7 +244,7 @@ def _folder(store: Any) -> Path:
     try:
         return Path(store).absolute()  # other processes may have another working directory
     except TypeError as error:
-        raise OptionValueError(f"store must be the path of a folder, not {shown(store)}") from error
+        raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
 
 
 def _try(workshop: Workshop, rows: Sequence[Row], contenders: Iterable[str]) -> tuple[str, dict[str, dict[str, Any]]]:
@@ -362,7 +364,7 @@ def _do_one(workshop: Workshop, run: Run, metrics: Metrics, size: int, writer: W
     except BaseException as error:
         if not _is_failure(error):
             raise
-        known, trace = Known(None, told(error)), "".join(traceback.format_exception(error))[-LONGEST_TRACE:]
+        known, trace = Known(None, describe_error(error)), "".join(traceback.format_exception(error))[-LONGEST_TRACE:]
         workshop.forget()
     writer.write(line_of(run.row, run.contender, run.seed, known, provenance(run.seed), trace))
 
@@ -414,7 +416,7 @@ def _frame(
     team: Any,
 ) -> "DataFrame":
     """Return the table of all runs, in the order of the design, the contenders and the seeds."""
-    pandas = needed("pandas", "run_experiment")
+    pandas = import_extra("pandas", "run_experiment")
     places: list[int] = []
     columns: dict[str, list[Any]] = {name: [] for name in (*COLUMNS[:5], *metrics, *COLUMNS[5:])}
     for place, key in enumerate(keys):
@@ -440,7 +442,7 @@ def _rows(known: Known, contender: str, seed: int, metrics: Sequence[str], team:
     try:
         rows = rows_of(known.outcome, team)
     except Exception as error:  # raised by team=, which is called for stored runs, too
-        yield from _rows(Known(None, told(error)), contender, seed, metrics, team)
+        yield from _rows(Known(None, describe_error(error)), contender, seed, metrics, team)
         return
     measured = [known.outcome.metrics.get(name) for name in metrics]
     for agent, value, length in rows:

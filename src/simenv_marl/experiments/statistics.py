@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionValueError, shown
-from .extras import needed
+from ..errors import OptionValueError, short_repr
+from ..many.spread import import_extra
 
 RESAMPLES: Final = 5_000
 """The number of bootstrap samples for an interval; always the same samples, for reproducible intervals."""
@@ -32,7 +32,7 @@ def check_number(name: str, value: Any) -> None:
         OptionValueError: It is not.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not isfinite(value):
-        raise OptionValueError(f"{name} must be a finite number, not {shown(value)}")
+        raise OptionValueError(f"{name} must be a finite number, not {short_repr(value)}")
 
 
 def check_confidence(confidence: Any) -> None:
@@ -43,7 +43,7 @@ def check_confidence(confidence: Any) -> None:
     """
     check_number("confidence", confidence)
     if not 0 < confidence < 1:
-        raise OptionValueError(f"confidence must lie between 0 and 1, such as 0.95, not {shown(confidence)}")
+        raise OptionValueError(f"confidence must lie between 0 and 1, such as 0.95, not {short_repr(confidence)}")
 
 
 def numbers(values: Any, of: str) -> Any:
@@ -59,7 +59,7 @@ def numbers(values: Any, of: str) -> Any:
     try:
         return values.astype(np.float64)
     except (TypeError, ValueError):
-        raise OptionValueError(f"of={shown(of)} is not a column of numbers") from None
+        raise OptionValueError(f"of={short_repr(of)} is not a column of numbers") from None
 
 
 def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:
@@ -72,7 +72,7 @@ def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, flo
     Returns:
         The bounds; nan if there are fewer than two values, or one that is not finite.
     """
-    stats = needed("scipy.stats", "an interval")
+    stats = import_extra("scipy.stats", "an interval")
     values = np.asarray(values, np.float64)
     if len(values) < 2 or not np.isfinite(values).all():
         return nan, nan
@@ -110,7 +110,7 @@ def seeds_needed(differences: NDArray[np.float64], difference: float, confidence
     Returns:
         The number, at least 2; infinity if it is too large, nan if there are fewer than two differences.
     """
-    stats = needed("scipy.stats", "the number of seeds")
+    stats = import_extra("scipy.stats", "the number of seeds")
     if len(differences) < 2 or not np.isfinite(differences).all():
         return nan
     ratio = float(np.std(differences, ddof=1)) / abs(difference)

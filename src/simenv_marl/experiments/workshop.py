@@ -12,10 +12,10 @@ from typing import Any, Final, NamedTuple
 from ..core.drivers import Spare
 from ..core.plan import Plan
 from ..core.provenance import describe, written_plainly
-from ..core.variant import Variant
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, short_repr
 from .playing import Policies, contender_plan, telling
 from .store import written
+from .variants import Variant
 
 Row = Mapping[str, Any]
 
@@ -37,12 +37,12 @@ def checked_make(make: Any, row: Row) -> None:
         return
     if not callable(make) or (hasattr(make, "run") and not isinstance(make, type)):
         raise OptionValueError(
-            f"make must be a callable of the factors, such as a class, or a Variant, not {shown(make)}"
+            f"make must be a callable of the factors, such as a class, or a Variant, not {short_repr(make)}"
         )
     try:
         inspect.signature(make).bind(**row)
     except TypeError as error:
-        name = getattr(make, "__qualname__", None) or shown(make)
+        name = getattr(make, "__qualname__", None) or short_repr(make)
         raise OptionValueError(
             f"{name} cannot be called with the factors {', '.join(row) or '(none)'}: {error}"
         ) from error
@@ -121,7 +121,7 @@ class Workshop:
     def _used_again(self, drawn: list[_Drawn], source: Any, variant: Variant | None) -> tuple[Plan, str] | None:
         if not drawn:
             return None
-        factory = source if variant is None else variant.applied(None, {})[0]
+        factory = source if variant is None else variant.environment_arguments(None, {})[0]
         spare = Spare(factory, drawn[0].plan.options.driver)
         of = _depended_on(spare.simulation, variant)
         for plan, known, base in drawn:

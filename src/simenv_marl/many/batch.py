@@ -20,15 +20,15 @@ from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.bound import BoundPoint, DeferredPolicy
 from ..core.episode import Episode, When
 from ..core.plan import Plan
+from ..core.reuse import processes_kept
 from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.spaces import duplicate
 from ..core.stacking import rows, stacker
 from ..core.together import step_all
 from ..decision import DecisionPoint
-from ..errors import InvalidActionError, annotate, shown
+from ..errors import InvalidActionError, annotate, short_repr
 from ..hooks.stacks import outside_simulation
-from ..remote.kept import processes_kept
 from ..simulation import RULE, positional
 
 # -- who is asked ---------------------------------------------------------------------------------
@@ -207,7 +207,7 @@ class Group:
                 answers, extras = answers
             actions = [RULE] * len(waiting) if answers is RULE else rows(answers, integers=self._discrete)
             if actions is None or len(actions) != len(waiting):
-                returned = shown(answers) if actions is None else f"{len(actions)} actions"
+                returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
                 raise InvalidActionError(
                     f"{asked!r} was asked for {len(waiting)} decisions at once and returned {returned}; it must return"
                     " one action for each row of the observations, in their order"
@@ -419,7 +419,8 @@ class _Batches:
             except BaseException as problem:
                 annotate(
                     error,
-                    f"simenv_marl: unwinding the simulation of seed {self._seeds[place]} raised {shown(problem)} as"
+                    f"simenv_marl: unwinding the simulation of seed {self._seeds[place]} raised"
+                    f" {short_repr(problem)} as"
                     " well",
                 )
         self._sessions.clear()

@@ -1,15 +1,20 @@
-"""Policies in the model: one simulation runs its own loop, and policies answer its decisions."""
+"""Policies in the model: simulations run their own loops, and policies answer their decisions."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from typing import Any, Unpack
+
+import numpy as np
 
 from ..core.episode import When
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
+from ..core.reuse import processes_kept
 from ..core.session import Session, checked_seed
-from ..errors import close_after
-from ..remote.kept import processes_kept
+from ..errors import OptionValueError, close_after, short_repr
+from .batch import policy_keys, run
+from .spread import progress_bar, spread
 
 
 def simulate(
@@ -48,3 +53,152 @@ def simulate(
             raise
         session.close()
     return session.simulation
+
+
+def simulate_many(
+    simulation: Any,
+    policies: Mapping[Any, Any] | None = None,
+    *,
+    seeds: Iterable[int],
+    points: Points = None,
+    collect: Callable[[Any], Any] | None = None,
+    batch_size: int = 1024,
+    workers: int = 0,
+    progress: bool = False,
+    **options: Unpack[EpisodeOptions],
+) -> list[Any]:
+    """Run one simulation per seed, with policies that answer the decisions of many simulations in batches.
+
+    Each simulation ends as it would end with ``simulate`` and the same policies. The results do not depend on
+    ``batch_size`` and ``workers``, as long as a policy's answer to one row does not depend on the other rows.
+
+    Args:
+        simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
+        policies: The policies: a dict from an agent or a decision point to a callable. The callable gets the
+            observations of all decisions that wait for it; or the observations and the infos; or the observations, the
+            infos and the identities. Observations are stacked, ``(batch, *shape)``; for a ``Dict`` or ``Tuple`` space
+            they are a dict or a tuple of stacks. The infos are a list of dicts. The identities are a list of pairs: the
+            seed of the episode, and the number of the decision among all decisions of the episode. The callable returns
+            as many actions, in the same order: an array, something that NumPy can convert to one (a tensor), a
+            sequence, or a dict of these. ``RULE`` in place of one action, or of all, leaves the decision to the model.
+            A tuple of actions and a dict is allowed; the dict is ignored here (see ``collect_episodes``). If several
+            keys have the same policy object, their decisions share batches. One batch never mixes different spaces. The
+            policies of a ``Variant`` answer one decision at a time.
+        seeds: The seeds of the simulations, non-negative integers.
+        points: The decision points, as ``generate_env`` takes them. With neither ``points`` nor ``policies``, there are
+            no decision points and the plain models run.
+        collect: A callable of a simulation that has just ended. It returns what to keep of it. None: keep the
+            simulation itself.
+        batch_size: The largest number of simulations that are suspended together, in each worker process. At most 256
+            are suspended while the policies take less time than the simulations.
+        workers: The number of worker processes, which ``joblib`` runs. 0: this process alone. -1: as many as joblib's
+            backend has. The simulation, points, policies, options and collected values must be picklable, by reference
+            or by value.
+        progress: Whether to show a progress bar, by ``tqdm``.
+        **options: The options of ``simulate``.
+
+    Returns:
+        The collected value of each seed, in the order of the seeds.
+
+    Raises:
+        OptionValueError: An argument has an invalid value.
+        InvalidActionError: A policy did not return one legal action for each decision.
+        MissingExtraError: joblib or tqdm is missing.
+        SimEnvError: Something else cannot work. The subclass tells what.
+        BaseException: Any exception of a model, a mapping, a policy or ``collect``, with a note that names the seed.
+            All other simulations are unwound first.
+    """
+    checked = checked_seeds(seeds)
+    check_numbers(batch_size, workers)
+    check_collect(collect)
+    arguments = (simulation, checked_policies(policies), points, collect, int(batch_size), options)
+    # The plan is made here even if workers do the work: errors show up before any work starts.
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unanswered=True)
+    with progress_bar(len(checked)) if progress else nullcontext() as bar:
+        if not workers or not checked:
+            return _simulate(plan, collect, int(batch_size), checked, bar)
+        results: list[Any] = []
+        for number, part in spread(_simulate_part, arguments, checked, int(workers), int(batch_size)):
+            results += part
+            if bar is not None:
+                bar.update(number)
+        return results
+
+
+def _simulate_part(
+    simulation: Any,
+    policies: Mapping[Any, Any],
+    points: Any,
+    collect: Callable[[Any], Any] | None,
+    batch_size: int,
+    options: dict[str, Any],
+    seeds: list[int],
+) -> list[Any]:
+    """Simulate a part of the seeds, in a worker process."""
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unanswered=True)
+    return _simulate(plan, collect, batch_size, seeds, None)
+
+
+def _simulate(
+    plan: Plan, collect: Callable[[Any], Any] | None, batch_size: int, seeds: list[int], bar: Any
+) -> list[Any]:
+    results: list[Any] = [None] * len(seeds)
+
+    def finish(place: int, simulation: Any) -> None:
+        results[place] = simulation if collect is None else collect(simulation)
+        if bar is not None:
+            bar.update()
+
+    run(plan, seeds, batch_size, finish)
+    return results
+
+
+def checked_seeds(seeds: Any) -> list[int]:
+    """Return seeds as a list of Python integers.
+
+    Raises:
+        OptionValueError: These are not valid seeds.
+    """
+    if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
+        raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {short_repr(seeds)}")
+    checked = []
+    for seed in seeds:
+        if seed is None:
+            raise OptionValueError("seeds must be integers, not None: an unknown seed could not be repeated")
+        checked.append(checked_seed(seed))
+    return checked  # type: ignore[return-value]
+
+
+def checked_policies(policies: Any) -> Mapping[Any, Any]:
+    """Return policies as a mapping.
+
+    Raises:
+        OptionValueError: They are not a mapping.
+    """
+    if policies is not None and not isinstance(policies, Mapping):
+        raise OptionValueError(
+            f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
+        )
+    return policies or {}
+
+
+def check_collect(collect: Any) -> None:
+    """Check the argument ``collect``.
+
+    Raises:
+        OptionValueError: It is not a callable.
+    """
+    if collect is not None and not callable(collect):
+        raise OptionValueError(f"collect must be a callable of a simulation, or None, not {short_repr(collect)}")
+
+
+def check_numbers(batch_size: Any, workers: Any) -> None:
+    """Check ``batch_size`` and ``workers``.
+
+    Raises:
+        OptionValueError: One of the numbers is invalid.
+    """
+    for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+            what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"
+            raise OptionValueError(f"{name} must be {what}, not {short_repr(value)}")

@@ -7,12 +7,34 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from math import ceil
 from types import FunctionType
 from typing import Any, Final
 
 from ..core.processes import pack, pack_error, unpack, unpack_error
-from .extras import needed
+from ..errors import MissingExtraError
+
+EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots"}
+"""The extra that installs a package. All other packages belong to ``experiments``."""
+
+
+def import_extra(module: str, feature: str) -> Any:
+    """Import a module that an extra installs.
+
+    Args:
+        module: The dotted name of the module.
+        feature: The feature that needs it, for the error message.
+
+    Raises:
+        MissingExtraError: The module is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        extra = EXTRAS.get(package, "experiments")
+        raise MissingExtraError(f"{feature} needs {package}: install simenv-marl[{extra}] ({error})") from None
 
 
 def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
@@ -26,7 +48,7 @@ def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
     Raises:
         MissingExtraError: tqdm is not installed.
     """
-    return needed("tqdm.auto", "progress=True", extra="many").tqdm(total=total, unit=unit, initial=done)
+    return import_extra("tqdm.auto", "progress=True").tqdm(total=total, unit=unit, initial=done)
 
 
 def spread(
@@ -55,7 +77,7 @@ def spread(
         WorkerError: An error in a worker could not be sent here as itself.
         BaseException: Any exception of the function.
     """
-    joblib = needed("joblib", f"workers={workers}", extra="many")
+    joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
     size = max(1, ceil(len(seeds) / (share * processes)), min(least, ceil(len(seeds) / processes)))
     parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]

@@ -9,3 +9,14 @@ Each module imports only from those below it::
     lookahead       the horizon and discount of a try, and its return
     players         the deciding agent in a branch, in each view
 """
+
+from .policy import RolloutPolicy
+from .tree import TreeSearchPolicy
+from .values import ActionValues, action_values
+
+__all__ = [
+    "ActionValues",
+    "RolloutPolicy",
+    "TreeSearchPolicy",
+    "action_values",
+]

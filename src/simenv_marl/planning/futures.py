@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..branching import branch
-from ..errors import BranchError, annotate, shown, warn_user
+from ..core.branching import branch
+from ..errors import BranchError, annotate, short_repr, warn_user
 from ..many.spread import progress_bar
 from .lookahead import Lookahead
 from .players import player_of
@@ -117,7 +117,9 @@ class Futures:
         try:
             return self._look.play(twin, actions)
         except BaseException as error:
-            annotate(error, f"simenv_marl: while {', '.join(map(shown, actions))} was tried out in future {future}")
+            annotate(
+                error, f"simenv_marl: while {', '.join(map(short_repr, actions))} was tried out in future {future}"
+            )
             raise
 
     def seeds(self, number: int) -> list[int]:

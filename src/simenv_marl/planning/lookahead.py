@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..core.asking import PLANNING
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, short_repr
 from ..simulation import RULE
 from .players import Player, player_of
 
@@ -36,18 +36,18 @@ class Lookahead:
     def __post_init__(self) -> None:
         for name in ("horizon_by", "discount_by"):
             if getattr(self, name) not in UNITS:
-                raise OptionValueError(f'{name} must be "decision" or "time", not {shown(getattr(self, name))}')
+                raise OptionValueError(f'{name} must be "decision" or "time", not {short_repr(getattr(self, name))}')
         if not is_count(self.futures):
-            raise OptionValueError(f"futures must be a positive integer, not {shown(self.futures)}")
+            raise OptionValueError(f"futures must be a positive integer, not {short_repr(self.futures)}")
         horizon, timed = self.horizon, self.horizon_by == "time"
         if horizon is not None and not (is_number(horizon) and horizon > 0 if timed else is_count(horizon)):
             kind = "a positive time" if timed else "a number of decisions, 1 or more,"
-            raise OptionValueError(f"horizon must be {kind} or None, not {shown(horizon)}")
+            raise OptionValueError(f"horizon must be {kind} or None, not {short_repr(horizon)}")
         if not (is_number(self.discount) and 0 <= self.discount <= 1):
-            raise OptionValueError(f"discount must be a number from 0 to 1, not {shown(self.discount)}")
+            raise OptionValueError(f"discount must be a number from 0 to 1, not {short_repr(self.discount)}")
         if self.terminal_value is not None and not callable(self.terminal_value):
             raise OptionValueError(
-                f"terminal_value must be a callable of the environment, not {shown(self.terminal_value)}"
+                f"terminal_value must be a callable of the environment, not {short_repr(self.terminal_value)}"
             )
 
     def check(self, player: Player) -> None:
@@ -103,7 +103,7 @@ class Lookahead:
             if isinstance(rest, np.ndarray) and rest.size == 1:
                 rest = rest.item()
             if not is_number(rest):
-                raise OptionValueError(f"terminal_value must return a finite number, not {shown(rest)}")
+                raise OptionValueError(f"terminal_value must return a finite number, not {short_repr(rest)}")
             brought[-1] += float(rest) * self.discount ** (now - began if self.discount_by == "time" else decided)
         return brought
 

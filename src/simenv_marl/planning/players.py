@@ -17,8 +17,17 @@ from ..core.agent import Agent
 from ..core.asking import AskingPolicy, base_of
 from ..core.roster import two_arguments
 from ..core.spaces import duplicate
-from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv, View
-from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, ViewError, meant, shown
+from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
+from ..envs.base import View
+from ..errors import (
+    EpisodeOverError,
+    InvalidActionError,
+    OptionValueError,
+    UnknownAgentError,
+    ViewError,
+    did_you_mean,
+    short_repr,
+)
 from ..simulation import RULE
 
 
@@ -71,17 +80,21 @@ class Player:
         if actions is None:
             space = self.space
             if not isinstance(space, spaces.Discrete):
-                raise OptionValueError(f"actions=None needs a Discrete action space; list candidates of {shown(space)}")
+                raise OptionValueError(
+                    f"actions=None needs a Discrete action space; list candidates of {short_repr(space)}"
+                )
             actions, legal = range(int(space.start), int(space.start + space.n)), True
         try:
             listed = [] if isinstance(actions, (str, Mapping)) else list(actions)
         except TypeError:
             listed = []
         if not listed:
-            raise OptionValueError(f"actions must be a list of candidates, not {shown(actions)}")
+            raise OptionValueError(f"actions must be a list of candidates, not {short_repr(actions)}")
         found = [action for action in listed if not (legal and self._is_masked(action))]
         if not found:
-            raise InvalidActionError(f"all candidates of {self.agent!r} are masked; its mask is {shown(self.own.mask)}")
+            raise InvalidActionError(
+                f"all candidates of {self.agent!r} are masked; its mask is {short_repr(self.own.mask)}"
+            )
         for action in found:
             if action is not RULE:
                 self._check(action)
@@ -93,9 +106,13 @@ class Player:
         elif (
             self.own.point.check if self.space == self.own.point.definition.action_space else action_check(self.space)
         )(action) is ILLEGAL:
-            raise InvalidActionError(f"the action {shown(action)} of {self.agent!r} is not in {shown(self.space)}")
+            raise InvalidActionError(
+                f"the action {short_repr(action)} of {self.agent!r} is not in {short_repr(self.space)}"
+            )
         elif self._is_masked(action):
-            raise InvalidActionError(f"the action {shown(action)} is masked; the mask is {shown(self.own.mask)}")
+            raise InvalidActionError(
+                f"the action {short_repr(action)} is masked; the mask is {short_repr(self.own.mask)}"
+            )
 
     def _is_masked(self, action: Any) -> bool:
         """Return whether the mask forbids an action; wrappers may have replaced the space of the mask."""
@@ -115,12 +132,13 @@ class Player:
         base = self.base
         for policy in base.values() if isinstance(base, Mapping) else [base]:
             if policy is not RULE and not callable(policy):
-                raise OptionValueError(f"base must be RULE, a policy, or policies by agent, not {shown(base)}")
+                raise OptionValueError(f"base must be RULE, a policy, or policies by agent, not {short_repr(base)}")
         for name in base if isinstance(base, Mapping) else ():
             if not self._may_be(name):
                 known = [*self.episode.agents, *self.episode.answered]
                 raise UnknownAgentError(
-                    f"base names {shown(name)}, which is not an agent here; the agents are: {known}{meant(name, known)}"
+                    f"base names {short_repr(name)}, which is not an agent here; the agents are:"
+                    f" {known}{did_you_mean(name, known)}"
                 )
 
     def _may_be(self, name: Any) -> bool:
@@ -385,6 +403,6 @@ def player_of(env: Any, base: Any) -> Player:
     """
     view = getattr(env, "unwrapped", env)
     if not isinstance(view, View):
-        raise ViewError(f"planning needs an environment of one simulation, not {shown(env)}")
+        raise ViewError(f"planning needs an environment of one simulation, not {short_repr(env)}")
     view.check_pending()
     return next(made for kind, made in PLAYERS.items() if isinstance(view, kind))(env, base)

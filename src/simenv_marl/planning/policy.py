@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core.session import checked_seed
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, short_repr
 from ..simulation import RULE
 from .futures import Futures
 from .lookahead import Lookahead, is_count, within_a_branch
@@ -65,7 +65,7 @@ class RolloutPolicy:
             OptionValueError: An argument has an invalid value.
         """
         if budget is not None and not is_count(budget):
-            raise OptionValueError(f"budget must be a number of branches or None, not {shown(budget)}")
+            raise OptionValueError(f"budget must be a number of branches or None, not {short_repr(budget)}")
         self._look = Lookahead(
             base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
             discount=discount, discount_by=discount_by, method=method, time_limit=time_limit,

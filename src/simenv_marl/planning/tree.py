@@ -3,7 +3,7 @@
 from math import inf, log, sqrt
 from typing import Any, Final
 
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, short_repr
 from .futures import Futures
 from .lookahead import is_count, is_number
 from .policy import RolloutPolicy
@@ -40,9 +40,9 @@ class TreeSearchPolicy(RolloutPolicy):
             OptionValueError: An argument has an invalid value.
         """
         if not is_count(depth):
-            raise OptionValueError(f"depth must be a number of decisions, not {shown(depth)}")
+            raise OptionValueError(f"depth must be a number of decisions, not {short_repr(depth)}")
         if not is_number(exploration) or exploration < 0:
-            raise OptionValueError(f"exploration must be a number that is not negative, not {shown(exploration)}")
+            raise OptionValueError(f"exploration must be a number that is not negative, not {short_repr(exploration)}")
         super().__init__(actions, **options)
         self._depth, self._exploration = int(depth), float(exploration)
 

@@ -9,3 +9,11 @@
     child      the process: starting it, waiting for it, ending it; its lines
     wire       lines and frames
 """
+
+from .callbacks import CallbackGuard
+from .process import ProcessSimulation
+
+__all__ = [
+    "CallbackGuard",
+    "ProcessSimulation",
+]

@@ -11,7 +11,7 @@ from functools import partial
 from subprocess import DEVNULL, PIPE, TimeoutExpired, run
 from typing import Any, Final
 
-from ..errors import ProcessDiedError, ProcessError, ProcessTimeoutError, shown
+from ..errors import ProcessDiedError, ProcessError, ProcessTimeoutError, short_repr
 from .child import Child
 from .wire import DESCRIPTORS, LONGEST, STOP, encode
 
@@ -160,14 +160,14 @@ class _Check:
                 return frames
             if "decide" not in frame:
                 if "error" in frame:
-                    child.fail(ProcessError(f"it has sent {shown(frame)}"))
+                    child.fail(ProcessError(f"it has sent {short_repr(frame)}"))
                 if not {"remove", "update"} & frame.keys():
-                    child.fail(ProcessError(f"it sent {shown(frame)}, which is not a frame of the wire"))
+                    child.fail(ProcessError(f"it sent {short_repr(frame)}, which is not a frame of the wire"))
                 child.check_named(frame, frame.get("update", frame.get("remove")))
                 continue
             number += 1
             if type(frame["decide"]) is not int or frame["decide"] != number:
-                child.fail(ProcessError(f"call {number} was due, but it sent {shown(frame)}"))
+                child.fail(ProcessError(f"call {number} was due, but it sent {short_repr(frame)}"))
             child.check_named(frame, frame.get("entity"))
             if number == stop or number == self._most:
                 child.send(STOP)
@@ -194,7 +194,10 @@ class _Check:
                 return WRONG, "it asked for no decision"
             if "end" not in self._first[-1]:
                 return NOTE, f"it was stopped after {self._most} decisions ({told})"
-            return OK, f"{self._decisions} decisions ({told}), result {shown(self._first[-1]['end'].get('result'))}"
+            return (
+                OK,
+                f"{self._decisions} decisions ({told}), result {short_repr(self._first[-1]['end'].get('result'))}",
+            )
 
     def _two(self) -> tuple[str, str]:
         with self._child() as child:
@@ -213,7 +216,7 @@ class _Check:
     def _compared(self, frames: list[Any]) -> tuple[str, str]:
         for number, (one, other) in enumerate(zip(self._first, frames, strict=False)):
             if one != other:
-                return WRONG, f"frame {number} is {shown(other)}, and in a new process it was {shown(one)}"
+                return WRONG, f"frame {number} is {short_repr(other)}, and in a new process it was {short_repr(one)}"
         if len(frames) != len(self._first):
             return WRONG, f"it sent {len(frames)} frames, and in a new process {len(self._first)}"
         return OK, "the same as in a new process"
@@ -257,15 +260,15 @@ class _Check:
             except ProcessDiedError:
                 return OK, "it ends"
             if "error" in frame:
-                return OK, f"it sends the error {shown(frame['error'])}"
-            return WRONG, f"it continues with {shown(frame)}"
+                return OK, f"it sends the error {short_repr(frame['error'])}"
+            return WRONG, f"it continues with {short_repr(frame)}"
 
     def _idle(self) -> tuple[str, str]:
         with self._child() as child:
             self._play(child)
             child.close_input()
             try:
-                return WRONG, f"it sends {shown(child.receive())}"
+                return WRONG, f"it sends {short_repr(child.receive())}"
             except ProcessTimeoutError:
                 return WRONG, f"it does not end within {self._timeout:g} s"
             except ProcessDiedError:

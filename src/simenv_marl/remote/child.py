@@ -24,8 +24,8 @@ from ..errors import (
     SimEnvError,
     WireError,
     WrongThreadError,
-    shown,
-    told,
+    describe_error,
+    short_repr,
     warn_user,
 )
 from .wire import DESCRIPTORS, LONGEST, VERSION, decode
@@ -189,7 +189,7 @@ class Child:
         try:
             self._process = _Process(command, os.environ if env is None else env, cwd)
         except (OSError, ValueError) as error:
-            raise ProcessDiedError(f"{command[0]!r} cannot be started: {told(error)}") from error
+            raise ProcessDiedError(f"{command[0]!r} cannot be started: {describe_error(error)}") from error
         self._finalizer = finalize(self, self._process.end, GRACE)
         self._name = f"the process {self._process.number} ({command[0]})"
         self._poll = select.poll()
@@ -202,11 +202,13 @@ class Child:
             raise
         version, points, can = hello.get("hello"), hello.get("points"), hello.get("can", [])
         if version is None:
-            self.refuse(hello, f"began with {shown(hello)}, not with a hello")
+            self.refuse(hello, f"began with {short_repr(hello)}, not with a hello")
         if type(version) is not int or version != VERSION:
-            self.fail(WireError(f"{self} speaks version {shown(version)} of the wire; this is version {VERSION}"))
+            self.fail(WireError(f"{self} speaks version {short_repr(version)} of the wire; this is version {VERSION}"))
         if not _are_strings(points) or not _are_strings(can):
-            self.fail(WireError(f'{self} has said {shown(hello)}; its "points" and "can" must be lists of strings'))
+            self.fail(
+                WireError(f'{self} has said {short_repr(hello)}; its "points" and "can" must be lists of strings')
+            )
         self.points: frozenset[str] = frozenset(points)
         self.can: frozenset[str] = frozenset(can)
 
@@ -260,7 +262,7 @@ class Child:
         """
         if self._rest or self._process.reading in dict(self._poll.poll(0)):
             frame = self.receive()
-            self.refuse(frame, f"has sent {shown(frame)} before the start of an episode")
+            self.refuse(frame, f"has sent {short_repr(frame)} before the start of an episode")
 
     def check_named(self, frame: Mapping[str, Any], entity: Any) -> tuple[str, float | None]:
         """Return the point and the time of a frame that names an entity.
@@ -270,19 +272,20 @@ class Child:
         """
         name, arguments, time = frame.get("point"), frame.get("args"), frame.get("time")
         if not isinstance(name, str) or name not in self.points:
-            self.fail(WireError(f"{self} has named the point {shown(name)}, which is not in its hello"))
+            self.fail(WireError(f"{self} has named the point {short_repr(name)}, which is not in its hello"))
         if type(entity) not in _ENTITIES:
             self.fail(
                 WireError(
-                    f"{self} has sent the entity {shown(entity)} for {name}; an entity must be a string or an integer"
+                    f"{self} has sent the entity {short_repr(entity)} for {name}; an entity must be a"
+                    " string or an integer"
                 )
             )
         if arguments is not None and not isinstance(arguments, dict):
-            self.fail(WireError(f"{self} has sent args for {name} that are not an object: {shown(arguments)}"))
+            self.fail(WireError(f"{self} has sent args for {name} that are not an object: {short_repr(arguments)}"))
         if type(time) is int and abs(time) < 1 << 1000:  # floats are not larger
             time = float(time)
         if type(time) not in _TIMES:
-            self.fail(WireError(f"{self} has sent the time {shown(time)} for {name}, which is not a number"))
+            self.fail(WireError(f"{self} has sent the time {short_repr(time)} for {name}, which is not a number"))
         return name, time
 
     def check_end(self, end: Any) -> None:
@@ -293,7 +296,9 @@ class Child:
         """
         if not isinstance(end, dict):
             self.fail(
-                WireError(f'{self} has sent the end {shown(end)}; it must be an object with "truncated" and "result"')
+                WireError(
+                    f'{self} has sent the end {short_repr(end)}; it must be an object with "truncated" and "result"'
+                )
             )
 
     def send(self, lines: bytes) -> None:

@@ -6,6 +6,7 @@ from contextlib import suppress
 from math import inf
 from typing import Any
 
+from ..core.reuse import keep, take
 from ..decision import BY_NAME, Definition
 from ..errors import (
     BranchError,
@@ -18,12 +19,11 @@ from ..errors import (
     UnknownPointError,
     WireError,
     annotate,
-    shown,
+    short_repr,
 )
 from ..simulation import RULE, TRUNCATED, SimulationInterface
 from .calls import RemoteCall, point_named
 from .child import Child
-from .kept import keep, take
 from .wire import STOP, answer, encode
 
 
@@ -116,7 +116,7 @@ class ProcessSimulation(SimulationInterface):
             raise ProcessError("ProcessSimulation needs POSIX: elsewhere a process cannot inherit the descriptors")
         self.command = _words(command)
         if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or not 0 < timeout < inf:
-            raise OptionValueError(f"timeout must be a positive number of seconds, not {shown(timeout)}")
+            raise OptionValueError(f"timeout must be a positive number of seconds, not {short_repr(timeout)}")
         self.timeout, self.env, self.cwd = float(timeout), None if env is None else dict(env), cwd
         self.points = _by_function(points)
         self.result: Any = None
@@ -178,7 +178,9 @@ class ProcessSimulation(SimulationInterface):
             child.send(start)
             first = child.receive()
             if stopped and "end" in first:
-                child.refuse(first, f'has sent {shown(first)} after "stop"; it must be silent until the next start')
+                child.refuse(
+                    first, f'has sent {short_repr(first)} after "stop"; it must be silent until the next start'
+                )
             child.may_exit = False
             link.begin(first)
         except BaseException:
@@ -213,7 +215,7 @@ class ProcessSimulation(SimulationInterface):
                 elif "remove" in frame:
                     self._remove(child, frame)
                 else:
-                    child.refuse(frame, f"has sent {shown(frame)}, which is not a frame of the wire")
+                    child.refuse(frame, f"has sent {short_repr(frame)}, which is not a frame of the wire")
                 frame = child.receive()
             return self._end(child, frame["end"])
         except BaseException:
@@ -258,7 +260,7 @@ class ProcessSimulation(SimulationInterface):
         """Get the decision of a call; return the lines that answer it."""
         link, number = self._link, frame["decide"]
         if type(number) is not int or number != link.number + 1:
-            child.fail(WireError(f"{child} has made call {shown(number)} where call {link.number + 1} was due"))
+            child.fail(WireError(f"{child} has made call {short_repr(number)} where call {link.number + 1} was due"))
         entity = frame.get("entity")
         name, time = child.check_named(frame, entity)
         if time is not None:
@@ -320,7 +322,9 @@ def _words(command: Any) -> list[str]:
     """
     words = [command] if isinstance(command, (str, os.PathLike)) else command
     if not isinstance(words, Sequence) or not words or not all(isinstance(word, (str, os.PathLike)) for word in words):
-        raise OptionValueError(f"command must be a program and its arguments, a list of strings, not {shown(command)}")
+        raise OptionValueError(
+            f"command must be a program and its arguments, a list of strings, not {short_repr(command)}"
+        )
     return [os.fspath(word) for word in words]
 
 
@@ -331,11 +335,13 @@ def _by_function(points: Any) -> dict[Any, Definition]:
         DefinitionError: ``points`` is not a dict from names to definitions.
     """
     if not isinstance(points, Mapping) or not points:
-        raise DefinitionError(f"points must be a dict from the process's names to definitions, not {shown(points)}")
+        raise DefinitionError(
+            f"points must be a dict from the process's names to definitions, not {short_repr(points)}"
+        )
     for name, definition in points.items():
         if not isinstance(name, str) or not name or not isinstance(definition, Definition):
             raise DefinitionError(
-                f"points must be a dict from the process's names to what make_step returns, not {shown(name)}:"
-                f" {shown(definition)}"
+                f"points must be a dict from the process's names to what make_step returns, not {short_repr(name)}:"
+                f" {short_repr(definition)}"
             )
     return {point_named(name).decide: definition for name, definition in points.items()}

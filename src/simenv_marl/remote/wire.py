@@ -13,7 +13,7 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
-from ..errors import WireError, shown, told
+from ..errors import WireError, describe_error, short_repr
 from ..simulation import RULE
 
 VERSION: Final = 1
@@ -40,7 +40,7 @@ def encode(frame: Mapping[str, Any]) -> bytes:
     except WireError:
         raise
     except (ValueError, RecursionError) as error:
-        raise WireError(f"the message cannot be written as JSON ({told(error)})") from None
+        raise WireError(f"the message cannot be written as JSON ({describe_error(error)})") from None
     if len(line) > LONGEST:
         raise WireError(f"a line of {len(line):,} bytes is too long to be sent; the limit is {LONGEST:,}")
     return line
@@ -87,10 +87,10 @@ def sendable(value: Any, where: str = "") -> Any:
         for key in value:
             if not isinstance(key, str):
                 raise WireError(
-                    f"{shown(key)} cannot be a key in a message to a process; keys must be strings{_at(where)}"
+                    f"{short_repr(key)} cannot be a key in a message to a process; keys must be strings{_at(where)}"
                 )
         return {key: sendable(item, f"{where}[{key!r}]") for key, item in value.items()}
-    raise WireError(f"{shown(value)} cannot be sent to a process: it is not JSON{_at(where)}")
+    raise WireError(f"{short_repr(value)} cannot be sent to a process: it is not JSON{_at(where)}")
 
 
 def _at(where: str) -> str:
@@ -110,9 +110,9 @@ def decode(line: bytes) -> dict[str, Any]:
         if end < len(text) and not text[end:].isspace():
             raise ValueError(f"more follows after {end} characters")
     except (ValueError, RecursionError) as error:
-        raise WireError(f"a line that is not JSON in UTF-8 ({told(error)}): {shown(line)}") from None
+        raise WireError(f"a line that is not JSON in UTF-8 ({describe_error(error)}): {short_repr(line)}") from None
     if not isinstance(frame, dict):
-        raise WireError(f"a line that is not a JSON object: {shown(line)}")
+        raise WireError(f"a line that is not a JSON object: {short_repr(line)}")
     return frame
 
 

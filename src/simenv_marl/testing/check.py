@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.options import CheckOptions
 from ..core.points import Points
-from ..errors import OptionValueError, SimEnvError, shown
+from ..errors import OptionValueError, SimEnvError, short_repr
 from .checks import check_plain_runs, check_repeated_run, check_views
 from .conformance import check_conformance, check_timing
 from .episodes import check_early_end, check_episodes
@@ -77,12 +77,12 @@ def check_simulation(
     """
     chosen = tuple(seeds)
     if not chosen or any(isinstance(s, bool) or not isinstance(s, (int, np.integer)) or s < 0 for s in chosen):
-        raise OptionValueError(f"seeds must be non-negative integers, at least one, not {shown(seeds)}")
+        raise OptionValueError(f"seeds must be non-negative integers, at least one, not {short_repr(seeds)}")
     for name, number in (("episodes", episodes), ("max_steps", max_steps)):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise OptionValueError(f"{name} must be a positive integer, not {shown(number)}")
+            raise OptionValueError(f"{name} must be a positive integer, not {short_repr(number)}")
     if not time_limit > 0:
-        raise OptionValueError(f"time_limit must be a positive number of seconds, not {shown(time_limit)}")
+        raise OptionValueError(f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}")
     try:
         with quietly():
             plan = Plan.draw_up(simulation, points, options)

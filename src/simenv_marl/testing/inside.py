@@ -15,7 +15,7 @@ from ..core.plan import Plan
 from ..core.rng import GlobalRandom
 from ..core.switch import SimulationExit
 from ..decision import DecisionPoint, Definition
-from ..envs import VIEWS, view_class
+from ..envs.make import VIEWS, view_class
 from ..hooks.places import Held
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import make_simulation, resetter

@@ -22,7 +22,7 @@ from zlib import crc32
 
 import numpy as np
 
-from ..errors import text_of
+from ..errors import error_text
 from ..simulation import RULE
 from .fingerprint import Fingerprint, alike, brief, shown
 from .inside import MASK, Plan, SimulationExit, make_simulation, outside_simulation, plain_loop, watching_rules
@@ -340,7 +340,7 @@ def culprit(error: BaseException) -> str:
 
 def error_in_words(error: BaseException, most: int = 300) -> str:
     """Describe an error: its kind, the first lines of its text, and where it was raised."""
-    text, place = " ".join(text_of(error).split()), culprit(error)
+    text, place = " ".join(error_text(error).split()), culprit(error)
     text = text if len(text) <= most else f"{text[: most - 4]} ..."
     return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
 

@@ -7,7 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from ..errors import AgentError, MaskError, NoDecisionError, ObservationError, RewardError, ViewError, notes_of, text_of
+from ..errors import (
+    AgentError,
+    MaskError,
+    NoDecisionError,
+    ObservationError,
+    RewardError,
+    ViewError,
+    error_notes,
+    error_text,
+)
 from ..simulation import RULE
 from .fingerprint import Fingerprint, fingerprint
 from .inside import Plan, make_environment, outside_simulation
@@ -211,15 +220,15 @@ class Report:
 
     def add_error(self, error: BaseException, where: str) -> None:
         """Add the finding for an exception; the same one from the same place is reported once."""
-        key = type(error).__name__, culprit(error) or text_of(error)
+        key = type(error).__name__, culprit(error) or error_text(error)
         if key in self._errors:
             return
         self._errors.add(key)
         name = next(
-            (name for kind, words, name in _OF_ERRORS if isinstance(error, kind) and words in text_of(error)),
+            (name for kind, words, name in _OF_ERRORS if isinstance(error, kind) and words in error_text(error)),
             next(name for words, name in _ORIGINS.items() if words in where),
         )
-        notes = [note.removeprefix("simenv_marl: ") for note in notes_of(error)]
+        notes = [note.removeprefix("simenv_marl: ") for note in error_notes(error)]
         self.add(name, "\n".join([f"{where}: {error_in_words(error, 400)}", *notes[:2]]), kind=type(error).__name__)
 
     def add_unrepeatable(self, subject: Subject, evidence: str) -> None:

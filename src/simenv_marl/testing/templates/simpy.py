@@ -1,6 +1,6 @@
 """MyModel: a job shop in SimPy, and a dispatcher that learns which job a machine takes next.
 
-Run ``python -m simenv_marl.templates.simpy`` to train the dispatcher and to compare it with the model's own rule. It
+``python -m simenv_marl.testing.templates.simpy`` trains the dispatcher and compares it with the model's own rule. It
 needs ``pip install "simenv-marl[experiments]" simpy cma``. ``--quick`` only shows that everything runs.
 
 Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
@@ -21,7 +21,8 @@ import simpy
 from gymnasium import Env
 from gymnasium.spaces import Box, Discrete
 
-from simenv_marl import TRUNCATED, SimulationInterface, collect_episodes, difference, evaluate, make_step, single_env
+from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, make_step, single_env
+from simenv_marl.data import collect_episodes
 
 # -- 1. The model: SimPy's processes, and a rule of its own ---------------------------------------
 
@@ -184,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")
     print(found.summary().round(1).to_string())
     print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.templates.simpy:MyModelSimulation")
+    print("python -m simenv_marl check simenv_marl.testing.templates.simpy:MyModelSimulation")
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ import pytest
 from pettingzoo.test import api_test
 
 from simenv_marl import RULE
-from simenv_marl.templates.mesa import MyModelSimulation, env
 from simenv_marl.testing import check_simulation
+from simenv_marl.testing.templates.mesa import MyModelSimulation, env
 
 
 def rabbits(simulation: MyModelSimulation) -> list[tuple[Any, ...]]:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionValueError, shown
-from .extras import needed
+from ..errors import OptionValueError, short_repr
+from ..many.spread import import_extra
 from .plot_data import (
     CHARTED,
     ENDS,
@@ -64,8 +64,8 @@ def style(what: str) -> Iterator[Any]:
     Raises:
         MissingExtraError: Matplotlib is missing.
     """
-    rc_context = needed("matplotlib", what, extra="plots").rc_context
-    make = needed("matplotlib.figure", what, extra="plots").Figure
+    rc_context = import_extra("matplotlib", what).rc_context
+    make = import_extra("matplotlib.figure", what).Figure
 
     def new_figure(width: float, height: float) -> Any:
         figure: Any = make(figsize=(width, height), layout="constrained")
@@ -364,7 +364,7 @@ def plot_returns(
         MissingExtraError: Matplotlib is missing.
     """
     if per not in ("policy", "agent", "team"):
-        raise OptionValueError(f'per must be "policy", "agent" or "team", not {shown(per)}')
+        raise OptionValueError(f'per must be "policy", "agent" or "team", not {short_repr(per)}')
     groups = groups_of(collected, per)
     number = sum(len(rows) for rows in groups.values())
     if not number:

@@ -21,9 +21,9 @@ from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.spaces import blank
 from ..core.stacking import empty, joined, stack_masks, stacker, taken
-from ..errors import AgentError, OptionValueError, shown
+from ..errors import AgentError, OptionValueError, short_repr
+from ..many.batch import Group, PolicyKey
 from ..simulation import RULE
-from .batch import Group, PolicyKey
 
 # -- what learners get ----------------------------------------------------------------------------
 
@@ -285,7 +285,8 @@ class Ledger:
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(
-                    f"{page.asked!r} returned {shown(name)} of shape {array.shape} for {len(actions)} decisions; the"
+                    f"{page.asked!r} returned {short_repr(name)} of shape {array.shape} for"
+                    f" {len(actions)} decisions; the"
                     " length of its first axis must be their number"
                 )
         page.extras.append(arrays)
@@ -339,7 +340,8 @@ class Ledger:
             own = [page for page in pages if (page.policies == place).any()]
             if len(own) > 1:
                 raise AgentError(
-                    f"{shown(key)} has decided at {' and at '.join(page.page.point.point.name for page in own)}, whose"
+                    f"{short_repr(key)} has decided at"
+                    f" {' and at '.join(page.page.point.point.name for page in own)}, whose"
                     " spaces differ; give its policy under the names of the points"
                 )
             tuple_of_seeds = tuple(seeds)

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from greenlet import getcurrent
 
-from .core.switch import SECONDS_TO_UNWIND, BaseDriver, SimulationExit
-from .hooks.stacks import stack_of
+from ..core.switch import SECONDS_TO_UNWIND, BaseDriver, SimulationExit
+from ..hooks.stacks import stack_of
 
 
 class CallbackGuard:

@@ -1,6 +1,6 @@
 """MyModel: a home battery, and an agent that learns when to charge it.
 
-Run ``python -m simenv_marl.templates.plain`` to train the agent and to compare it with the model's own rule. It needs
+``python -m simenv_marl.testing.templates.plain`` trains the agent and compares it with the model's own rule. It needs
 ``pip install "simenv-marl[experiments]" stable-baselines3``. ``--quick`` only shows that everything runs.
 
 Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from simenv_marl import TRUNCATED, SimulationEnv, SimulationInterface, difference, evaluate, make_step, single_env
+from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, make_step, single_env
+from simenv_marl.envs import SimulationEnv
 
 # -- 1. The model: plain Python, with a main loop and a rule of its own ---------------------------
 
@@ -135,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("Minus the costs of a week; differences are paired by seed, with 95 % intervals:")
     print(found.summary().round(2).to_string())
     print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.templates.plain:MyModelSimulation")
+    print("python -m simenv_marl check simenv_marl.testing.templates.plain:MyModelSimulation")
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ..core.asking import asks_for_environment
 from ..core.stacking import rows, taken
-from ..errors import InvalidActionError, OptionValueError, shown
+from ..errors import InvalidActionError, OptionValueError, short_repr
+from ..many.batch import BatchPolicy
 from ..simulation import RULE
-from .batch import BatchPolicy
 
 
 class Mixture:
@@ -38,20 +38,23 @@ class Mixture:
         pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
         if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
             raise OptionValueError(
-                f"a mixture needs a dict from policies to weights, or pairs of these, not {shown(parts)}"
+                f"a mixture needs a dict from policies to weights, or pairs of these, not {short_repr(parts)}"
             )
         for policy, weight in pairs:
             if policy is not RULE and not callable(policy):
-                raise OptionValueError(f"a mixture consists of policies, callables or RULE, not of {shown(policy)}")
+                raise OptionValueError(
+                    f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
+                )
             if asks_for_environment(policy):
-                raise OptionValueError(f"{shown(policy)} asks for the environment, which a mixture does not have")
+                raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
             if (
                 isinstance(weight, bool)
                 or not isinstance(weight, (int, float))
                 or not (isfinite(weight) and weight >= 0)
             ):
                 raise OptionValueError(
-                    f"the weight of {shown(policy)} must be a number that is not negative, not {shown(weight)}"
+                    f"the weight of {short_repr(policy)} must be a number that is not negative, not"
+                    f" {short_repr(weight)}"
                 )
         weights = np.array([weight for _, weight in pairs], np.float64)
         if not weights.sum() > 0:
@@ -103,14 +106,16 @@ def actions_of(returned: Any, number: int, policy: Any) -> list[Any]:
         returned = returned[0]
     actions = [RULE] * number if returned is RULE else rows(returned, integers=False)
     if actions is None or len(actions) != number:
-        what = shown(returned) if actions is None else f"{len(actions)} actions"
-        raise InvalidActionError(f"{shown(policy)} was asked for {number} decisions at once and has returned {what}")
+        what = short_repr(returned) if actions is None else f"{len(actions)} actions"
+        raise InvalidActionError(
+            f"{short_repr(policy)} was asked for {number} decisions at once and has returned {what}"
+        )
     return actions
 
 
 def name_of(policy: Any) -> str:
     """Return the name of a policy."""
-    return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or shown(policy))
+    return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or short_repr(policy))
 
 
 def defers(policy: Any) -> bool:

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from contextvars import ContextVar, Token
-from typing import Final
+from typing import Any, Final, Protocol
 from weakref import ref
 
-from .child import Child
 
-Kept = dict[Hashable, list[Child]]
+class Reusable(Protocol):
+    """A resource that can serve several simulations, one after the other."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether another simulation can use it."""
+
+    def close_input(self) -> None:
+        """Ask the resource to end."""
+
+    def end(self) -> None:
+        """Wait for the end of the resource."""
+
+
+Kept = dict[Hashable, list[Any]]
 """Kept processes, by the arguments that started them."""
 
 
@@ -49,7 +62,7 @@ def _block() -> processes_kept | None:
     return None if found is None else found()
 
 
-def keep(key: Hashable, child: Child) -> bool:
+def keep(key: Hashable, child: Reusable) -> bool:
     """Keep a process if a block is active; return whether it is kept."""
     block = _block()
     if block is None or not child.usable:
@@ -58,7 +71,7 @@ def keep(key: Hashable, child: Child) -> bool:
     return True
 
 
-def take(key: Hashable) -> Child | None:
+def take(key: Hashable) -> Any:
     """Return a kept process that was started in the same way; None if there is none."""
     block = _block()
     alike = [] if block is None else block.kept.get(key, [])

@@ -12,8 +12,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from ..errors import OptionValueError, SimulationError, shown
-from .points import Points, portable
+from ..core.points import Points, portable
+from ..errors import OptionValueError, SimulationError, short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Variant:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise OptionValueError(f"a variant needs a name, not {shown(self.name)}")
+            raise OptionValueError(f"a variant needs a name, not {short_repr(self.name)}")
         if isinstance(self.simulation, Variant):
             raise SimulationError(
                 f"the variant {self.name!r} needs a simulation, not the variant {self.simulation.name!r}; derive one"
@@ -53,7 +53,7 @@ class Variant:
         for name in ("parameters", "policies", "options"):
             value = getattr(self, name)
             if not isinstance(value, Mapping):
-                raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {shown(value)}")
+                raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {short_repr(value)}")
             # Copied, so that later changes of the arguments do not change the variant.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
         twice = [name for name in ("plugins", "policies") if name in self.options]
@@ -71,13 +71,14 @@ class Variant:
         if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
             raise SimulationError(
                 f"the variant {self.name!r} has parameters, so its simulation must be a class or a factory, not"
-                f" {shown(source)}"
+                f" {short_repr(source)}"
             )
         try:
             inspect.signature(source).bind(**self.parameters)
         except TypeError as error:
             raise SimulationError(
-                f"{getattr(source, '__qualname__', None) or shown(source)} cannot be called with the parameters of the"
+                f"{getattr(source, '__qualname__', None) or short_repr(source)} cannot be called with"
+                " the parameters of the"
                 f" variant {self.name!r}: {error}"
             ) from error
         except ValueError:  # a builtin without a signature
@@ -101,7 +102,7 @@ class Variant:
             dict(self.options),
         )
 
-    def applied(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
+    def environment_arguments(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
         """Return the arguments of an environment of this variant.
 
         Args:

@@ -12,9 +12,9 @@ from ..core.options import EpisodeOptions
 from ..core.points import Points
 from ..core.spaces import same as alike
 from ..core.stacking import stacker
-from ..errors import OptionValueError, shown
+from ..errors import OptionValueError, short_repr
+from ..many.batch import BatchPolicy
 from ..simulation import RULE
-from .batch import BatchPolicy
 from .collect import collect_episodes
 from .mixture import actions_of
 from .rule_actions import check_knowable, check_known
@@ -84,12 +84,15 @@ def compare_with_rule(
         SimEnvError: As ``collect_episodes`` raises it; this holds for all other errors, too.
     """
     if not isinstance(policies, Mapping) or not all(callable(policy) for policy in policies.values()):
-        raise OptionValueError(f"policies must be a dict from agents or points to callables, not {shown(policies)}")
+        raise OptionValueError(
+            f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
+        )
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
-        raise OptionValueError(f"tolerance must be a number that is not negative, not {shown(tolerance)}")
+        raise OptionValueError(f"tolerance must be a number that is not negative, not {short_repr(tolerance)}")
     if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
         raise OptionValueError(
-            f"others must be a dict of policies for agents or points that policies does not name, not {shown(others)}"
+            "others must be a dict of policies for agents or points that policies does not name, not"
+            f" {short_repr(others)}"
         )
     by_rule = dict.fromkeys(policies, RULE)
     checked = {name: value for name, value in options.items() if name not in PLAYING}

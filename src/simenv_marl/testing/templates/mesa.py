@@ -1,6 +1,6 @@
 """MyModel: rabbits in Mesa that are born and starve, and one policy, shared by all of them, that learns where to go.
 
-Run ``python -m simenv_marl.templates.mesa`` to train the policy and to compare it with the model's own rule. It needs
+``python -m simenv_marl.testing.templates.mesa`` trains the policy and compares it with the model's own rule. It needs
 ``pip install "simenv-marl[experiments]" mesa``. ``--quick`` only shows that everything runs.
 
 Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
@@ -17,7 +17,9 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from mesa.discrete_space import CellAgent, OrthogonalVonNeumannGrid
 
-from simenv_marl import SimulationAECEnv, SteppedSimulation, aec_env, collect_episodes, difference, evaluate, make_step
+from simenv_marl import SteppedSimulation, aec_env, difference, evaluate, make_step
+from simenv_marl.data import collect_episodes
+from simenv_marl.envs import SimulationAECEnv
 
 # -- 1. The model: Mesa's agents, and a rule of their own -----------------------------------------
 
@@ -162,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{title}; differences are paired by seed, with 95 % intervals:")
         print(found.summary(of).round(1).to_string())
     print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.templates.mesa:MyModelSimulation")
+    print("python -m simenv_marl check simenv_marl.testing.templates.mesa:MyModelSimulation")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Templates: models to start from, one file each, from the model's class to a trained policy, with tests.
 
 ``python -m simenv_marl new plain|simpy|mesa NAME`` copies one of the modules of this package and puts ``NAME`` into it.
-They also run as they are: ``python -m simenv_marl.templates.plain``.
+They also run as they are: ``python -m simenv_marl.testing.templates.plain``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from ..errors import OptionValueError, shown
+from ...errors import OptionValueError, short_repr
 
 KINDS: Final = {
     "plain": "stable-baselines3",
@@ -102,16 +102,18 @@ def _check_name(name: str, class_name: str, template: str) -> None:
     example = "; choose one like water_tank"
     if not name.isidentifier() or keyword.iskeyword(name) or not class_name.isidentifier():
         raise OptionValueError(
-            f"{shown(name)} cannot be the name of a module and, as {class_name}, of a class{example}"
+            f"{short_repr(name)} cannot be the name of a module and, as {class_name}, of a class{example}"
         )
     tree = ast.parse(template)
     imported = {node.names[0].name.partition(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import)}
     if name in sys.stdlib_module_names or name.lower() in imported or _installed(name):
-        raise OptionValueError(f"{shown(name)} is the name of another module, which the new file would hide{example}")
+        raise OptionValueError(
+            f"{short_repr(name)} is the name of another module, which the new file would hide{example}"
+        )
     used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
     used |= {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)} - {PLACEHOLDER}
     if class_name in used or hasattr(builtins, class_name):
-        raise OptionValueError(f"{shown(name)} would name the class {class_name}, and that name is taken{example}")
+        raise OptionValueError(f"{short_repr(name)} would name the class {class_name}, and that name is taken{example}")
 
 
 def _installed(name: str) -> bool:

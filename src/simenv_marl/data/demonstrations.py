@@ -15,7 +15,7 @@ from ..core.options import EpisodeOptions
 from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
-from ..errors import MissingExtraError, OptionValueError, meant, shown
+from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
 from .collect import collect_episodes
 from .mixture import name_of
 from .rule_actions import check_knowable, check_known
@@ -68,7 +68,7 @@ def record_dataset(
         SimEnvError: As ``collect_episodes`` raises it; this holds for all other errors, too.
     """
     if not isinstance(policies, Mapping) or not policies:
-        raise OptionValueError(f"policies must be a dict from agents or points to policies, not {shown(policies)}")
+        raise OptionValueError(f"policies must be a dict from agents or points to policies, not {short_repr(policies)}")
     names = _dataset_ids(dataset_id, policies)
     _check_free(names.values())
     check_knowable(simulation, policies, names, points, options)
@@ -104,14 +104,15 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]
         or not dataset_id
         or not all(isinstance(n, str) for n in dataset_id.values())
     ):
-        raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {shown(dataset_id)}")
+        raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {short_repr(dataset_id)}")
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
         raise OptionValueError(
-            f"dataset_id names {shown(unknown[0])}, which has no policy{meant(unknown[0], map(str, policies))}"
+            f"dataset_id names {short_repr(unknown[0])}, which has no"
+            f" policy{did_you_mean(unknown[0], map(str, policies))}"
         )
     if len(set(dataset_id.values())) < len(dataset_id):
-        raise OptionValueError(f"each policy needs a data set of its own: {shown(dict(dataset_id))}")
+        raise OptionValueError(f"each policy needs a data set of its own: {short_repr(dict(dataset_id))}")
     return dict(dataset_id)
 
 
@@ -141,8 +142,9 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
     """
     if not isinstance(trajectories, Trajectories):
         raise OptionValueError(
-            f"the data set {shown(dataset_id)} needs Trajectories, as collect_episodes returns them under each key,"
-            f" not {shown(trajectories)}"
+            f"the data set {short_repr(dataset_id)} needs Trajectories, as collect_episodes returns"
+            " them under each key,"
+            f" not {short_repr(trajectories)}"
         )
     (path,) = _check_free([dataset_id])
     _check_writable(dataset_id, trajectories)
@@ -180,12 +182,13 @@ def _check_free(names: Iterable[str]) -> list[Any]:
             parse_dataset_id(name)
         except (TypeError, ValueError):
             raise OptionValueError(
-                f'{shown(name)} is not a name for a data set; a valid one is "namespace/name-v0"'
+                f'{short_repr(name)} is not a name for a data set; a valid one is "namespace/name-v0"'
             ) from None
         paths.append(get_dataset_path(name))
         if paths[-1].exists():
             raise OptionValueError(
-                f"the data set {shown(name)} exists already, in {paths[-1]}; take another name or version, or delete"
+                f"the data set {short_repr(name)} exists already, in {paths[-1]}; take another name or"
+                " version, or delete"
                 " it with minari.delete_dataset"
             )
     return paths
@@ -193,7 +196,7 @@ def _check_free(names: Iterable[str]) -> list[Any]:
 
 def _check_writable(name: str, found: Trajectories) -> None:
     if not len(found):
-        raise OptionValueError(f"there is nothing to write to {shown(name)}: no agent has decided in any episode")
+        raise OptionValueError(f"there is nothing to write to {short_repr(name)}: no agent has decided in any episode")
     check_known(found)
 
 

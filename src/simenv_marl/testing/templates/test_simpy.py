@@ -3,8 +3,8 @@
 from typing import Any
 
 from simenv_marl import RULE
-from simenv_marl.templates.simpy import MyModelSimulation, env
 from simenv_marl.testing import check_simulation
+from simenv_marl.testing.templates.simpy import MyModelSimulation, env
 
 
 def test_with_the_rule_throughout_the_environment_is_the_plain_run() -> None:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionValueError, UnknownAgentError, meant, shown
+from ..errors import OptionValueError, UnknownAgentError, did_you_mean, short_repr
 from .trajectories import Trajectories
 
 CHARTED: Final = 6
@@ -95,7 +95,7 @@ def by_policy(trajectories: Any) -> Mapping[Any, Trajectories]:
         return {None: trajectories}
     if not isinstance(trajectories, Mapping) or not all(isinstance(v, Trajectories) for v in trajectories.values()):
         raise OptionValueError(
-            f"only the dict of Trajectories that collect_episodes returned can be drawn, not {shown(trajectories)}"
+            f"only the dict of Trajectories that collect_episodes returned can be drawn, not {short_repr(trajectories)}"
         )
     if not trajectories:
         raise OptionValueError("there is nothing to draw: no policy has answered any decision")
@@ -112,7 +112,7 @@ def checked_episode(episode: Any, parts: Mapping[Any, Trajectories]) -> int:
     try:
         place = operator.index(episode)
     except TypeError:
-        raise OptionValueError(f"episode must be the number of an episode, not {shown(episode)}") from None
+        raise OptionValueError(f"episode must be the number of an episode, not {short_repr(episode)}") from None
     if not -number <= place < number:
         raise OptionValueError(f"there is no episode {place}; there are {number}, counted from 0")
     return place % number
@@ -161,12 +161,12 @@ def _rows(key: Any, found: Trajectories, arrays: Sequence[NDArray[Any]], episode
 
 def _chosen(rows: Sequence[Row], agents: Any, episode: int) -> list[Row]:
     if isinstance(agents, str) or not agents:
-        raise OptionValueError(f"agents must be a sequence of names, not {shown(agents)}")
+        raise OptionValueError(f"agents must be a sequence of names, not {short_repr(agents)}")
     by_name = {row.name: row for row in rows}
     for name in agents:
         if name not in by_name:
             raise UnknownAgentError(
-                f"{shown(name)} did not decide in episode {episode}; these agents did:"
+                f"{short_repr(name)} did not decide in episode {episode}; these agents did:"
                 f" {', '.join(list(by_name)[:20])}{' and others' if len(by_name) > 20 else ''}"
             )
     return [by_name[name] for name in dict.fromkeys(agents)]
@@ -178,7 +178,7 @@ def _namer(key: Any, action_names: Any) -> Callable[[int], str]:
     if action_names is None:
         return str
     if isinstance(action_names, (str, bytes)) or not isinstance(action_names, (Mapping, Sequence)):
-        raise OptionValueError(f"action_names must be a sequence or a dict of names, not {shown(action_names)}")
+        raise OptionValueError(f"action_names must be a sequence or a dict of names, not {short_repr(action_names)}")
     names = action_names if isinstance(action_names, Mapping) else dict(enumerate(action_names))
     return lambda action: str(names.get(action, action))
 
@@ -235,7 +235,7 @@ def coloured_by(panels: Sequence[Panel], component: str | None) -> list[tuple[Le
         components = dict.fromkeys(name for own in known for name in own)
         names = ", ".join(map(repr, components))
         raise OptionValueError(
-            f"no action has a component {shown(component)}; there are {names}{meant(component, components)}"
+            f"no action has a component {short_repr(component)}; there are {names}{did_you_mean(component, components)}"
         )
     return [own.get(component or "", next(iter(own.values()))) for own in known]
 

@@ -15,12 +15,21 @@ from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 
-from .core.forking import Standing, end_with
-from .core.processes import pack_error, pack_plainly, unpack, unpack_error
-from .core.rng import is_seed, process_kept, seed_process
-from .envs import View
-from .errors import BranchError, OptionValueError, ViewError, WorkerError, annotate, close_after, meant, shown, told
-from .remote.kept import processes_kept
+from ..errors import (
+    BranchError,
+    OptionValueError,
+    ViewError,
+    WorkerError,
+    annotate,
+    close_after,
+    describe_error,
+    did_you_mean,
+    short_repr,
+)
+from .forking import Standing, end_with
+from .processes import pack_error, pack_plainly, unpack, unpack_error
+from .reuse import processes_kept
+from .rng import is_seed, process_kept, seed_process
 
 Result = TypeVar("Result")
 
@@ -29,7 +38,7 @@ METHODS: Final = ("fork", "replay")
 DEEPEST: Final = 4
 """The largest depth of nested branches. Each level can run as many branches as there are cores."""
 
-_depth: ContextVar[int] = ContextVar("simenv_marl.branching", default=0)
+_depth: ContextVar[int] = ContextVar("simenv_marl.core.branching", default=0)
 """The depth of this branch."""
 
 
@@ -96,21 +105,21 @@ def branch(
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
 
 
-def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
+def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> Any:
     """Return the unwrapped environment to continue.
 
     Raises:
         SimEnvError: As ``branch``.
     """
     view = getattr(env, "unwrapped", env)
-    if not isinstance(view, View):
-        raise ViewError(f"branch needs an environment of one simulation, not {shown(env)}")
+    if not hasattr(view, "begin_branch"):
+        raise ViewError(f"branch needs an environment of one simulation, not {short_repr(env)}")
     if isinstance(n, bool) or not isinstance(n, int) or n < 0:
-        raise OptionValueError(f"n must be a non-negative integer, not {shown(n)}")
+        raise OptionValueError(f"n must be a non-negative integer, not {short_repr(n)}")
     if method not in (None, *METHODS):
         raise OptionValueError(
-            f"method must be None or one of {', '.join(map(repr, METHODS))}, not {shown(method)}"
-            f"{meant(method, METHODS)}"
+            f"method must be None or one of {', '.join(map(repr, METHODS))}, not {short_repr(method)}"
+            f"{did_you_mean(method, METHODS)}"
         )
     if method == "fork" and not _can_fork(view):
         raise OptionValueError(
@@ -118,7 +127,7 @@ def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
             ' other threads; use "replay"'
         )
     if not isinstance(time_limit, (int, float)) or not time_limit > 0:
-        raise OptionValueError(f"time_limit must be a number of seconds, not {shown(time_limit)}")
+        raise OptionValueError(f"time_limit must be a number of seconds, not {short_repr(time_limit)}")
     view.check_pending()
     if _depth.get() == DEEPEST:
         raise BranchError(
@@ -128,7 +137,7 @@ def _checked(env: Any, n: Any, method: Any, time_limit: Any) -> View:
     return view
 
 
-def _can_fork(view: View) -> bool:
+def _can_fork(view: Any) -> bool:
     return hasattr(os, "fork") and view.driver == "greenlet"
 
 
@@ -143,7 +152,9 @@ def _checked_seeds(seeds: Any, n: int) -> list[int]:
     """
     given: list[Any] = list(seeds) if isinstance(seeds, (Sequence, np.ndarray)) else [None]
     if len(given) != n or not all(map(is_seed, given)):
-        raise OptionValueError(f"seeds must be n = {n} non-negative integers, one for each branch, not {shown(seeds)}")
+        raise OptionValueError(
+            f"seeds must be n = {n} non-negative integers, one for each branch, not {short_repr(seeds)}"
+        )
     return [int(seed) for seed in given]
 
 
@@ -161,7 +172,7 @@ def _in_other_futures(function: Callable[[Any, int], Result], seeds: list[int]) 
 # -- by replaying ---------------------------------------------------------------------------------
 
 
-def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
+def _replayed(env: Any, view: Any, function: Callable[[Any, int], Result], number: int) -> Result:
     deeper = _depth.set(_depth.get() + 1)
     try:
         with process_kept():  # the model may draw from the process's generators, then and now
@@ -170,7 +181,7 @@ def _replayed(env: Any, view: View, function: Callable[[Any, int], Result], numb
         _depth.reset(deeper)
 
 
-def _run_replayed(env: Any, view: View, function: Callable[[Any, int], Result], number: int) -> Result:
+def _run_replayed(env: Any, view: Any, function: Callable[[Any, int], Result], number: int) -> Result:
     twin = view.replayed()
     try:
         twin.begin_branch()
@@ -304,7 +315,7 @@ def _answer(value: Any) -> bytes:
 
 
 def _unpicklable(error: Exception) -> BranchError:
-    return BranchError(f"it returned a value that cannot be pickled ({told(error)})")
+    return BranchError(f"it returned a value that cannot be pickled ({describe_error(error)})")
 
 
 def _result(child: _Child) -> Any:
@@ -326,7 +337,7 @@ def _result(child: _Child) -> Any:
     else:
         error = unpack_error(parcel)
     if not isinstance(error, Exception):  # an exit or an interrupt must not be raised here
-        raise BranchError(f"branch {number} has raised {told(error)}") from error
+        raise BranchError(f"branch {number} has raised {describe_error(error)}") from error
     if type(error) is WorkerError:
         raise BranchError(f"branch {number}: {error}") from error.__cause__ or error.__context__
     annotate(error, f"simenv_marl: in branch {number}")

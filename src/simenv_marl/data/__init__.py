@@ -1,0 +1,20 @@
+"""Trajectories of many episodes, data sets, comparisons with the rule, and plots."""
+
+from .collect import collect_episodes
+from .comparison import Comparison, compare_with_rule
+from .demonstrations import record_dataset, save_dataset
+from .mixture import Mixture
+from .plots import plot_returns, plot_timeline
+from .trajectories import Trajectories
+
+__all__ = [
+    "Comparison",
+    "Mixture",
+    "Trajectories",
+    "collect_episodes",
+    "compare_with_rule",
+    "plot_returns",
+    "plot_timeline",
+    "record_dataset",
+    "save_dataset",
+]

@@ -1,0 +1,186 @@
+"""Extensions: handlers before, after and instead of a model's functions, without a change to the model (paper).
+
+Handlers are attached to functions, methods, generator and coroutine functions, iterables, and classes whose instances
+are iterable: for the whole process (``attach_handler``), for a block (``handlers``), or for one environment (the option
+``plugins``). A function without handlers costs nothing extra or, if ``expose_to_plugins`` exposed it, one test.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TypeVar
+
+from .decision import decision_points
+from .errors import HandlerError, SimEnvError, short_repr
+from .hooks.attached import Call, ChangedArgs, ChangedResult, title
+from .hooks.handlers import Target
+from .hooks.hook import Hook
+from .hooks.places import Held
+from .hooks.plugins import Added, Entry, attachable
+from .hooks.stacks import LOCK
+from .hooks.targets import at_hand, expose, exposed_functions, find_target
+
+__all__ = [
+    "Call",
+    "ChangedArgs",
+    "ChangedResult",
+    "attach_handler",
+    "attached_handlers",
+    "decision_points",
+    "expose_to_plugins",
+    "exposed_functions",
+    "handlers",
+    "remove_handler",
+    "trace",
+]
+
+Thing = TypeVar("Thing")
+
+
+def attached_handlers(env: Any = None) -> list[Entry]:
+    """Return the attached handlers, by target, in the order in which they run.
+
+    Args:
+        env: An environment, for the handlers of its option ``plugins``. None: the handlers of the whole process.
+
+    Returns:
+        A list of tuples: the handler, the dotted name of its target, and its position.
+    """
+    if env is not None:
+        entries: list[Entry] = env.unwrapped.plugins
+        return entries
+    targets = sorted(Target.all, key=lambda target: target.name)
+    return [(a.handler, target.name, a.position) for target in targets for a in target.attached]
+
+
+def expose_to_plugins(function_or_iterable: Thing) -> Thing:
+    """Let handlers be attached to a function or an iterable (paper, section 3.4).
+
+    Use it as a decorator in the model, above or below ``staticmethod``, ``classmethod`` and ``make_step``; or from
+    outside: ``Model.step = expose_to_plugins(Model.step)``. An importable function need not be exposed: handlers can be
+    attached to its dotted name.
+
+    Args:
+        function_or_iterable: A function of any kind, an iterable, or a class whose instances are iterable.
+
+    Returns:
+        The exposed function, which keeps its name, signature and docstring and may be exposed again; for an iterable, a
+        proxy that behaves like it; for a class, the class itself.
+
+    Raises:
+        PatchError: It is none of these, or a method that is bound to one object.
+    """
+    with LOCK:
+        exposed: Thing = expose(function_or_iterable)
+    return exposed
+
+
+# -- handlers -------------------------------------------------------------------------------------
+
+
+def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> None:
+    """Attach a handler to a function, for the whole process (paper, section 3.4).
+
+    Args:
+        handler: A callable. It gets the arguments of the call as they were passed; at ``*_next`` positions, it gets
+            those of the generator function, or the iterable. A ``before`` handler may return ``ChangedArgs``. An
+            ``after`` handler gets the result if it has a parameter ``_result``, and may return ``ChangedResult``. The
+            result of an ``instead`` handler is the result of the call. Handlers of one position run in the order in
+            which they were attached. Of several ``instead`` handlers only the latest runs, and then no ``before`` and
+            ``after`` handlers.
+        target: The function, or the dotted name of any importable function, exposed or not.
+        position: "before", "after" or "instead"; for iterables and generator functions also "before_next", "after_next"
+            or "instead_next".
+
+    Raises:
+        UnknownTargetError: The name does not exist.
+        HandlerError: The position does not exist, or the handler cannot be called like the target.
+        PatchError: The target is not exposed and cannot be patched.
+    """
+    with LOCK:
+        attached = attachable((handler, target, position))
+        attached.target.add(attached)
+
+
+def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
+    """Remove a handler that ``attach_handler`` attached.
+
+    Args:
+        target: The function, or its dotted name.
+        position: The position.
+        handler: The handler; if it was attached several times, the last one is removed. None: all handlers at this
+            position.
+
+    Raises:
+        UnknownTargetError: The name does not exist.
+        HandlerError: There is no such handler.
+    """
+    with LOCK:
+        found = find_target(target)
+        there = [a for a in found.attached if a.position == position and (handler is None or a.handler == handler)]
+        if not there:
+            what = "no handler is" if handler is None else f"{title(handler)} is not"
+            at = ", ".join(sorted({a.position for a in found.attached})) or "nowhere"
+            raise HandlerError(f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}")
+        for attached in there if handler is None else there[-1:]:
+            found.remove(attached)
+
+
+@contextmanager
+def handlers(*entries: Entry) -> Iterator[None]:
+    """Attach handlers for the duration of a ``with`` block.
+
+    Args:
+        *entries: Tuples of the arguments of ``attach_handler``: handler, target, position.
+
+    Raises:
+        SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
+    """
+    with LOCK:
+        attached = [attachable(entry) for entry in entries]
+        held = Held([Added([(own.target, own) for own in attached])])
+    try:
+        yield
+    finally:
+        held.let_go()
+
+
+# -- seeing what happens --------------------------------------------------------------------------
+
+
+@contextmanager
+def trace(*targets: Any) -> Iterator[list[Call]]:
+    """Record the calls of a model's functions, in the order in which they begin.
+
+    Args:
+        *targets: The functions, as ``attach_handler`` takes them. Without arguments: all functions that are exposed or
+            have handlers, and all decorated decision points.
+
+    Returns:
+        A context manager whose value is the list of calls. An entry has the attributes ``target``, ``arguments`` and
+        ``result``, which are strings; the result is None until the call ends.
+
+    Raises:
+        SimEnvError: As ``attach_handler``.
+    """
+    calls: list[Call] = []
+
+    def record(target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
+        call = Call.of(target, args, kwargs)
+        calls.append(call)
+        return call
+
+    with LOCK:
+        found = dict.fromkeys(map(find_target, targets) if targets else _everything())
+        held = Held([Added([(target, record) for target in found if isinstance(target, Hook)])])
+    try:
+        yield calls
+    finally:
+        held.let_go()
+
+
+def _everything() -> Iterator[Target]:
+    """Yield all targets that are exposed or have handlers, and all decorated decision points."""
+    for target in list(Target.all):
+        if isinstance(target, Hook) and (target.for_good or target.slot):
+            with suppress(SimEnvError, ImportError):
+                yield at_hand(target)

@@ -162,10 +162,10 @@ def _make(known: _Recipe, view: str, options: dict[str, Any]) -> Any:
     mode = options.pop("render_mode", None)
     plan = Plan.draw_up(known.simulation, known.points, options)
     wrapper: Any = None
-    if mode not in plan.render_modes and isinstance(mode, str):
-        if mode.endswith("_list") and mode.removesuffix("_list") in plan.render_modes:
+    if mode not in plan.model.render_modes and isinstance(mode, str):
+        if mode.endswith("_list") and mode.removesuffix("_list") in plan.model.render_modes:
             mode, wrapper = mode.removesuffix("_list"), RenderCollection
-        elif mode == "human" and "rgb_array" in plan.render_modes:
+        elif mode == "human" and "rgb_array" in plan.model.render_modes:
             mode, wrapper = "rgb_array", HumanRendering
     env = view_class(plan, view)(plan.amended({"render_mode": mode}))
     return env if wrapper is None else wrapper(env)

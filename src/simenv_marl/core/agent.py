@@ -14,112 +14,124 @@ from greenlet import getcurrent
 
 from ..errors import MaskError, RewardError, short_repr
 from ..hooks.stacks import DIFFERENCES, EVALUATING
-from ..simulation import RULE, Sentinel
+from ..simulation import RULE
 from .actions import MASK
-from .asking import AskingPolicy
-from .bound import BoundPoint, DeferredPolicy
+from .driver import WAIT
+from .point import Point
 from .spaces import duplicate
 
 if TYPE_CHECKING:
     from .episode import Episode
-
-WAIT: Final = Sentinel("WAIT")
-"""Returned instead of a reply to the simulation if the episode waits for an action, or is over."""
 
 _NOTHING: Final[dict[str, Any]] = {}
 """The keyword arguments of calls without any. Nothing writes to this dict."""
 
 
 class Agent:
-    """One agent of an episode.
+    """One agent of an episode. If its decision point has no other agent, it is also the event of a decision there.
 
     Attributes:
         name: The name.
         point: The decision point at which the agent decides.
         policy: The policy that answers the agent's decisions. None: the environment's user answers them.
-        deferred: Whether that policy answers many decisions at once, so that the episode waits for it.
-        looks: Whether that policy gets the environment.
-        consultations: How many of the agent's decisions were put to a policy that gets the environment.
+        own: Whether it is an agent of the environment, with rewards and an end.
+        delegated: Whether the environment's user does not answer its decisions: a policy does, or it has ended.
         clock: Returns the simulation's time. None if the simulation has no time.
-        settle: Rewards and observes the agent: see ``settling``.
-        settle_again: Does the same for an agent that has decided before.
+        update: Rewards and observes the agent: see ``make_updates``.
         decided: Whether the reward mapping was called in this episode. Its first value is dropped.
         acted: Whether the latest round used an action that the user gave for the agent.
         ended: Whether the agent's episode ended before the simulation's.
-        led: Whether the environment's user no longer answers the agent's decisions.
         present: Whether the latest info comes from an observation. False if there was nothing to observe.
         reward: The reward of the agent's previous action, as of its latest decision or its end.
         asked: Whether the user was asked for an action in this episode. Used where forced moves are skipped.
         carried: The sum of the rewards of forced moves. It is added to the agent's next reward.
+        consultations: How many decisions were put to a policy that gets the environment.
         observation: The latest observation, cast to its space. None before the first one.
         handed_out: The observation that a view has returned and must not return a second time.
         info: The info of the latest decision. The dict is the agent's own.
         mask, choices: The legal actions of the pending decision, if the decision point restricts them.
         offered: The choices of the latest decision, among which the rule's decision is looked up.
         rule_action: The action that corresponds to the rule's latest decision. None if it is not known.
+        informs_rule_action: Whether the next info contains ``rule_action``.
         memory: The values that ``difference`` remembers for the agent.
         plugins: The plugins of the environment. None if it has none.
         now, answered_at: The times of the latest decision and of the one before.
         entity, rest, kwargs: The arguments of the latest decision: see ``keep``.
-        tells: Whether the next info contains ``rule_action``.
         group, notes: Used by runners of many episodes.
     """
 
     __slots__ = (
-        "acted", "answered_at", "asked", "carried", "choices", "clock", "consultations", "decided", "deferred", "ended",
-        "entity", "group", "handed_out", "info", "kwargs", "led", "looks", "mask", "memory", "name", "notes", "now",
-        "observation", "offered", "plugins", "point", "policy", "present", "rest", "reward", "rule_action", "settle",
-        "settle_again", "tells",
+        "acted", "answered_at", "asked", "carried", "choices", "clock", "consultations", "decided", "delegated",
+        "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "kwargs", "mask", "memory",
+        "name", "notes", "now", "observation", "offered", "own", "plugins", "point", "policy", "present", "report",
+        "rest", "reward", "rule_action", "update",
     )  # fmt: skip
 
-    def __init__(
-        self, name: str, point: BoundPoint, policy: Any, clock: Callable[[], float] | None, plugins: Any
-    ) -> None:
-        self.name, self.point, self.clock = name, point, clock
-        self.follow(policy)
-        self.consultations = 0
-        self.settle = self.settle_again = point.settle
-        self.plugins = plugins
-        self.asked = self.decided = self.acted = self.ended = self.led = self.present = self.tells = False
+    def __init__(self, name: str, point: Point, policy: Any, own: bool, clock: Any, plugins: Any) -> None:
+        self.name, self.point, self.policy, self.clock, self.plugins = name, point, policy, clock, plugins
+        self.own, self.delegated = own, not own
+        self.deliver, self.report = point.deliver, point.report
+        self.update: Callable[..., None] = point.updates[0]
+        self.decided = self.acted = self.ended = self.present = self.asked = self.informs_rule_action = False
         self.reward = self.carried = 0.0
+        self.consultations = 0
         self.observation: Any = None
         self.handed_out: Any = None
-        self.info: dict[str, Any] = {}
         self.mask: Any = None
         self.choices: Any = None
         self.offered: Any = None
         self.rule_action: Any = None
-        self.memory: dict[Any, Any] = {}
         self.group: Any = None
         self.notes: Any = None
+        self.info: dict[str, Any] = {}
+        self.memory: dict[Any, Any] = {}
         self.now: float | None = None
         self.answered_at: float | None = None
         self.entity: Any = None
         self.rest: tuple[Any, ...] | None = None
         self.kwargs: dict[str, Any] = _NOTHING
 
-    def follow(self, policy: Any) -> None:
-        """Let a policy answer the agent's decisions. None: the environment's user answers them."""
-        self.policy = policy
-        self.deferred, self.looks = isinstance(policy, DeferredPolicy), isinstance(policy, AskingPolicy)
+    # -- decisions --------------------------------------------------------------------------------
 
-    # -- the arguments of its decision ------------------------------------------------------------
+    def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Handle a decision: update the agent and wait for an action, or do what the episode does instead.
 
-    def keep(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
+        Returns:
+            The reply to the simulation, or ``WAIT``.
+        """
+        if self.delegated:
+            return episode.consult(self, args, kwargs)
+        point = self.point
+        if point.agent is None:
+            entity = self.entity
+            if entity is not None and args and entity() is args[0]:
+                self.rest, self.kwargs = args[1:], kwargs
+            else:
+                self.keep(episode, args, kwargs)
+        else:
+            if point.one_entity and args and self.rest and self.rest[0] is not args[0]:
+                point.warn_of_several(self.name)
+            self.rest, self.kwargs = args, kwargs  # a strong reference: the first argument is no entity of the model
+        episode.latest = self
+        decide = episode.decide
+        if decide is not None:  # in a round, after the last step, or where forced moves are skipped
+            return decide(episode, self, args, kwargs)
+        update = self.update  # a local variable: calling the attribute directly is slower
+        update(self, args, kwargs)
+        episode.pending = self
+        return WAIT
+
+    def keep(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Keep the arguments of a decision.
 
         At an entity-level point the first argument is the entity. It is held by a weak reference if it supports one,
         so that the model can free it. While the decision is pending, the simulation holds it.
-
-        Returns:
-            Whether the entity is a different one than before.
         """
-        before, self.entity, self.rest, self.kwargs = self.entity, None, args, kwargs
-        if not args or self.point.agent is not None:
-            return False
-        with suppress(TypeError):  # not every object supports weak references
-            self.entity, self.rest = ref(args[0]), args[1:]
-        return self.entity is None or self.entity is not before
+        self.entity, self.rest, self.kwargs = None, args, kwargs
+        if args and self.point.agent is None:
+            with suppress(TypeError):  # not every object supports weak references
+                self.entity, self.rest = ref(args[0]), args[1:]
+            episode.entities[self.point, id(args[0])] = self
 
     def arguments(self) -> tuple[Any, ...] | None:
         """The positional arguments of the latest decision; None if there was none, or if the entity is gone."""
@@ -133,86 +145,44 @@ class Agent:
         self.entity = self.rest = self.answered_at = None
         self.kwargs = _NOTHING
 
-    # -- decisions --------------------------------------------------------------------------------
+    def checked(self, action: Any) -> Any:
+        """Check an action for the pending decision; return it in the form that its mapping takes.
 
-    @property
-    def deliver(self) -> Callable[..., Any] | None:
-        """Turns a reply into the value that the decision function returns: see ``BoundPoint``."""
-        return self.point.deliver
-
-    @property
-    def told(self) -> Any:
-        """The event that reports what the rule decides: see ``BoundPoint``."""
-        return self.point.told
-
-    def arise(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Handle a decision: settle the agent and wait for an action, or do what the episode does instead.
-
-        If the decision point has no other agent, the agent itself is the event that the simulation sends.
+        Raises:
+            InvalidActionError: The action is not legal.
         """
-        point = self.point
-        if point.agent is None:
-            entity = self.entity
-            if entity is not None and args and entity() is args[0]:
-                self.rest, self.kwargs = args[1:], kwargs
-            elif self.keep(args, kwargs):
-                episode.remember(self, args[0])
-        elif self.led:
-            return episode.dispatch(point, self.name, args, kwargs)
-        else:
-            if point.one_entity and args and self.rest and self.rest[0] is not args[0]:
-                point.warn_of_several(self.name)
-            self.rest, self.kwargs = args, kwargs  # a strong reference: the first argument is no entity of the model
-        episode.latest = self
-        decide = episode.decide
-        if decide is not None:  # in a round, after the last step, or where forced moves are skipped
-            return decide(episode, self, args, kwargs)
-        settle = self.settle_again  # a local variable: calling the attribute directly is slower
-        settle(self, args, kwargs)
-        episode.pending = self
-        return WAIT
-
-    def choose(self, action: Any) -> Any:
-        """Return the choice that a checked action stands for, in a list of one; return ``RULE`` unchanged."""
-        choices, self.choices = self.choices, None
-        if self.point.recorded:
-            self.offered = choices
-        return action if action is RULE else [choices[action]]
+        return action if action is RULE else self.point.checked(action, self.name, self.mask)
 
     # -- infos ------------------------------------------------------------------------------------
 
     def inform(self) -> dict[str, Any]:
         """Make the info of an observation: the time, the action mask and the rule's action."""
-        info: dict[str, Any] = {} if self.clock is None else self.tell_time()
+        info: dict[str, Any] = {} if self.clock is None else self.read_clock()
         mask = self.mask
         if mask is not None:
             info[MASK] = mask.copy() if type(mask) is np.ndarray else duplicate(mask)
-        if self.tells:
+        if self.informs_rule_action:
             action = self.rule_action
             info["rule_action"] = action if type(action) is int else duplicate(action)
-            self.tells = False
+            self.informs_rule_action = False
         return info
 
-    def unsee(self) -> None:
-        """Set the reward to 0.0, and the info to that of an agent with nothing to observe and all actions legal."""
-        self.reward, self.present = 0.0, False
-        self.info = {} if self.clock is None else self.tell_time()
-        if self.point.legal is not None:
-            self.info[MASK] = self.point.open_mask()
-
-    def tell_time(self) -> dict[str, Any]:
+    def read_clock(self) -> dict[str, Any]:
         """Note the time. Return it, and the time elapsed since the agent's previous decision, as an info."""
         clock: Any = self.clock
         time, before = clock(), self.answered_at
         self.now = now = time if type(time) is float else float(time)
         return {"time": now, "elapsed": 0.0 if before is None else now - before}
 
+    def clear_observation(self) -> None:
+        """Set the reward to 0.0, and the info to that of an agent with nothing to observe and all actions legal."""
+        self.reward, self.present = 0.0, False
+        self.info = {} if self.clock is None else self.read_clock()
+        if self.point.legal is not None:
+            self.info[MASK] = self.point.open_mask()
 
-Settle = Callable[..., None]
-"""``settle(agent, args, kwargs, reward=True, observe=True, last=False)``: see ``settling``."""
 
-
-def settling(point: BoundPoint) -> tuple[Settle, Settle]:
+def make_updates(point: Point) -> tuple[Callable[..., None], Callable[..., None]]:
     """Make the functions that reward and observe the agents of a decision point.
 
     Returns:
@@ -223,9 +193,9 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
     """
     reward_mapping, observation_mapping, cast = point.reward_mapping, point.observation_mapping, point.cast
     legal, masked = point.legal, bool(point.masked_parts)
-    quiet = legal is None and not point.tells
+    plain = legal is None and not point.informs_rule_action and not masked
 
-    def settle(
+    def update(
         agent: Agent,
         args: tuple[Any, ...],
         kwargs: dict[str, Any],
@@ -238,23 +208,27 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
             before, EVALUATING[here] = EVALUATING.get(here), agent
         try:
             if reward and agent.decided:
-                value = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-                agent.reward = checked_reward(agent, value)
+                agent.reward = checked_reward(agent, reward_mapping(*args, **kwargs))
             elif reward and not last:  # the agent has not acted yet, so this value rewards nothing
                 reward_mapping(*args, **kwargs)
-                agent.decided, agent.settle_again = True, again
-            if observe:
-                first, agent.present = not agent.present, True
-                if legal is not None:
-                    agent.mask, agent.choices = _legal_at_end(point, args, kwargs) if last else legal(args, kwargs)
-                agent.info = {} if quiet and agent.clock is None else agent.inform()
-                if masked:
-                    agent.observation = point.observe(args, kwargs, agent.mask)
-                else:
-                    seen = observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args)
-                    agent.observation = cast(seen)
-                if first and point.finite is not None:
-                    point.finite(agent.observation)
+                agent.decided, agent.update = True, again
+            if not observe:
+                return
+            first, agent.present = not agent.present, True
+            if legal is not None:
+                try:
+                    agent.mask, agent.choices = legal(args, kwargs)
+                except MaskError:
+                    if not last:
+                        raise
+                    agent.mask, agent.choices = point.open_mask(), None  # it will not be asked again
+            agent.info = agent.inform()
+            if masked:
+                agent.observation = point.observe(args, kwargs, agent.mask)
+            else:
+                agent.observation = cast(observation_mapping(*args, **kwargs))
+            if first and point.finite is not None:
+                point.finite(agent.observation)
         finally:
             if here is not None:
                 if before is None:  # without a function call, which could fail at the recursion limit
@@ -262,35 +236,19 @@ def settling(point: BoundPoint) -> tuple[Settle, Settle]:
                 else:
                     EVALUATING[here] = before
 
-    def settle_quietly(agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        here = getcurrent() if DIFFERENCES else None
-        if here is not None:
-            before, EVALUATING[here] = EVALUATING.get(here), agent
-        try:
-            reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
-            if type(reward) is not float or reward - reward != 0.0:  # spares nearly all rewards the call
-                reward = checked_reward(agent, reward)
-            agent.reward = reward
-            agent.info = {} if agent.clock is None else agent.tell_time()
-            agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
-        finally:
-            if here is not None:
-                if before is None:  # without a function call, which could fail at the recursion limit
-                    del EVALUATING[here]
-                else:
-                    EVALUATING[here] = before
+    def update_plainly(agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        if DIFFERENCES:
+            update(agent, args, kwargs)
+            return
+        reward = reward_mapping(*args, **kwargs) if kwargs else reward_mapping(*args)
+        if type(reward) is not float or reward - reward != 0.0:  # spares nearly all rewards the call
+            reward = checked_reward(agent, reward)
+        agent.reward = reward
+        agent.info = {} if agent.clock is None else agent.read_clock()
+        agent.observation = cast(observation_mapping(*args, **kwargs) if kwargs else observation_mapping(*args))
 
-    again = settle_quietly if quiet and not masked else settle
-    return settle, again
-
-
-def _legal_at_end(point: BoundPoint, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, Any]:
-    """Find the legal actions at the agent's end: it will not be asked again, so no action needs to be legal."""
-    legal: Any = point.legal
-    try:
-        return legal(args, kwargs)  # type: ignore[no-any-return]
-    except MaskError:
-        return point.open_mask(), None
+    again = update_plainly if plain else update
+    return update, again
 
 
 def checked_reward(agent: Agent, reward: Any) -> float:

@@ -18,7 +18,7 @@ from weakref import ref
 
 from ..errors import OptionValueError, short_repr
 from ..simulation import RULE, positional
-from .bound import asks_for
+from .point import asks_for
 
 PLANNING: Final[ContextVar[bool]] = ContextVar("simenv_marl.planning", default=False)
 """Whether this code runs in a branch in which a planner tries a candidate action."""
@@ -93,7 +93,7 @@ class AskingPolicy:
                 " pass the policy in policies="
             )
         episode = session.episode
-        if episode.alone or PLANNING.get():
+        if episode.plan.solo or PLANNING.get():
             return self._by_base(observation, info, (episode.consulted or episode.pending).name)
         return self.answer(observation, info, AskingPolicy.make(session))
 

@@ -1,4 +1,4 @@
-"""One episode of one simulation. This module alone determines the order of events.
+"""One episode of one simulation. This module and ``rounds`` determine what happens when.
 
 An episode::
 
@@ -11,44 +11,46 @@ A decision::
     simulation                     episode, on its user's stack
     ----------                     ----------------------------
     calls a decision function
-      suspended          ------>   ``arise``: if the rule decides, back to the simulation
-                                   ``settle``: reward of the previous action (the first of an episode is dropped),
+      suspended          ------>   ``handle``: find the agent; if the rule decides, back to the simulation
+                                   ``update``: reward of the previous action (the first of an episode is dropped),
                                      legal actions, info, observation
-                                   if a policy answers, back to the simulation with its action
+                                   if a policy answers (``consult``), back to the simulation with its action
                                    else PENDING, until the user answers
-                                   ``answer``: check the action and map it to the decision
-      returns            <------   ``resume``
+                                   ``answer``: map the checked action to the reply
+      returns            <------   ``advance``
     returns from ``run``
-      ended              ------>   last reward and last observation of each agent; OVER
+      ended              ------>   ``finish``: last reward and last observation of each agent; OVER
 
-Views differ in who answers, and in when agents are settled (``When``). They share the code of all steps above.
-While an episode is RESETTING or MOVING on the user's side, decision functions run their rule.
+In AEC and single views an episode is played in turns: each agent is updated when its decision arises. In parallel and
+joint views it is played in rounds: all live agents are updated when a step returns (``rounds``). Where policies answer
+all agents (``simulate``, ``simulate_many``), agents are observed when a policy is asked, and not rewarded. While an
+episode is RESETTING or MOVING on the user's side, decision functions run their rule.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from enum import Enum
+from collections.abc import Callable, Collection, Iterable
 from math import inf
 from typing import Any, Final
 
 from greenlet import getcurrent
 
-from ..errors import (
-    NoDecisionError,
-)
+from ..errors import AgentError, NoDecisionError, short_repr, warn_user
+from ..hooks.hook import Hook
 from ..hooks.stacks import EVALUATING
-from ..simulation import RULE, Sentinel
+from ..simulation import RULE
 from .actions import ILLEGAL, only_choice
-from .agent import WAIT, Agent
-from .bound import BoundPoint
-from .contexts import Claim
-from .ending import MANY_ROUNDS, Ending
-from .plan import Plan
+from .agent import Agent
+from .asking import AskingPolicy
+from .context import ExclusiveLock
+from .driver import WAIT, Driver
+from .plan import DeferredPolicy, Plan
+from .point import Point
 from .rng import GlobalRandom
+from .rounds import Rounds
+from .run import Run
 from .spaces import duplicate
-from .switch import BaseDriver
 
 LONGEST_TAPE: Final = 200_000
 """How many actions are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""
@@ -56,47 +58,46 @@ LONGEST_TAPE: Final = 200_000
 LOST: Final[deque[Any]] = deque(maxlen=0)
 """The tape of an episode that has more actions or is never replayed. It keeps nothing."""
 
-MISSING: Final = Sentinel("MISSING")
 
-
-class When(Enum):
-    """When the agents of an episode are rewarded and observed.
-
-    Attributes:
-        DECISION: Each agent when its decision arises (AEC and single views).
-        RETURN: All live agents when a step returns (parallel and joint views).
-        NEVER: Agents are not rewarded, and are observed only when a policy is asked (``simulate``, ``simulate_many``).
-    """
-
-    DECISION = "decision"
-    RETURN = "return"
-    NEVER = "never"
-
-
-class Episode(Ending):
+class Episode(Run):
     """One run of a simulation, from its reset to its end. It has no reference to the environment.
 
     Attributes:
+        agents: The live agents of the environment, by name, in the order in which they joined.
+        others: The agents for which policies answer, by name.
+        ended: The agents of the environment whose episodes ended before the simulation's, by name.
+        just_ended: The ended agents whose end no view has reported yet.
+        entities: The agent as which an entity last decided, by its point and its id.
+        consulted: The agent whose policy is being asked. In a replay, the one at whose decision the replay ends.
+        decide: What is done with a decision of the user's instead of updating the agent and waiting.
+        rounds: The state of the present round. None if the episode is played in turns.
+        terminated, truncated: How the episode ended. Both are False before its end, and if an error ended it.
+        unreported_end: Whether the episode ended before the user was asked, because all decisions were forced. The
+            first step reports this end.
+        is_complete: Whether the only agent of the environment has ended, so that nothing is left to ask the user.
+        most_steps: The number of turns after which the episode is truncated; infinity without ``max_steps``.
+        limit: The next number of turns at which ``_reach_limit`` is called.
         tape: The answers of the user and of policies, in order. ``LOST`` if they are not kept.
-        most_steps: The number of steps after which the episode is truncated; infinity without ``max_steps``.
-        limit: The next number of turns at which ``_come_to_limit`` is called.
-        last_time: The time at the latest step of a joint view.
+        script: During a replay, the answers on the other episode's tape that are still to be given. Else None.
         skips: Whether a decision with one legal action is answered with it.
-        stalled: The number of rounds without an action for the pending agent since the simulation last moved.
+        last_time: The time at the latest step of a joint view.
     """
 
     __slots__ = (
-        "_left", "decide", "last_time", "limit", "most_steps", "skips", "stalled", "tape", "when",
+        "agents", "consulted", "decide", "ended", "entities", "is_complete", "just_ended", "last_time", "limit",
+        "most_steps", "others", "rounds", "script", "skips", "tape", "terminated", "truncated", "unreported_end",
     )  # fmt: skip
 
     def __init__(
         self,
         plan: Plan,
         simulation: Any,
-        driver: BaseDriver,
+        driver: Driver,
         seed: int,
-        when: When,
-        around: tuple[GlobalRandom | None, Claim | None],
+        *,
+        in_rounds: bool = False,
+        rng: GlobalRandom | None = None,
+        lock: ExclusiveLock | None = None,
         script: Iterable[Any] | None = None,
     ) -> None:
         """Prepare an episode of a simulation that has been reset.
@@ -106,51 +107,80 @@ class Episode(Ending):
             simulation: The simulation.
             driver: The simulation's driver. Its next ``resume`` begins ``run``.
             seed: The seed of the simulation's reset.
-            when: When agents are settled.
-            around: The generators and the claim of the environment's context: see ``at_work``.
+            in_rounds: Whether all agents are updated when a step returns.
+            rng: The environment's own state of the global generators. None if it has none.
+            lock: The lock that lets one thread at a time use the environment. None if only one thread can use it.
             script: The tape of another episode to replay. None: this is an ordinary episode.
         """
-        super().__init__(plan, simulation, driver, seed, around)
-        self.when = when
+        super().__init__(plan, simulation, driver, seed, rng, lock)
+        self.agents = {name: self._new_agent(name, point) for name, point in plan.roster.items()}
+        self.others: dict[str, Agent] = {}
+        self.ended: dict[str, Agent] = {}
+        self.just_ended: list[Agent] = []
+        self.entities: dict[tuple[Point, int], Agent] = {}
+        self.consulted: Agent | None = None
+        self.terminated = self.truncated = self.unreported_end = self.is_complete = False
         self.most_steps = plan.options.max_steps or inf
         self.limit = min(self.most_steps, LONGEST_TAPE + 1)
-        self.skips, self.stalled = plan.options.skip_forced, 0
-        self.decide: Callable[..., Any] | None = None
-        if when is When.RETURN:
-            self.decide = Episode._decide_in_round
-        elif self.skips:
-            self.decide = Episode._decide_unless_forced
-        self.last_time: float | None = None
-        self.tape: Any = LOST if plan.unanswered and not plan.looked_into else []
+        self.tape: Any = LOST if plan.unattended and not plan.has_planner else []
         self.script = None if script is None else deque(script)
-        self._left: dict[str, Any] = {}  # the unused actions of the current round
+        self.skips = plan.options.skip_forced
+        self.last_time: float | None = None
+        self.rounds = Rounds() if in_rounds else None
+        self.decide: Callable[..., Any] | None = None
+        if self.rounds is not None:
+            self.decide = self.rounds.decide
+        elif self.skips:
+            self.decide = Episode.decide_unless_forced
 
-    def begin(self) -> None:
+    def events_by_hook(self) -> dict[Hook, Any]:
+        """The events that the simulation sends: an agent where it is the only one of a point, else the plan's event."""
+        agents = self.agents
+        return {hook: agents.get(getattr(event, "agent", None), event) for hook, event in self.plan.events.items()}  # type: ignore[arg-type]
+
+    # -- steps ------------------------------------------------------------------------------------
+
+    def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
         """Run the simulation to its first decision.
+
+        Args:
+            at_first_event: Called when the simulation has sent its first event.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
             BaseException: Any error of the model, a mapping or a policy.
         """
-        with self.at_work():
+        with self.context():
             try:
-                self.go_on(None)
-                if not self.over and self.when is not When.NEVER and self.consulted is None:
-                    self._return(settle=self.when is When.RETURN)
-                    for agent in self.agents.values() if self.skips else ():
-                        agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards
-                    self.untold = self.just_ended if self.skips else []
+                event, args, kwargs = self.driver.resume(None)
+                if at_first_event is not None:
+                    at_first_event()
+                reply = event.handle(self, args, kwargs)
+                event = args = kwargs = None
+                if reply is not WAIT:
+                    self.advance(reply)
+                if not self.over and self.consulted is None:
+                    if self.rounds is not None:
+                        self.rounds.update_all(self)
+                    elif not self.plan.unattended or self.plan.rewarded:
+                        self._observe_announced()
+                if self.rounds is not None:
+                    self.rounds.ended_at_reset = self.just_ended if self.skips else []
                 self.begun = True
             except BaseException as error:
                 self.fail(error)
                 raise
-        if self.pending is None and not self._plan.unanswered:
-            self.unheard = self.skips and any(agent.decided for agent in (*self.agents.values(), *self.just_ended))
-            if self.unheard:
-                return
-            raise NoDecisionError(self.without_decision())
+        if self.pending is None and not self.plan.unattended:
+            self.unreported_end = self.skips and any(a.decided for a in (*self.agents.values(), *self.just_ended))
+            if not self.unreported_end:
+                raise NoDecisionError(self._without_decision())
 
-    # -- answers ----------------------------------------------------------------------------------
+    def play(self, action: Any) -> None:
+        """Play a round if the episode is played in rounds, else a step."""
+        if self.rounds is None:
+            self.step(action)
+        else:
+            self.rounds.play(self, action)
 
     def step(self, action: Any, entered: bool = False) -> None:
         """Answer the pending decision and run to the user's next decision, or to the end.
@@ -166,32 +196,33 @@ class Episode(Ending):
         """
         agent = self.pending
         if agent is None:
-            self._hear()
+            self.report_end()
             return
         if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
-            self._enter(Episode.step, action)
+            with self.context():
+                self.step(action, True)
             return
         try:
             if action is not RULE:
                 check = agent.point.check  # a local variable: calling the attribute directly is slower
                 legal = check(action)
                 if legal is ILLEGAL or agent.mask is not None:
-                    legal = agent.point.checked(action, agent.name, agent.mask)
+                    legal = agent.checked(action)
                 action = legal
-            self.go_on(self.answer(agent, action))
+            self.advance(self.answer(agent, action))
         except BaseException as error:
             if self.pending is None:
                 self.fail(error)
-            else:  # nothing has moved
+            else:
                 self.annotate(error)
             raise
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
-        """Turn an agent's action into the reply to the simulation, and release what only this decision needed.
+        """Turn the checked action of an agent into the reply to the simulation.
 
         Args:
-            agent: The agent whose decision has arisen.
-            action: A checked action, or ``RULE``, which is its own reply.
+            agent: The agent whose decision is answered.
+            action: The action, or ``RULE``.
             turn: Whether the user answers the pending decision.
 
         Returns:
@@ -202,14 +233,17 @@ class Episode(Ending):
         """
         try:
             self.pending = None  # so that an action from inside a mapping is refused
-            kept = action
+            recorded = action
             if agent.choices is not None:
-                reply = agent.choose(action)
+                choices, agent.choices = agent.choices, None
+                if agent.report is not None:
+                    agent.offered = choices
+                reply = action if action is RULE else [choices[action]]
             elif action is RULE:
                 reply = action
             else:
                 if type(action) is not int and turn:
-                    kept = duplicate(action)  # before a mapping can change it
+                    recorded = duplicate(action)  # before a mapping can change it
                 convert = agent.point.convert  # a local variable: calling the attribute directly is slower
                 reply = convert(action)
         except BaseException:
@@ -219,27 +253,12 @@ class Episode(Ending):
         agent.answered_at = agent.now
         if turn:
             self.turns = turns = self.turns + 1
-            self.tape.append(kept)
+            self.tape.append(recorded)
             if turns == self.limit:
-                self._come_to_limit()
+                self._reach_limit()
         return reply
 
-    def _come_to_limit(self) -> None:
-        """Drop a tape that has grown too long, and prepare the truncation if this was the last step."""
-        if len(self.tape) > LONGEST_TAPE:
-            self.tape = LOST
-        self.limit = self.most_steps
-        if self.turns == self.limit:
-            self.decide = Episode._decide_too_late
-
-    def _keep(self, answer: Any) -> None:
-        """Keep an answer for a replay."""
-        tape = self.tape
-        if len(tape) >= LONGEST_TAPE:
-            tape = self.tape = LOST
-        tape.append(answer)
-
-    def go_on(self, reply: Any) -> None:
+    def advance(self, reply: Any) -> None:
         """Resume the simulation with a reply, and run to the user's next decision, or to the end.
 
         Raises:
@@ -248,139 +267,105 @@ class Episode(Ending):
         while True:
             resume = self.driver.resume  # a local variable: calling the attribute directly is slower
             event, args, kwargs = resume(reply)
-            reply = event.arise(self, args, kwargs)
+            reply = event.handle(self, args, kwargs)
             if reply is WAIT:
                 return
             event = args = kwargs = None  # so that they keep nothing alive that the model frees meanwhile
 
-    def play(self, actions: Mapping[str, Any], entered: bool = False) -> None:
-        """Play a round: use each agent's action once, up to the first decision without an action, or to the end.
+    def record(self, answer: Any) -> None:
+        """Keep an answer for a replay."""
+        if len(self.tape) >= LONGEST_TAPE:
+            self.tape = LOST
+        self.tape.append(answer)
 
-        Then settle all live agents.
+    def _reach_limit(self) -> None:
+        """Drop a tape that has grown too long, and prepare the truncation if this was the last step."""
+        if len(self.tape) > LONGEST_TAPE:
+            self.tape = LOST
+        self.limit = self.most_steps
+        if self.turns == self.limit:
+            self.decide = Episode._decide_too_late
 
-        Args:
-            actions: An action, or ``RULE``, for each agent's name.
-            entered: Whether the environment's context is already entered.
+    def _observe_announced(self) -> None:
+        """After a reset, observe the agents that ``expected_calls`` announces and that have not decided."""
+        following, self.pending = self.pending, None  # so that an action from inside a mapping is refused
+        for agent, args in self.announced().items():
+            if agent is not following and not agent.decided:
+                agent.keep(self, args, {})
+                self.latest = agent
+                agent.update(agent, args, agent.kwargs, reward=False)
+                agent.choices = None  # ``legal`` returns them again when the agent decides
+        self.pending = following
+        for agent in self.agents.values() if self.skips else ():
+            agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards
 
-        Raises:
-            UnknownAgentError: An action is for an agent that is not live. Nothing has moved.
-            InvalidActionError: An action is not legal. Nothing has moved. An action that is legal now and illegal at
-                its turn counts as missing.
-            EpisodeOverError, ReentrancyError: No decision is pending.
-            BaseException: Any error of the model, a mapping or a policy.
-        """
-        if self.pending is None:
-            self._hear()
-            return
-        if not entered and (getcurrent() is not self.driver.caller or EVALUATING or self.plugins is not None):
-            self._enter(Episode.play, actions)
-            return
-        left = self.check(actions)
-        pending, self.pending = self.pending, None
-        assert pending is not None
-        try:
-            self._keep({name: part if type(part) is int else duplicate(part) for name, part in left.items()})
-            self.turns += bool(actions)
-            for agent in (*self.agents.values(), *self.just_ended):
-                agent.acted = False
-            self.just_ended = self.untold
-            self.untold = []
-            self._left = left
-            reply = self._answer_in_round(pending)
-            if reply is WAIT:
-                self.stalled += 1
-            else:
-                self.stalled = 0
-                self.go_on(reply)
-            if not self.over and self.consulted is None:  # ``consulted`` is set where a replay ends
-                self._return(truncate=bool(actions) and self.turns == self.most_steps)
-        except BaseException as error:
-            self.fail(error)
-            raise
-        if self.stalled == MANY_ROUNDS:
-            self.warn_of_standstill()
-
-    def dispatch(self, point: BoundPoint, name: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Handle a decision of an agent that is not yet known at this point as an agent of the user's.
-
-        Returns:
-            The reply to the simulation, or ``WAIT``.
-
-        Raises:
-            AgentError: The name is not a string, or belongs to another point, or to an agent that has ended.
-            BaseException: Any error of a mapping or a policy.
-        """
-        if name is None:
-            return RULE
-        self.latest = agent = self.agent_for(point, name)
-        if agent.name in self.answered:
-            return self.consult(agent, args, kwargs)
-        return agent.arise(self, args, kwargs)
+    # -- who decides ------------------------------------------------------------------------------
 
     def consult(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Let a policy answer a decision.
 
         Returns:
-            The reply to the simulation; ``WAIT`` if the policy is asked later, for many decisions at once.
+            The reply to the simulation; ``WAIT`` if the policy is asked later, for many decisions at once, or if a
+            replay has reached the other episode's decision.
 
         Raises:
             InvalidActionError: The policy's action is not legal.
             BaseException: Any error of a mapping or the policy.
         """
-        if self.done:  # else the simulation might run for ever without a decision for the user
+        if agent.ended:
+            raise _decides_after_end(agent)
+        if self.is_complete:  # else the simulation might run for ever without a decision for the user
             self.finish(truncated=False)
             return WAIT
-        if agent.policy is RULE:
+        policy = agent.policy
+        if policy is RULE:
             return RULE
-        agent.settle(agent, args, kwargs, False)
-        forced = self._forced(agent) if self.skips else None
+        self.latest = agent
+        update = agent.point.updates[0]
+        update(agent, args, kwargs, reward=False)
+        forced = self.forced_action(agent) if self.skips else None
         if forced is not None:
-            return self._answer_forced(agent, forced)
-        if self.script is None and not (agent.deferred or agent.looks):
-            action = agent.policy(agent.observation, agent.info)
+            return self.answer_forced(agent, forced)
+        is_deferred = isinstance(policy, DeferredPolicy)
+        if is_deferred and not self.plan.solo:
+            self.pending = agent
+            return WAIT
+        if isinstance(policy, AskingPolicy):
+            agent.consultations += 1
+            agent.keep(self, args, kwargs)
+        if self.script:
+            action = self.script.popleft()
         else:
-            action = self.ask(agent, args, kwargs)
-            if action is WAIT:
+            self.consulted = agent
+            if self.script is not None:
                 self.pending = agent
                 return WAIT
-        self._keep(duplicate(action))
-        if action is not RULE:
-            action = agent.point.checked(action, agent.name, agent.mask)
-        return self.answer(agent, action, False)
-
-    def single_out(self, agent: Agent) -> None:
-        """Turn a branch into a single view of the consulted agent: reward it from now on, and wait for it only."""
-        if list(self.agents.values()) != [agent]:
-            self.most_steps = self.limit = inf  # ``max_steps`` counts the steps of other agents
-        super().single_out(agent)
-        self.when, self.decide = When.DECISION, Episode._decide_unless_forced if self.skips else None
-        self.begun, self.untold, self._left, agent.asked = True, [], {}, True
-        if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
-            with self.at_work():
-                agent.settle(agent, agent.arguments(), agent.kwargs, observe=False)
-        self.consulted, self.pending = None, agent
-
-    # -- decisions --------------------------------------------------------------------------------
+            try:
+                action = policy.alone(self, agent) if is_deferred else policy(agent.observation, agent.info)
+            finally:
+                self.consulted = None
+        self.record(duplicate(action))
+        return self.answer(agent, agent.checked(action), False)
 
     def _decide_too_late(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Truncate the episode, because the user has taken the last step."""
         self.finish(truncated=True)
         return WAIT
 
-    def _decide_unless_forced(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Settle an agent. Its rewards add up until it has more than one legal action."""
-        agent.settle_again(agent, args, kwargs)
+    def decide_unless_forced(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Update an agent. Its rewards add up until it has more than one legal action."""
+        agent.update(agent, args, kwargs)
         agent.reward, agent.carried = agent.reward + agent.carried, 0.0
-        forced = self._forced(agent)
+        forced = self.forced_action(agent)
         if forced is not None or not agent.asked:  # ``reset`` returns no rewards either
             agent.reward, agent.carried = 0.0, agent.reward
         if forced is not None:
-            return self._answer_forced(agent, forced)
+            return self.answer_forced(agent, forced)
         agent.asked = True
         self.pending = agent
         return WAIT
 
-    def _answer_forced(self, agent: Agent, action: Any) -> Any:
+    def answer_forced(self, agent: Agent, action: Any) -> Any:
         """Answer with the only legal action. The elapsed time adds up until the agent is asked, as rewards do."""
         before = agent.answered_at
         reply = self.answer(agent, action, False)
@@ -388,62 +373,138 @@ class Episode(Ending):
             agent.answered_at = before
         return reply
 
-    def _forced(self, agent: Agent) -> Any:
+    def forced_action(self, agent: Agent) -> Any:
         """The only legal action of an agent; None if it has several."""
         return only_choice(agent.point.definition.action_space, agent.mask)
 
-    def _decide_in_round(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Answer a decision with the agent's action of this round, or wait for the next round."""
-        if agent.point.legal is not None:
-            agent.mask, agent.choices = agent.point.legal(args, kwargs)
-        if self.clock is not None:
-            agent.now = float(self.clock())
-        return self._answer_in_round(agent)
+    # -- agents -----------------------------------------------------------------------------------
 
-    def _answer_in_round(self, agent: Agent) -> Any:
-        action = self._forced(agent) if self.skips else None
-        if action is None:
-            action = self._left.pop(agent.name, MISSING)
-            mask = agent.mask
-            if action is MISSING or (mask is not None and action is not RULE and not agent.point.allows(mask, action)):
-                self.pending = agent
-                return WAIT
-            agent.acted = True
-        self.latest = agent
-        if not agent.decided:  # it acts before it was ever settled
-            agent.settle(agent, agent.arguments(), agent.kwargs, observe=False)
-        return self.answer(agent, action, False)
+    def _new_agent(self, name: str, point: Point) -> Agent:
+        policy = self.plan.policy_of(name, point)
+        return Agent(name, point, policy, self.plan.owns(policy), self.clock, self.plan.plugins)
 
-    def _return(self, *, settle: bool = True, truncate: bool = False) -> None:
-        """Reward and observe the agents when a step or a reset returns.
+    def agent_for(self, point: Point, name: Any) -> Agent:
+        """Find the agent with a name that decides at a point, or let it join.
 
-        Args:
-            settle: Whether all live agents are rewarded and observed. If False, only agents that ``expected_calls``
-                announces, and that have not decided, are observed.
-            truncate: Whether the episode ends here.
+        Raises:
+            AgentError: The name is not a string, or belongs to another point, or to an agent that has ended.
         """
-        following, self.pending = self.pending, None  # so that an action from inside a mapping is refused
-        announced = {}
-        for agent, call in self.announced():
-            if agent is not following and agent not in announced:  # the first of several calls counts
-                announced[agent] = call
-                if (settle or not agent.decided) and agent.keep(call, {}):
-                    self.remember(agent, call[0])
-        if truncate:
-            self.finish(truncated=True)
-            return
+        if not isinstance(name, str):
+            raise AgentError(f"agent= of {point.point.name} must return a string or None, not {short_repr(name)}")
+        agent = self.others.get(name) or self.agents.get(name)
+        if agent is None:
+            if name in self.ended:
+                raise _decides_after_end(self.ended[name])
+            agent = self._new_agent(name, point)
+            (self.agents if agent.own else self.others)[name] = agent
+        elif agent.point is not point:
+            raise AgentError(
+                f"the agent {name!r} decides at {agent.point.point.name} and at {point.point.name};"
+                " an agent has one decision point: give each point's agents names of their own"
+            )
+        return agent
+
+    def agent_names(self) -> str:
+        """List the names of the live agents, for messages."""
+        return listed(self.agents)
+
+    def agent(self, name: str) -> Agent | None:
+        """An agent of the environment, live or ended; None if there is no such agent."""
+        return self.agents.get(name) or self.ended.get(name)
+
+    def named_before(self, point: Point, entity: Any) -> str | None:
+        """The name of the agent as which an entity last decided at a point; None if it was no agent."""
+        agent = self.entities.get((point, id(entity)))
+        args = None if agent is None else agent.arguments()  # to exclude a freed entity that had the same id
+        return agent.name if agent is not None and args and args[0] is entity else None
+
+    def announced(self) -> dict[Agent, tuple[Any, ...]]:
+        """The live agents that ``expected_calls`` announces, with the arguments of the first call of each."""
+        expected: Any = getattr(self.simulation, "expected_calls", None)
+        announced: dict[Agent, tuple[Any, ...]] = {}
+        for point in self.plan.active if expected is not None else ():
+            for call in expected(point.point.name):
+                args = call if type(call) is tuple else tuple(call)
+                name = point.agent or point.name_agent(*args)
+                if name is None or name in self.ended:
+                    continue
+                agent = self.agent_for(point, name)
+                if agent.own:
+                    announced.setdefault(agent, args)
+        return announced
+
+    def end_agent(self, agent: Agent) -> None:
+        """End the episode of one agent while the simulation's goes on."""
+        latest = self.latest
+        self._conclude(agent)
+        self.latest = latest  # the model continues after this agent's decision
+        agent.ended = agent.delegated = True
+        self.ended[agent.name] = self.agents.pop(agent.name)
+        self.just_ended.append(agent)
+        self.is_complete = agent.name == self.plan.one_agent
+
+    def _conclude(self, agent: Agent) -> None:
+        """Give an agent its last reward and its last observation."""
+        self.latest = agent
+        args = agent.arguments()
+        if args is None:  # the agent never decided, or the model has freed its entity
+            agent.clear_observation()
+        else:
+            update = agent.point.updates[0]
+            update(agent, args, agent.kwargs, last=True)
+        agent.reward, agent.carried = agent.reward + agent.carried, 0.0
+        agent.release()
+
+    # -- ends -------------------------------------------------------------------------------------
+
+    def finish(self, *, truncated: bool) -> None:
+        """End the episode of all live agents."""
+        self.pending = None
         for agent in self.agents.values():
-            args = agent.arguments()
-            if args is None:
-                agent.unsee()
-                continue
-            self.latest = agent
-            if settle:
-                agent.settle_again(agent, args, agent.kwargs)
-                if self.skips:
-                    agent.reward, agent.carried = agent.reward + agent.carried, 0.0
-            elif agent in announced and not agent.decided:
-                agent.settle(agent, args, agent.kwargs, reward=False)
-            if agent.choices is not None and agent is not following:
-                agent.choices = None  # ``legal`` returns them again when the agent decides
-        self.pending = following
+            self._conclude(agent)
+        self.over, self.truncated, self.terminated = True, truncated, not truncated
+        if self.plan.unmatched_names:
+            self._warn_of_unmatched_names()
+
+    def _warn_of_unmatched_names(self) -> None:
+        """Warn of agents that the environment's options name and that have not appeared, once for each agent."""
+        unmatched = self.plan.unmatched_names
+        present = [name for name, agent in self.agents.items() if agent.decided or agent.observation is not None]
+        present += [*self.others, *self.ended]
+        absent = unmatched.difference(present)
+        if absent:
+            unmatched -= absent
+            warn_user(
+                f"policies= or possible_agents= name agents that did not appear in the episode:"
+                f" {listed(sorted(absent))}; these did: {listed(present)}"
+            )
+
+    def report_end(self) -> None:
+        """Handle a step without a pending decision: report an end that the user does not know of, or refuse."""
+        if not self.unreported_end:
+            raise self.refusal()
+        self.unreported_end = False
+
+    def _without_decision(self) -> str:
+        """Make the message for an episode that ended without a decision for the environment's user."""
+        points = ", ".join(point.point.name for point in self.plan.active)
+        ended = f"{type(self.simulation).__name__}.run() ended without a decision of"
+        if self.others:
+            expected = f"{self.plan.one_agent!r} at {points}" if self.plan.one_agent else points
+            return f"{ended} {expected}; these have decided: {listed(self.others)}"
+        return (
+            f"{ended} {points}; does the simulation call the decision functions as attributes of their class or module?"
+        )
+
+
+def _decides_after_end(agent: Agent) -> AgentError:
+    return AgentError(
+        f"the agent {agent.name!r} decides at {agent.point.point.name} after its end; agent= must give each entity a"
+        " name of its own, and removed_by= or end_agent() must end an agent only when its entity is gone"
+    )
+
+
+def listed(names: Collection[str]) -> str:
+    """List the first ten of some names, and the number of the others, for messages."""
+    first = ", ".join(list(names)[:10])
+    return f"{first} and {len(names) - 10} more" if len(names) > 10 else first

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from contextvars import Context, copy_context
+from contextvars import copy_context
 from sys import modules
-from threading import get_ident, local
-from typing import Any
-from weakref import ref
+from typing import Any, Final
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -16,97 +15,148 @@ from ..errors import WrongThreadError
 from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Taker
 from ..simulation import RULE
-from .loops import LOOPS, Sides, hush
-from .switch import BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
+from .driver import FINISHED, NO_EVENTS, Driver, Event, SimulationExit, reporting_rule
 
 
-class _Home:
-    """The identity of a thread. Unlike the thread's number, it is never reused for another thread."""
+def _root() -> greenlet:
+    """The root greenlet of the current thread. Unlike the thread's number, it is never reused for another thread."""
+    here = getcurrent()
+    while here.parent is not None:
+        here = here.parent
+    return here
 
 
-_homes = local()
+class GreenletDriver(Driver):
+    """A driver that runs a simulation in a greenlet of the thread that begins the first job."""
 
+    __slots__ = ("_asker", "_body", "_direct", "_leave", "_loops", "_root", "resume")
 
-def _home() -> _Home:
-    try:
-        home: _Home = _homes.home
-    except AttributeError:
-        home = _homes.home = _Home()
-    return home
-
-
-class GreenletDriver(BaseDriver):
-    """A driver that runs a simulation in a greenlet of the thread that starts the first job."""
-
-    __slots__ = (
-        "_asker", "_body", "_direct", "_here", "_home", "_sides", "_switch_out", "_thread", "resume",
-    )  # fmt: skip
-
-    def __init__(self, *, plugins: Any = None, before: BaseDriver | None = None, direct: bool = True) -> None:
-        """Prepare a greenlet, as ``BaseDriver`` does.
+    def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
+        """Prepare a greenlet, as ``Driver`` does.
 
         Args:
             plugins: The plugins of the simulation's environment.
-            before: The simulation's previous driver.
+            opened: What the simulation has opened on an earlier stack.
             direct: Whether ``resume`` may be called without ``enter``. If False, ``caller`` stays None.
         """
-        super().__init__(plugins=plugins, before=before)
+        super().__init__(plugins, opened)
         self._direct = direct
-        self._thread = get_ident()
-        self._home = ref(_home())
-        self._sides = Sides()
+        self._root = _root()
+        self._loops = _Loops()
         self._body: Any = greenlet(self._serve)
         self._asker: greenlet | None = None  # the model's own greenlet that waits for an answer
-        self._here: Any = None
-        self._switch_out: Any = None
-        self.resume: Callable[[Any], Event] = self._body.switch
+        self._leave: Any = None
+        self.resume: Any = self._body.switch
+
+    # -- on the user's side -----------------------------------------------------------------------
+
+    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
+        """Prepare a job. The next ``resume`` starts it on the stack."""
+        self.enter()
+        self._job, self._events, self._refused = job, events, None
+        # A new greenlet has an empty context, but the model expects the user's context variables.
+        self._body.gr_context = copy_context() if context is None else context
+
+    def enter(self) -> None:
+        """Prepare to resume the simulation from the current greenlet.
+
+        Raises:
+            WrongThreadError: The simulation belongs to another thread.
+        """
+        if self._body is None or not self.reachable:
+            raise WrongThreadError(
+                "the simulation is suspended in another thread, the one that called reset(); step, reset and close the"
+                ' environment there, or make it with driver="thread", which allows any thread'
+            )
+        here = getcurrent()
+        self._leave, self._body.parent = here.switch, here  # control returns here when the stack ends
+        # Inside another environment's simulation, ``enter`` is needed before each step, to hide that simulation.
+        self.caller = here if self._direct and here not in STACKS else None
+
+    def throw(self) -> Event | None:
+        """Raise ``SimulationExit`` in the suspended simulation; return its next event."""
+        self.enter()
+        if self.idle or not self._body:  # the job has ended, or was interrupted before it began
+            self._job = None
+            return FINISHED, [None], None
+        self._exiting = True
+        event: Event = (self._asker or self._body).throw(SimulationExit())
+        return event
+
+    @property
+    def reachable(self) -> bool:
+        """Whether the simulation can be resumed from the current thread."""
+        return self._root is _root()
+
+    @property
+    def lost(self) -> bool:
+        """Whether the simulation's thread has ended, so that nothing can resume the simulation."""
+        return bool(self._root.dead)
+
+    @property
+    def usable(self) -> bool:
+        """Whether a job can begin in the current thread."""
+        return super().usable and not self._body.dead
+
+    def end(self) -> None:
+        """End the stack."""
+        if self.ended:
+            return
+        self._forget_stack()
+        body, self._body = self._body, None
+        self._asker = self._leave = self.caller = self.resume = None
+        if self.idle and body and self.reachable:
+            body.parent = getcurrent()
+            body.throw()
+
+    def abandon(self) -> None:
+        """Leave a job suspended that does not unwind."""
+        self._forget_stack()
+        _abandoned.append(self)
 
     # -- on the simulation's side -----------------------------------------------------------------
 
     def _serve(self, _: Any) -> None:
         with suppress(GreenletExit):
-            self._begin()
-            while not self._ended:
-                self._sides.begin()
+            self._register()
+            while not self.ended:
+                self._loops.begin()
                 try:
                     event = self._work()
                 finally:
-                    if not self._ended:  # once the driver has ended, the stack unwinds by itself
-                        self._sides.leave()
-                if self._ended:
-                    return  # the driver was dropped, and the stack has unwound by itself
+                    if not self.ended:  # once the driver has ended, the stack unwinds by itself
+                        self._loops.leave()
+                if self.ended:
+                    return
                 self._body.gr_context = None
-                self._idle = True
-                self._switch_out(*event)
+                self.idle = True
+                self._leave(*event)
 
-    def _decider(self, hook: Hook, event: Crossing, away: bool = False) -> Taker:
-        rule, deliver, driver, sides = self._rule_of(hook, event, away), event.deliver, self, self._sides
+    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Taker:
+        deliver, driver, loops = event.deliver, self, self._loops
+        rule = reporting_rule(hook, event, lambda report: self._decider(hook, report, away))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             if away:
                 driver._ask_from(getcurrent())
-            switch_out = driver._switch_out
-            find_loop = sides.find
-            own = None
+            leave, running = driver._leave, loops.running
+            if running is None and ASYNCIO in modules:
+                running = loops.running = modules[ASYNCIO]._get_running_loop
+            looped = running is not None and (running() is not None or loops.users is not None)
+            if looped:
+                loops.leave()
             try:
-                if find_loop is None:
-                    if LOOPS in modules:
-                        own = sides.look()
-                        find_loop = sides.find
-                elif find_loop() is not None or sides.users is not None:
-                    own = sides.leave()
-                reply = switch_out(event, args, kwargs)
+                reply = leave(event, args, kwargs)
             except BaseException:
-                if not driver._ended:  # once the driver has ended, the stack unwinds by itself
+                if not driver.ended:  # once the driver has ended, the stack unwinds by itself
                     if away:
                         driver._ask_from(None)
-                    sides.enter()
-                    hush()
+                    loops.enter()
                 raise
             if away:
                 driver._ask_from(None)
-            if find_loop is not None and (own is not None or find_loop() is not None):
-                sides.enter()
+            if looped or (running is not None and running() is not None):
+                loops.enter()
             if reply is RULE:
                 return rule(*args, **kwargs) if kwargs else rule(*args)
             return reply if deliver is None else deliver(reply, *args, **kwargs)
@@ -118,91 +168,59 @@ class GreenletDriver(BaseDriver):
         self._asker = asker
         self.resume = (self._body if asker is None else asker).switch
 
-    # -- on the user's side -----------------------------------------------------------------------
 
-    def prepare(
-        self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
-    ) -> None:
-        """Prepare a job. The next ``resume`` begins to run it on the stack."""
+_abandoned: Final[list[GreenletDriver]] = []
+"""Drivers of simulations that did not unwind. Freeing a greenlet would resume it, at an arbitrary moment."""
+
+
+# -- asyncio --------------------------------------------------------------------------------------
+
+ASYNCIO: Final = "asyncio.events"
+"""The module that knows a thread's running event loop, whatever its stack. If it is not imported, no loop runs."""
+
+_NO_LOOP: Final = (None, (None, None))
+
+
+class _Loops:
+    """The asyncio event loops of a simulation and of its user, which share a thread.
+
+    Attributes:
+        running: Returns the loop that runs in this thread. None until it is known that asyncio is imported.
+        users: The user's loop and its hooks, while the simulation runs. None if there is nothing to restore.
+    """
+
+    __slots__ = ("_own", "running", "users")
+
+    def __init__(self) -> None:
+        self.running: Callable[[], Any] | None = None
+        self.users: Any = None
+        self._own: Any = None
+
+    def begin(self) -> None:
+        """Switch to the simulation for a new job, which begins without a loop."""
+        self._own = None
         self.enter()
-        if "gevent" in modules:
-            _share_hub(modules["gevent"].get_hub())
-        self._prepare(job, decisions, None)
-        # A new greenlet has an empty context, but the model expects the user's context variables.
-        self._body.gr_context = copy_context() if context is None else context
 
     def enter(self) -> None:
-        """Prepare to resume the simulation from the current greenlet.
+        """Switch to the simulation's loop."""
+        users, own = _present_loop(), self._own or _NO_LOOP
+        self.users = None if users[0] is None and own is _NO_LOOP else users
+        if self.users is not None:
+            _set_loop(own)
 
-        Raises:
-            WrongThreadError: The simulation belongs to another thread.
-        """
-        here = getcurrent()
-        if here is self._here:
-            return
-        if self._body is None or not self.reachable():
-            raise WrongThreadError(
-                "the simulation is suspended in another thread, the one that called reset(); step, reset and close the"
-                ' environment there, or make it with driver="thread", which allows any thread'
-            )
-        self._here, self._switch_out = here, here.switch
-        self._body.parent = here  # control returns here when the stack ends
-        # Inside another environment's simulation, ``enter`` is needed before each step, to hide that simulation.
-        self.caller = here if self._direct and here not in STACKS else None
-
-    def throw(self) -> Event:
-        """Raise ``SimulationExit`` in the suspended simulation; return its next event."""
-        self.enter()
-        if self._idle or not self._body:  # the job has ended, or was interrupted before it began
-            self._job = None
-            return nothing_to_end()
-        self._exiting = True
-        event: Event = (self._asker or self._body).throw(SimulationExit())
-        return event
-
-    def reachable(self) -> bool:
-        """Whether the simulation can be resumed from the current thread."""
-        return self._home() is _home()
-
-    def lost(self) -> bool:
-        """Whether the simulation's thread has ended, so that nothing can resume the simulation."""
-        return self._home() is None
-
-    @property
-    def usable(self) -> bool:
-        """Whether the current thread can start a job."""
-        return super().usable and not self._body.dead
-
-    def end(self) -> None:
-        """End the stack."""
-        if self._ended:
-            return
-        self._forget_stack()
-        body, self._body = self._body, None
-        self._asker = self._here = self._switch_out = self.caller = self.resume = None  # type: ignore[assignment]
-        if self._idle and self.reachable() and body:
-            body.parent = getcurrent()
-            body.throw()
-
-    def give_up(self) -> None:
-        """Abandon a job that does not unwind, and leave it suspended."""
-        self._forget_stack()
-        _given_up.append(self)
-
-    def forked(self) -> None:
-        """Handle a fork in the child process, in which only one thread is left."""
-        if self._thread != get_ident():
-            self._stay_behind()
+    def leave(self) -> None:
+        """Switch to the user's loop."""
+        self._own = _present_loop()
+        if self._own[0] is not None or self.users is not None:
+            _set_loop(self.users or _NO_LOOP)
 
 
-def _share_hub(hub: Any) -> None:
-    """Attach gevent's hub to its thread's main greenlet, even if a simulation was the first to use the hub."""
-    root = getcurrent()
-    while root.parent is not None:
-        root = root.parent
-    if hub.parent is not root:
-        hub.parent = root
+def _present_loop() -> tuple[Any, Any]:
+    events = modules.get(ASYNCIO)
+    return None if events is None else events._get_running_loop(), sys.get_asyncgen_hooks()
 
 
-_given_up: list[GreenletDriver] = []
-"""Simulations that did not unwind. They are kept, because freeing a greenlet resumes it, at an arbitrary moment."""
+def _set_loop(state: Any) -> None:
+    loop, hooks = state
+    modules[ASYNCIO]._set_running_loop(loop)
+    sys.set_asyncgen_hooks(*hooks)

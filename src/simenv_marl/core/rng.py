@@ -1,122 +1,103 @@
 """Separate states of Python's and NumPy's global random generators, for environments that ask for them.
 
 Models that draw from ``random`` and ``numpy.random`` share one state with the whole process. With ``global_rng=True``
-an environment has a state of its own, which is in place while the environment runs; afterwards the user's state is
-restored. The *owner* of the generators is the one whose state is in place. There always is exactly one owner.
+an environment has a state of its own, which is in place while the environment runs; afterwards the state of whatever
+ran before is restored.
 """
 
 from __future__ import annotations
 
 import random
 from _random import Random as Twister
-from collections.abc import Callable
-from ctypes import c_char, memmove, string_at
+from ctypes import memmove, string_at
 from sys import modules
 from threading import get_ident
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
 from ..errors import WrongThreadError
 
-_HEADER: Final = object.__basicsize__
-_WORDS: Final = 4 * 625  # bytes: the 624 words of a Mersenne twister, and the number of words that are used up
-
-_KEY: Final = 4 * 624
-"""The size, in bytes, of the words of a Mersenne twister. The number of used words follows them in memory."""
-
-_UNKNOWN: Final = (c_char * 4)()
-
 _python: Any = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
 _numpy: Any = np.random.mtrand._rand
 _legacy: Any = np.random  # NumPy's type stubs lack some of its functions
 
-
-class State(Protocol):
-    """A saved state of the global generators."""
-
-    def save(self) -> None:
-        """Save the state that is in place."""
-
-    def load(self) -> None:
-        """Put the saved state in place."""
-
-    def separate(self) -> None:
-        """Copy the bit generator, so that other code that draws from it does not change the saved state."""
+_HEADER: Final = object.__basicsize__
+_WORDS: Final = 4 * 625  # bytes: the 624 words of a Mersenne twister, and the number of words that are used up
 
 
-class PortableState:
-    """A state that the generators' own functions save and load. This takes about 150 microseconds."""
+class _State:
+    """A saved state of the global generators.
 
-    def save(self) -> None:
-        """Save the state that is in place."""
-        self._python, self._generator = random.getstate(), _legacy.get_bit_generator()
-        self._numpy = np.random.get_state(legacy=False)
-
-    def load(self) -> None:
-        """Put the saved state in place."""
-        random.setstate(self._python)
-        _legacy.set_bit_generator(self._generator)
-        np.random.set_state(self._numpy)
-
-    def separate(self) -> None:
-        """Copy the bit generator."""
-        self._generator = _copied(self._generator)
-        self._numpy |= self._generator.state  # a new state if the user has set a bit generator of another type
-
-
-class SwiftState:
-    """A state that is saved and loaded by copying memory. This takes about a microsecond; ``_is_swift`` tests it."""
+    Where the generators have the expected memory layout, their state is copied as bytes, which takes a microsecond.
+    Otherwise their own functions save and load it, which takes 150 microseconds.
+    """
 
     gauss_at = 0
-    """The offset in NumPy's generator of the second normally distributed number, which it keeps for the next call."""
+    """The offset in NumPy's generator of the second normally distributed number, which it keeps for the next call. 0:
+    the layout is not the expected one."""
 
     def save(self) -> None:
         """Save the state that is in place."""
-        self._python = string_at(id(_python) + _HEADER, _WORDS)
-        self._next = _python.gauss_next
         self._generator = _legacy.get_bit_generator()
-        self._gauss = string_at(id(_numpy) + self.gauss_at, 16)
+        if _State.gauss_at:
+            self._python: Any = string_at(id(_python) + _HEADER, _WORDS), _python.gauss_next
+            self._gauss: Any = string_at(id(_numpy) + self.gauss_at, 16)
+        else:
+            self._python, self._gauss = random.getstate(), np.random.get_state(legacy=False)
 
     def load(self) -> None:
         """Put the saved state in place."""
-        memmove(id(_python) + _HEADER, self._python, _WORDS)
-        _python.gauss_next = self._next
         _legacy.set_bit_generator(self._generator)  # this drops the number that NumPy keeps
-        memmove(id(_numpy) + self.gauss_at, self._gauss, 16)
+        if _State.gauss_at:
+            words, _python.gauss_next = self._python
+            memmove(id(_python) + _HEADER, words, _WORDS)
+            memmove(id(_numpy) + self.gauss_at, self._gauss, 16)
+        else:
+            random.setstate(self._python)
+            np.random.set_state(self._gauss)
 
     def separate(self) -> None:
-        """Copy the bit generator."""
-        self._generator = _copied(self._generator)
+        """Copy the bit generator, so that other code that draws from it does not change the saved state.
+
+        A generator of another type is replaced: ``numpy.random.seed`` can seed a Mersenne twister only.
+        """
+        twister = np.random.MT19937()
+        if type(self._generator) is np.random.MT19937:
+            twister.state = self._generator.state
+        self._generator = twister
+        if not _State.gauss_at:
+            self._gauss |= twister.state
 
 
-def _is_swift() -> bool:
-    """Test whether the generators have the expected memory layout. Leave their state unchanged."""
-    before, swift = PortableState(), SwiftState()
-    before.save()
+def _find_gauss() -> int:
+    """Return ``_State.gauss_at``: test whether a state that is copied as bytes is exact. Leave the generators alone."""
+    before, copied = random.getstate(), np.random.get_state(legacy=False)
+    generator = _legacy.get_bit_generator()
     try:
-        random.seed(1)
-        np.random.seed(1)
+        _legacy.set_bit_generator(np.random.MT19937(1))
         kept = _legacy.standard_normal(1) * 0 + _legacy.get_state(legacy=False)["gauss"]
         place = string_at(id(_numpy), type(_numpy).__basicsize__).find(kept.tobytes())
         if place < 8 + _HEADER or Twister.__basicsize__ not in range(_WORDS, _WORDS + 64):
-            return False
-        SwiftState.gauss_at = place - 8  # the flag before it says whether a number is kept
+            return 0
+        _State.gauss_at = place - 8  # the flag before it says whether a number is kept
         random.gauss(0, 1)
-        found = _draws(swift)
-        swift.load()
-        return found == _draws(None)
+        state = _State()
+        state.save()
+        state.separate()
+        first = _draws()
+        state.load()
+        return _State.gauss_at if first == _draws() else 0
     except Exception:  # any error means that the layout differs
-        return False
+        return 0
     finally:
-        before.load()
+        _legacy.set_bit_generator(generator)
+        np.random.set_state(copied)
+        random.setstate(before)
 
 
-def _draws(saved: State | None) -> list[float]:
-    """Save a state and draw from both generators; then seed them differently."""
-    if saved is not None:
-        saved.save()
-        saved.separate()
+def _draws() -> list[float]:
+    """Draw from both generators; then seed them differently."""
     drawn = [random.gauss(0, 1), np.random.standard_normal(), random.random(), np.random.random()]
     drawn += [random.gauss(0, 1), np.random.standard_normal()]
     random.seed(2)
@@ -125,66 +106,20 @@ def _draws(saved: State | None) -> list[float]:
     return drawn
 
 
-def _copied(generator: Any) -> Any:
-    """Copy a Mersenne twister, or make a new one if the generator is of another type.
-
-    ``numpy.random.seed`` can seed a Mersenne twister only.
-    """
-    twister = np.random.MT19937()
-    if type(generator) is np.random.MT19937:
-        twister.state = generator.state
-    return twister
-
-
-_State: Final[Callable[[], State]] = SwiftState if _is_swift() else PortableState
-
-
-class _Used:
-    """A reader of how many of the numbers that the generators have made in advance are used up."""
-
-    def __init__(self) -> None:
-        self._python = (c_char * 4).from_address(id(_python) + _HEADER) if _State is SwiftState else _UNKNOWN
-        self._generator: Any = None
-        self._numpy = _UNKNOWN
-
-    def __call__(self) -> tuple[bytes, bytes]:
-        generator = _numpy._bit_generator
-        if generator is not self._generator:
-            known = type(generator) is np.random.MT19937
-            self._numpy = (c_char * 4).from_address(generator.ctypes.state_address + _KEY) if known else _UNKNOWN
-            self._generator = generator
-        return self._python.raw, self._numpy.raw
-
-
-used_up: Final = _Used()
-"""Returns four bytes for Python's global generator and four for NumPy's. They change when a number is drawn."""
-
-
-class _Owner:
-    """An owner of the global generators, with a state of its own.
-
-    Attributes:
-        state: The owner's state, while it is not in place.
-        threads: The identifiers of the threads in which the owner's code may run.
-    """
-
-    def __init__(self) -> None:
-        self.state = _State()
-        self.threads: set[int] = set()
-
-
-_owners: Final = [_Owner()]
-"""The stack of owners. The first is the user; the last is the present owner."""
+_State.gauss_at = _find_gauss()
 
 
 class GlobalRandom:
     """The context in which a simulation has its own state of the global generators."""
 
+    _entered: Final[list[GlobalRandom]] = []
+
     def __init__(self) -> None:
         """Copy the present state, which is used until ``begin`` seeds it."""
-        self._owner = _Owner()
-        self._owner.state.save()
-        self._owner.state.separate()
+        self._own, self._thread = _State(), 0
+        self._outer: list[_State] = []
+        self._own.save()
+        self._own.separate()
 
     def begin(self, seed: int) -> None:
         """Seed both generators, whose state must be in place, with the seed of an episode."""
@@ -201,46 +136,36 @@ class GlobalRandom:
         Raises:
             WrongThreadError: The state of another environment, which runs in another thread, is in place.
         """
-        thread, now = get_ident(), _owners[-1]
-        if len(_owners) > 1 and thread not in now.threads:
+        thread = get_ident()
+        if self._entered and self._entered[-1]._thread != thread:
             raise WrongThreadError(
                 "two environments with global_rng=True ran in two threads at once, but a process has only one state of"
                 " the global generators; run them one after the other, or in separate processes"
             )
-        self._owner.threads.add(thread)
-        _owners.append(self._owner)
-        self._hand_over(now, self._owner)
+        self._thread = thread
+        if self not in self._entered[-1:]:
+            outer = _State()
+            outer.save()
+            self._own.load()
+            self._outer.append(outer)
+        self._entered.append(self)
 
     def leave(self) -> None:
         """Restore the state that was in place before."""
-        _owners.pop()
-        self._hand_over(self._owner, _owners[-1])
-        if self._owner not in _owners:
-            self._owner.threads.clear()
+        self._entered.pop()
+        if self not in self._entered[-1:]:
+            self._own.save()
+            self._outer.pop().load()
 
     def step_out(self) -> None:
         """Leave as often as this state was entered in a row."""
-        while _owners[-1] is self._owner:
+        while self in self._entered[-1:]:
             self.leave()
 
-    def around(self, run: Callable[[], Any]) -> Callable[[], Any]:
-        """Wrap a job of the simulation's stack, so that the job's thread is known as one of this owner's.
 
-        While the job runs the user waits, and so this state is in place.
-        """
-        threads = self._owner.threads
-
-        def run_and_tell() -> Any:
-            threads.add(get_ident())
-            return run()
-
-        return run_and_tell
-
-    @staticmethod
-    def _hand_over(before: _Owner, after: _Owner) -> None:
-        if before is not after:
-            before.state.save()
-            after.state.load()
+def global_state() -> tuple[Any, Any]:
+    """Return values that change when a number is drawn from Python's or NumPy's global generator."""
+    return random.getstate(), repr(_legacy.get_bit_generator().state)
 
 
 # -- other futures --------------------------------------------------------------------------------
@@ -312,14 +237,17 @@ class process_kept:  # noqa: N801 - it is used like a function
     """
 
     def __enter__(self) -> None:
-        self._before, torchs = PortableState(), _generator_of_torch()
-        self._before.save()
-        self._drawn = None if torchs is None else torchs.get_state()
+        torchs = _generator_of_torch()
+        self._python, self._numpy = random.getstate(), np.random.get_state(legacy=False)
+        self._generator = _legacy.get_bit_generator()
+        self._torch = None if torchs is None else torchs.get_state()
 
     def __exit__(self, *error: object) -> None:
-        self._before.load()
-        if self._drawn is not None:
-            _generator_of_torch().set_state(self._drawn)
+        random.setstate(self._python)
+        _legacy.set_bit_generator(self._generator)
+        np.random.set_state(self._numpy)
+        if self._torch is not None:
+            _generator_of_torch().set_state(self._torch)
 
 
 def _generator_of_torch() -> Any:

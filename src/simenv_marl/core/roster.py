@@ -10,16 +10,16 @@ from ..decision import DecisionPoint, Definition, unwrapped
 from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, short_repr
 from ..simulation import RULE
 from .asking import AskingPolicy, asks_for_environment, takes_info
-from .bound import BoundPoint, Policy
+from .point import Point
 from .points import NamedPoint, find_point
 
 
-def names_agents(policies: Mapping[Any, Any] | None) -> bool:
+def mentions_agents(policies: Mapping[Any, Any] | None) -> bool:
     """Whether a key of ``policies`` may name an agent, so that the agents of all points must be known."""
     return any(isinstance(key, str) and "." not in key for key in policies or {})
 
 
-def name_agents(named: list[NamedPoint]) -> list[str | None]:
+def agent_names(named: list[NamedPoint]) -> list[str | None]:
     """Name the agent of each point; None if a callable names it."""
     given = [point.definition.agent for point in named]
     owners: dict[str, str] = {}
@@ -46,12 +46,10 @@ def declared_agents(declared: Any) -> list[str]:
     return declared or []
 
 
-def call_the_roll(
-    active: list[BoundPoint], declared: Any, known: Collection[str | None]
-) -> tuple[dict[str, BoundPoint], bool]:
+def resolve_roster(active: list[Point], declared: Any, known: Collection[str | None]) -> tuple[dict[str, Point], bool]:
     """Find out which agents are known beforehand, and whether there can be no others."""
     named = [binding for binding in active if binding.agent is None]
-    names: dict[BoundPoint, list[Any]] = {}
+    names: dict[Point, list[Any]] = {}
     if isinstance(declared, Mapping):
         for key, value in declared.items():
             point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
@@ -69,7 +67,7 @@ def call_the_roll(
                 f" agents by a callable; here {len(named)} do"
             )
         names = dict.fromkeys(named, others)
-    roster: dict[str, BoundPoint] = {}
+    roster: dict[str, Point] = {}
     for binding in active:
         for name in names.get(binding, []) if binding.agent is None else [binding.agent]:
             if not isinstance(name, str) or name in roster:
@@ -78,7 +76,7 @@ def call_the_roll(
     return roster, not named or declared is not None
 
 
-def assign(
+def resolve_policies(
     policies: Mapping[Any, Any],
     named: list[NamedPoint],
     agents: list[str | None],
@@ -132,7 +130,7 @@ def _is_path(key: Any) -> bool:
     return bool(second) and (f"{first}.{second}" in modules or hasattr(modules.get(first), second))
 
 
-def two_arguments(policy: Callable[..., Any]) -> Policy:
+def two_arguments(policy: Callable[..., Any]) -> Callable[[Any, Any], Any]:
     """Make a policy callable with observation and info, even if it takes no info or asks for the environment."""
     if asks_for_environment(policy):
         return AskingPolicy(policy)

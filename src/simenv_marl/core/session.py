@@ -9,8 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from contextvars import Context, copy_context
+from enum import Enum
 from functools import partial
-from typing import Any
+from threading import current_thread
+from threading import enumerate as enumerate_threads
+from time import process_time_ns, thread_time_ns
+from typing import Any, Final
+from weakref import WeakSet
 from zlib import crc32
 
 import numpy as np
@@ -20,16 +25,41 @@ from gymnasium.utils import seeding
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..hooks.places import Held
 from ..simulation import closer, make_simulation, resetter
-from .contexts import Claim, at_work
-from .draws import WatchedDriver, is_watched, watched
-from .drivers import DRIVERS, run_job
-from .ending import refusal
-from .episode import LONGEST_TAPE, LOST, Episode, When
-from .forking import loops_on, sockets_of
+from .context import ExclusiveLock, environment_context
+from .driver import Driver
+from .episode import LONGEST_TAPE, LOST, Episode
 from .plan import Plan
-from .rng import GlobalRandom, is_seed
+from .prototype import DRIVERS
+from .resources import open_resources
+from .rng import GlobalRandom, global_state, is_seed
+from .run import refusal
 from .spaces import same
-from .switch import BaseDriver
+from .threads import SIMULATION
+
+_CHECKED: Final[WeakSet[type]] = WeakSet()
+"""The classes of simulations that were checked for draws from the global generators."""
+
+
+TOO_SHORT: Final = 5_000
+"""A time in nanoseconds that is too short for another thread to wake up and draw."""
+
+
+class State(Enum):
+    """What a session is doing, as far as its episode does not tell.
+
+    Attributes:
+        NEW: There was no episode yet.
+        COPIED: The same, and the session was copied from one with a running episode.
+        STARTING: The simulation is being reset or closed.
+        READY: There is an episode, or the latest one was ended.
+        CLOSED: The environment was closed.
+    """
+
+    NEW = "new"
+    COPIED = "copied"
+    STARTING = "resetting"
+    READY = "over"
+    CLOSED = "closed"
 
 
 class Session:
@@ -38,16 +68,16 @@ class Session:
     Attributes:
         plan: The plan of the environment.
         simulation: The simulation.
+        state: What the session is doing.
         seed: The seed of the latest episode.
         options: The options that the latest ``reset`` of the environment got.
         episode: The current or latest episode. None before the first one, and after it was closed.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
-        claim: The lock that lets one thread at a time use the environment. None if only one thread can use it.
     """
 
     __slots__ = (
-        "__weakref__", "_bound", "_closed", "_copied", "_driver", "_held", "_np_random", "_open", "_reset", "_rng",
-        "_starting", "_worn", "claim", "episode", "np_random_seed", "options", "plan", "seed", "simulation",
+        "__weakref__", "_driver", "_installed", "_lock", "_np_random", "_plan_of_simulation", "_reset", "_rng",
+        "_was_reset", "episode", "np_random_seed", "options", "plan", "seed", "simulation", "state",
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:
@@ -57,29 +87,26 @@ class Session:
             SimulationError: The plan's source does not make a simulation.
             PatchError: A function cannot be patched.
         """
-        self.plan = plan
+        self.plan, self.state = plan, State.NEW
         self.seed: int | None = None
         self.options: dict[str, Any] | None = None
         self.episode: Episode | None = None
         self.np_random_seed: int | None = None
         self._np_random: np.random.Generator | None = None
-        self._closed = self._copied = False
-        self._starting = False
-        self._open = False  # whether the simulation was reset and not closed since
-        self._worn = False  # whether it was given up: code that still uses it must not meet another episode
-        self._bound: tuple[Any, Any, Plan] | None = None  # the plan whose mappings have the simulation they ask for
-        self._held: Held | None = None
+        self._was_reset = False  # and not closed since
+        self._plan_of_simulation: tuple[Plan, Any, Plan] | None = None
+        self._installed: Held | None = None
+        self._driver: Driver | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
-        self.claim = Claim() if plan.options.driver == "thread" else None
-        self._driver: BaseDriver | None = None
+        self._lock = ExclusiveLock() if plan.options.driver == "thread" else None
         self.simulation: Any = None
-        self._hold_patches()
+        self._install()
         try:
-            spare = plan.spare()
-            if spare is None:
+            prototype = plan.prototype()
+            if prototype is None:
                 self._make_simulation()
             else:
-                self._driver, self.simulation = spare.taken()
+                self._driver, self.simulation = prototype.claim()
                 self._reset = resetter(self.simulation)
         except BaseException:
             self._put_away()
@@ -88,24 +115,24 @@ class Session:
     # -- the simulation's stack -------------------------------------------------------------------
 
     def _make_simulation(self) -> None:
-        with self.at_work():
+        with self.context():
             self.simulation = self._run(lambda: make_simulation(self.plan.source))
         self._reset = resetter(self.simulation)
 
     def _run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
         """Run a job on the simulation's stack, where decision functions run their rule."""
-        return run_job(self._usable_driver(), job if self._rng is None else self._rng.around(job), context)
+        return self._usable_driver().run(job, context)
 
-    def _usable_driver(self) -> BaseDriver:
+    def _usable_driver(self) -> Driver:
         """The driver of the simulation's stack. It is replaced if the stack has ended or belongs to another thread."""
         before = self._driver
         if before is None or not before.usable:
             if before is not None:
-                self._worn = self._worn or before.given_up is not None
                 before.end()  # first, so that an interrupt cannot leave an unknown stack behind
-            make = DRIVERS[self.plan.options.driver]
             # With ``global_rng`` each step must enter the simulation's own generators, and so is never direct.
-            self._driver = make(plugins=self.plan.plugins, before=before, direct=self._rng is None)
+            self._driver = DRIVERS[self.plan.options.driver](
+                self.plan.plugins, None if before is None else before.opened, direct=self._rng is None
+            )
         assert self._driver is not None
         return self._driver
 
@@ -113,15 +140,24 @@ class Session:
         """End the stack and remove the patches."""
         if self._driver is not None:
             self._driver.end()
-        self._let_go_of_patches()
+        if self._installed is not None:
+            self._installed.let_go()
+            self._installed = None
 
-    def at_work(self) -> AbstractContextManager[None]:
+    def _install(self) -> None:
+        """Set the plan's decision functions in the model, unless they are set."""
+        if self._installed is None or not self._installed.whole:
+            if self._installed is not None:
+                self._installed.let_go()
+            self._installed = Held(self.plan.patches)
+
+    def context(self) -> environment_context:
         """The context in which the environment's code must run."""
-        return at_work(self.plan.plugins, self._rng, self.claim)
+        return environment_context(self.plan.plugins, self._rng, self._lock)
 
-    def claimed(self) -> AbstractContextManager[None]:
+    def exclusive(self) -> AbstractContextManager[None]:
         """The context in which no other thread can use the environment."""
-        return nullcontext() if self.claim is None else self.claim
+        return nullcontext() if self._lock is None else self._lock
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -140,7 +176,8 @@ class Session:
         self,
         seed: int | None,
         options: dict[str, Any] | None,
-        when: When,
+        *,
+        in_rounds: bool = False,
         script: Iterable[Any] | None = None,
     ) -> Episode:
         """End the current episode, reset the simulation, and run it to its first decision.
@@ -148,87 +185,96 @@ class Session:
         Args:
             seed: The seed of the reset. None: a seed is drawn.
             options: The options that the environment's ``reset`` got.
-            when: When agents are settled.
+            in_rounds: Whether all agents are updated when a step returns.
             script: The tape of another episode to replay. None: this is an ordinary episode.
 
         Raises:
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any error of the model.
         """
-        with self.claimed():
+        with self.exclusive():
             self.end()
-            self._close_simulation()
+            self._close_simulation(last=False)
+            self.state = State.STARTING
             try:
-                self._closed, self._starting = False, True
-                return self._begin(seed, options, when, script)
+                return self._begin(seed, options, in_rounds, script)
             finally:
-                self._starting = False
+                self.state = State.NEW if self.episode is None else State.READY
 
-    def _close_simulation(self, *, last: bool = False) -> None:
+    def _close_simulation(self, *, last: bool) -> None:
         """Call the simulation's ``close`` on its stack, once for each successful reset. ``last``: no reset follows."""
-        close = closer(self.simulation) if self._open else None
+        close = closer(self.simulation) if self._was_reset else None
         if close is None:
             return
-        self._open, self._starting = False, True
+        state, self._was_reset, self.state = self.state, False, State.STARTING
         try:
-            with self.at_work():
+            with self.context():
                 self._run(partial(close, last))
         finally:
-            self._starting = False
-
-    def _plan_of_simulation(self) -> Plan:
-        """The plan in which mappings and policies that ask for the simulation or the session have it."""
-        if not self.plan.asks:
-            return self.plan
-        if self._bound is None or self._bound[0] is not self.plan or self._bound[1] is not self.simulation:
-            self._bound = self.plan, self.simulation, self.plan.with_simulation(self.simulation, self)
-        return self._bound[2]
+            self.state = state
 
     def _begin(
-        self,
-        seed: int | None,
-        options: dict[str, Any] | None,
-        when: When,
-        script: Iterable[Any] | None,
+        self, seed: int | None, options: dict[str, Any] | None, in_rounds: bool, script: Iterable[Any] | None
     ) -> Episode:
-        self._hold_patches()
+        self._install()
         self.options = options
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         else:
             self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
         self.seed = seed
-        if self._worn or (self._driver is not None and self._driver.given_up is not None):
-            self._make_simulation()
-            self._worn = False
-        context, watches = copy_context(), self._rng is None and is_watched(self.simulation)
+        if self._driver is not None and self._driver.given_up is not None:
+            self._make_simulation()  # code that still uses the old one must not meet another episode
+        context = copy_context()
+        checks_draws = self._rng is None and type(self.simulation) not in _CHECKED
+        before = (*global_state(), _time_of_others()) if checks_draws else None
         try:
-            with self.at_work():
+            with self.context():
                 if self._rng is not None:
                     self._rng.begin(seed)
-                reset = partial(self._run, partial(self._reset, seed, options), context)
-                if watches:
-                    watched(self.simulation, reset, in_thread=self.claim is not None)
-                else:
-                    reset()
+                self._run(partial(self._reset, seed, options), context)
         except BaseException as error:
             annotate(error, f"simenv_marl: while the simulation was reset; seed {seed}")
             raise
-        self._open = True
-        driver, plan = self._usable_driver(), self._plan_of_simulation()
-        run = self.simulation.run if self._rng is None else self._rng.around(self.simulation.run)
-        seen: Any = WatchedDriver(driver, self) if watches else driver
-        episode = Episode(plan, self.simulation, seen, seed, when, (self._rng, self.claim), script)
-        driver.prepare(run, episode.crossing(), context)
+        self._was_reset = True
+        driver = self._usable_driver()
+        episode = Episode(
+            self._bound_plan(), self.simulation, driver, seed, in_rounds=in_rounds, rng=self._rng, lock=self._lock,
+            script=script,
+        )  # fmt: skip
+        driver.begin(self.simulation.run, episode.events_by_hook(), context)
         try:
             self.episode = episode  # from now on the episode will be ended, even after an interrupt
-            episode.begin()
+            episode.begin(None if before is None else partial(self._check_draws, before))
         except BaseException:
             episode.over = True  # an interrupt may have come before the episode could set this
             if episode.unwound:
                 self.episode = None
             raise
         return episode
+
+    def _bound_plan(self) -> Plan:
+        """The plan in which mappings and policies that ask for the simulation or the session have it."""
+        if not self.plan.is_bound_to_simulation:
+            return self.plan
+        known = self._plan_of_simulation
+        if known is None or known[0] is not self.plan or known[1] is not self.simulation:
+            known = self.plan, self.simulation, self.plan.with_simulation(self.simulation, self)
+            self._plan_of_simulation = known
+        return known[2]
+
+    def _check_draws(self, before: tuple[Any, ...]) -> None:
+        """Warn if a simulation of a new class has drawn from the global generators before its first decision."""
+        kind = type(self.simulation)
+        _CHECKED.add(kind)
+        drawn = zip(("random", "numpy.random"), before, global_state(), strict=False)
+        names = [name for name, old, new in drawn if old != new]
+        if names and (_is_alone() or (self._lock is None and _time_of_others() - before[2] < TOO_SHORT)):
+            warn_user(
+                f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which all code in the"
+                " process shares: its environments influence each other, and a seed does not repeat an episode. Make"
+                " them with global_rng=True"
+            )
 
     def replay(self, other: Session) -> Episode:
         """Bring the simulation to the current decision of another session with the same plan.
@@ -247,14 +293,13 @@ class Session:
             raise BranchError(
                 f'the episode has more than {LONGEST_TAPE:,} decisions, so its actions were not kept; use method="fork"'
             )
-        generator = self.kept()
-        again = self.start(other.seed, other.options, episode.when, episode.tape)
-        self.take_over(generator)  # undo the seeding by ``start``: the other session may have drawn seeds since
-        answer = again.play if again.when is When.RETURN else again.step
+        snapshot = self.snapshot()
+        again = self.start(other.seed, other.options, in_rounds=episode.rounds is not None, script=episode.tape)
+        self.restore(snapshot)  # undo the seeding by ``start``: the other session may have drawn seeds since
         while again.script:
-            answer(again.script.popleft())
+            again.play(again.script.popleft())
         again.script = None
-        if not _stand_alike(again, episode):
+        if not _same_decision(again, episode):
             again.close()
             raise BranchError(
                 f"{type(self.simulation).__name__} does not repeat its decisions with the same seed and the same"
@@ -263,19 +308,95 @@ class Session:
             )
         return again
 
-    def opened(self) -> tuple[list[str], list[Any]]:
-        """Find the things that the simulation has opened and that a forked process would share.
+    def snapshot(self) -> dict[str, Any]:
+        """The state that a copy takes over: the latest seed, the generator, and whether an episode is under way."""
+        running = self.episode is not None and self.episode.pending is not None
+        return {
+            "seed": self.seed,
+            "np_random_seed": self.np_random_seed,
+            "_np_random": self._np_random,
+            "state": State.COPIED if running else State.NEW,
+        }
 
-        Returns:
-            A short description of each thing that cannot continue in a forked process; and the asyncio event loops,
-            which can.
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Take over the state that ``snapshot`` of another session returned."""
+        for name, value in snapshot.items():
+            setattr(self, name, value)
+
+    def refusal(self) -> Exception:
+        """Make the error that says why no action can be taken now."""
+        return refusal(self.state.value) if self.episode is None else self.episode.refusal()
+
+    def end(self) -> None:
+        """End the current episode, if there is one.
+
+        Raises:
+            ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
+            BaseException: Any error that the simulation raises while it unwinds.
         """
-        found = {} if self._driver is None else self._driver.children.alive()
-        loops = loops_on(found) if found else []
-        for loop in loops:
-            for number in sockets_of(loop):
-                found.pop(number, None)
-        return list(found.values()), loops
+        if self.state is State.STARTING:
+            raise refusal("resetting")
+        if self.episode is not None:
+            try:
+                with self.exclusive():
+                    self.episode.close()
+            finally:
+                if self.episode.unwound:
+                    self.episode = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is no episode to end and no patch to remove."""
+        return self.episode is None and self._installed is None
+
+    def render(self) -> Any:
+        """Render the simulation in the environment's render mode; without a render mode, warn and return None."""
+        mode = self.plan.options.render_mode
+        if mode is None:
+            warn_user(
+                "render() shows nothing without a render_mode; the simulation's render modes are"
+                f" {self.plan.model.render_modes}"
+            )
+            return None
+        with self.context():
+            return self.simulation.render(mode)
+
+    def close(self) -> None:
+        """Unwind the simulation and remove the patches.
+
+        Raises:
+            ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
+            BaseException: Any error that the simulation raises while it unwinds.
+        """
+        try:
+            self.end()
+        finally:
+            if self.episode is None and self.state is not State.STARTING:
+                self.state = State.CLOSED
+                try:
+                    self._close_simulation(last=True)
+                finally:
+                    self._put_away()
+
+    def abandon(self) -> None:
+        """Unwind the simulation and remove the patches, from a finalizer. Warn of errors instead of raising them."""
+        reachable = self._driver is not None and self._driver.reachable
+        try:
+            is_running = self.episode is not None and self.episode.running
+            if self.episode is not None:
+                self.episode.abandon()
+            if reachable or not is_running:  # otherwise the simulation has still to unwind, in another thread
+                self._close_simulation(last=True)
+        except Exception as error:
+            warn_user(f"a simulation that was abandoned raised {short_repr(error)} when it was closed", ResourceWarning)
+        finally:
+            self._put_away()
+
+    # -- branches ---------------------------------------------------------------------------------
+
+    def open_resources(self) -> dict[Any, str]:
+        """Describe what the simulation has opened that a forked process would share, by thing or descriptor."""
+        return {} if self._driver is None else open_resources(self._driver.opened)
 
     def step_out(self) -> None:
         """Restore the user's global generators in a branch that was forked from inside a policy."""
@@ -305,7 +426,7 @@ class Session:
             BaseException: Any error of the simulation's ``reseed``.
         """
         reseed = getattr(self.simulation, "reseed", None)
-        with self.at_work():
+        with self.context():
             if self._rng is not None:
                 self._rng.begin_anew(seed)
             if callable(reseed):
@@ -315,111 +436,18 @@ class Session:
                     annotate(error, f"simenv_marl: while the simulation was reseeded; seed {seed}")
                     raise
 
-    def kept(self) -> dict[str, Any]:
-        """The state that a copy takes over: the latest seed, the generator, and whether an episode is under way."""
-        return {
-            "seed": self.seed,
-            "np_random_seed": self.np_random_seed,
-            "_np_random": self._np_random,
-            "_copied": self.episode is not None and self.episode.pending is not None,
-        }
 
-    def take_over(self, kept: Mapping[str, Any]) -> None:
-        """Take over the state that ``kept`` of another session returned."""
-        for name, value in kept.items():
-            setattr(self, name, value)
-
-    def refusal(self) -> Exception:
-        """Make the error that says why no action can be taken now."""
-        if self.episode is not None:
-            return self.episode.refusal()
-        if self._starting:
-            return refusal("resetting")
-        return refusal("closed" if self._closed else "copied" if self._copied else "new")
-
-    def end(self) -> None:
-        """End the current episode, if there is one.
-
-        Raises:
-            ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
-            BaseException: Any error that the simulation raises while it unwinds.
-        """
-        if self._starting:
-            raise refusal("resetting")
-        if self.episode is not None:
-            try:
-                with self.claimed():
-                    self.episode.close()
-            finally:
-                if self.episode.unwound:
-                    self.episode = None
-
-    @property
-    def idle(self) -> bool:
-        """Whether there is no episode to end and no patch to remove."""
-        return self.episode is None and self._held is None
-
-    def render(self) -> Any:
-        """Render the simulation in the environment's render mode; without a render mode, warn and return None."""
-        mode = self.plan.options.render_mode
-        if mode is None:
-            warn_user(
-                "render() shows nothing without a render_mode; the simulation's render modes are"
-                f" {self.plan.render_modes}"
-            )
-            return None
-        with self.at_work():
-            return self.simulation.render(mode)
-
-    def close(self) -> None:
-        """Unwind the simulation and remove the patches.
-
-        Raises:
-            ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
-            BaseException: Any error that the simulation raises while it unwinds.
-        """
-        try:
-            self.end()
-        finally:
-            if self.episode is None and not self._starting:
-                self._closed = True
-                try:
-                    self._close_simulation(last=True)
-                finally:
-                    self._put_away()
-
-    def abandon(self) -> None:
-        """Unwind the simulation and remove the patches, from a finalizer. Warn of errors instead of raising them."""
-        try:
-            left = self.episode is not None and self.episode.running and not self._reachable()
-            if self.episode is not None:
-                self.episode.abandon()
-            if not left:  # otherwise the simulation has still to unwind, in another thread
-                self._close_abandoned()
-        finally:
-            self._put_away()
-
-    def _close_abandoned(self) -> None:
-        try:
-            self._close_simulation(last=True)
-        except Exception as error:
-            warn_user(f"a simulation that was abandoned raised {short_repr(error)} when it was closed", ResourceWarning)
-
-    def _reachable(self) -> bool:
-        return self._driver is not None and self._driver.reachable()
-
-    def _hold_patches(self) -> None:
-        if self._held is None or not self._held.whole:
-            self._let_go_of_patches()
-            self._held = Held(self.plan.patches)
-
-    def _let_go_of_patches(self) -> None:
-        if self._held is not None:
-            self._held.let_go()
-            self._held = None
+def _is_alone() -> bool:
+    """Whether no other thread can have drawn from the global generators while a simulation ran."""
+    return all(thread is current_thread() or thread.name == SIMULATION for thread in enumerate_threads())
 
 
-def _stand_alike(one: Episode, other: Episode) -> bool:
+def _time_of_others() -> int:
+    """The time in nanoseconds for which all other threads have run."""
+    return process_time_ns() - thread_time_ns()
+
+
+def _same_decision(one: Episode, other: Episode) -> bool:
     """Whether the pending decisions of two episodes look the same."""
     mine, theirs = one.pending, other.pending or other.consulted
     return (

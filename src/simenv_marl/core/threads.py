@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextvars import Context, copy_context
 from os import getpid
-from threading import Lock, Thread, current_thread, get_ident
+from threading import Lock, Thread, current_thread
 from time import monotonic
 from typing import Any, Final
 
@@ -13,11 +13,9 @@ from ..errors import WrongThreadError, warn_user
 from ..hooks.hook import Hook
 from ..hooks.stacks import Taker
 from ..simulation import RULE, Sentinel
-from .events import FAILED, STALLED
-from .loops import hush
-from .switch import SECONDS_TO_UNWIND, BaseDriver, Crossing, Event, SimulationExit, nothing_to_end
+from .driver import FAILED, FINISHED, NO_EVENTS, SECONDS_TO_UNWIND, Driver, Event, SimulationExit, reporting_rule
 
-_A_WHILE: Final = 1.0
+_LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
 
 SIMULATION: Final = "simulation"
@@ -29,93 +27,37 @@ _JOB: Final = Sentinel("JOB")
 _END: Final = Sentinel("END")
 
 
-class ThreadDriver(BaseDriver):
-    """A driver that runs a simulation in a thread of its own. The first ``prepare`` starts it, and ``end`` joins it.
+class ThreadDriver(Driver):
+    """A driver that runs a simulation in a thread of its own. The first ``begin`` starts it, and ``end`` joins it.
 
     Only one of the two threads runs at a time. They hand over values in ``_reply`` and ``_event``. Each of these has a
     lock that wakes the waiting thread. Only the values count, and not how often a lock was released. So a wait may be
     interrupted anywhere (by Ctrl-C, for instance), and the threads stay in step.
     """
 
-    __slots__ = ("_arrived", "_end", "_event", "_ident", "_process", "_reply", "_resumed", "_thread")
+    __slots__ = ("_arrived", "_context", "_event", "_outcome_event", "_process", "_reply", "_resumed", "_thread")
 
-    def __init__(self, *, plugins: Any = None, before: BaseDriver | None = None, direct: bool = True) -> None:
-        """Prepare a thread, as ``BaseDriver`` does; ``caller`` is always None."""
-        super().__init__(plugins=plugins, before=before)
+    own_thread = True
+
+    def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
+        """Prepare a thread, as ``Driver`` does; ``caller`` is always None."""
+        super().__init__(plugins, opened)
         self._process = getpid()
         self._resumed, self._arrived = Lock(), Lock()
         self._event: Event | None = None
-        self._end: Event | None = None
+        self._outcome_event: Event | None = None
         self._reply: Any = _NOTHING
         self._thread: Thread | None = None
-        self._ident: int | None = None
-
-    # -- in the simulation's thread ---------------------------------------------------------------
-
-    def _serve(self) -> None:
-        self._ident = get_ident()
-        self._begin()
-        try:
-            while not self._ended and (reply := self._wait()) is not _END:
-                if reply is _JOB:
-                    self._do()
-                reply = None
-        finally:
-            self._forget_stack()
-
-    def _do(self) -> None:
-        context: Any = self._context
-        self._context = None
-        try:
-            end: Event = context.run(self._work)
-        except BaseException as error:  # raised from another thread; without an event the user would wait for ever
-            end = FAILED, [error], None
-        context = None
-        if isinstance(end[1][0], SimulationExit):
-            # Nothing reads this traceback. Its frames must be freed while this thread runs, because the model's own
-            # greenlets can unwind in no other thread.
-            end[1][0].__traceback__ = end[1][0].__context__ = None
-        if self.lost():
-            self._ended = True
-            if end[0] is FAILED:
-                raise end[1].pop()  # the model has forked, and this process has no user to tell
-            return
-        self._idle = True
-        self._event = self._end = end
-        _wake(self._arrived)
-
-    def _wait(self) -> Any:
-        resumed = self._resumed
-        while self._reply is _NOTHING:
-            resumed.acquire()
-        reply, self._reply = self._reply, _NOTHING
-        return reply
-
-    def _decider(self, hook: Hook, event: Crossing, away: bool = False) -> Taker:
-        rule, deliver = self._rule_of(hook, event, away), event.deliver
-
-        def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-            self._event = (event, args, kwargs)
-            _wake(self._arrived)
-            reply = self._wait()
-            if reply is RULE:
-                return rule(*args, **kwargs)
-            if reply is _EXIT:
-                hush()
-                raise SimulationExit
-            return reply if deliver is None else deliver(reply, *args, **kwargs)
-
-        return decide
+        self._context: Context | None = None
 
     # -- in the user's thread ---------------------------------------------------------------------
 
-    def prepare(
-        self, job: Callable[[], Any], decisions: Mapping[Hook, Crossing] | None = None, context: Context | None = None
-    ) -> None:
-        """Prepare a job. The next ``resume`` begins to run it on the stack."""
+    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
+        """Prepare a job. The next ``resume`` starts it on the stack."""
         self.enter()
-        self._prepare(job, decisions, copy_context() if context is None else context)
-        self._event = self._end = None
+        self._job, self._events, self._refused = job, events, None
+        self._context = copy_context() if context is None else context
+        self._event = self._outcome_event = None
         if self._thread is None:
             self._start()
 
@@ -131,55 +73,57 @@ class ThreadDriver(BaseDriver):
             self._arrived.release()
             raise
 
-    def resume(self, reply: Any) -> Event:
-        """Resume the simulation with a reply; return its next event."""
-        self._reply = reply if self._job is None else _JOB
-        _wake(self._resumed)
-        arrived = self._arrived
-        while (event := self._event) is None:
-            arrived.acquire(True, _A_WHILE)
-        self._event = self._end = None
-        return event
-
-    def throw(self) -> Event:
-        """Raise ``SimulationExit`` in the suspended simulation; return its next event.
-
-        If the simulation still runs, because the user's wait was interrupted, the exit is raised at its next decision.
-        """
-        self.enter()
-        if self._thread is None or (self._idle and self._end is None and self._reply is not _JOB):
-            return nothing_to_end()
-        patience = monotonic() + SECONDS_TO_UNWIND
-        self._exiting = True
-        self._event = None
-        if not (self._idle and self._reply is _JOB):  # else the job begins, and gets the exit at its first decision
-            self._reply = _EXIT
-            _wake(self._resumed)
-        # ``_end`` keeps the end of the job, even if it came before this call.
-        while (event := self._end or self._event) is None:
-            left = patience - monotonic()
-            if left <= 0:
-                return STALLED, [], SECONDS_TO_UNWIND
-            self._arrived.acquire(timeout=left)
-        self._event = self._end = None
-        return event
-
     def enter(self) -> None:
         """Check that the simulation can be resumed from the current process.
 
         Raises:
             WrongThreadError: This process was forked, and the simulation's thread stayed behind.
         """
-        if self.lost():
+        if self.lost:
             raise WrongThreadError(
                 "this process was forked in mid-episode, but the simulation is suspended in a thread of the parent"
                 ' process; call reset(), or use driver="greenlet"'
             )
 
+    def resume(self, reply: Any) -> Event:
+        """Resume the simulation with a reply; return its next event."""
+        self._reply = reply if self._job is None else _JOB
+        _wake(self._resumed)
+        arrived = self._arrived
+        while (event := self._event) is None:
+            arrived.acquire(True, _LONGEST_WAIT)
+        self._event = self._outcome_event = None
+        return event
+
+    def throw(self) -> Event | None:
+        """Raise ``SimulationExit`` in the suspended simulation; return its next event, or None if none comes in time.
+
+        If the simulation still runs, because the user's wait was interrupted, the exit is raised at its next decision.
+        """
+        self.enter()
+        if self._thread is None or (self.idle and self._outcome_event is None and self._reply is not _JOB):
+            return FINISHED, [None], None
+        patience = monotonic() + SECONDS_TO_UNWIND
+        self._exiting = True
+        self._event = None
+        if not (self.idle and self._reply is _JOB):  # else the job begins, and gets the exit at its first decision
+            self._reply = _EXIT
+            _wake(self._resumed)
+        # ``_outcome_event`` keeps the end of the job, even if it came before this call.
+        while (event := self._outcome_event or self._event) is None:
+            left = patience - monotonic()
+            if left <= 0:
+                return None
+            self._arrived.acquire(timeout=left)
+        self._event = self._outcome_event = None
+        return event
+
+    @property
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from the current process."""
-        return not self.lost()
+        return not self.lost
 
+    @property
     def lost(self) -> bool:
         """Whether this process is a fork, in which the simulation's thread does not exist."""
         return getpid() != self._process
@@ -189,11 +133,11 @@ class ThreadDriver(BaseDriver):
 
         After an interrupt this can be called again.
         """
-        if self._ended and not self._idle:
+        if self.ended and not self.idle:
             return
         thread = self._thread
-        self._event = self._end = None
-        if self._idle and thread is not None and thread is not current_thread() and not self.lost():
+        self._event = self._outcome_event = None
+        if self.idle and thread is not None and thread is not current_thread() and not self.lost:
             self._reply = _END
             _wake(self._resumed)
             if thread.ident is not None:  # otherwise an interrupt came before the thread started
@@ -206,20 +150,65 @@ class ThreadDriver(BaseDriver):
         self._forget_stack()
         self._thread = None
 
-    def give_up(self) -> None:
-        """Abandon a job that does not unwind. If it decides again, it gets another chance to unwind."""
-        self._ended = True
-        self.children.driver = None  # decisions in threads that it has started run their rule
+    def abandon(self) -> None:
+        """Give up a job that does not unwind. If it decides again, it gets another chance to unwind."""
+        self.ended = True
 
-    def forked(self) -> None:
-        """Handle a fork in the child process, which runs in the simulation's own thread or lacks it."""
-        if self._ident == get_ident():
-            self._go_astray(
-                "a process that the simulation has forked, without the thread that steps the environment"
-                ' (driver="greenlet" needs no such thread)'
-            )
-        else:
-            self._stay_behind()
+    # -- in the simulation's thread ---------------------------------------------------------------
+
+    def _serve(self) -> None:
+        self._register()
+        try:
+            while not self.ended and (reply := self._wait()) is not _END:
+                if reply is _JOB:
+                    self._do()
+                reply = None
+        finally:
+            self._forget_stack()
+
+    def _do(self) -> None:
+        context: Any = self._context
+        self._context = None
+        try:
+            event: Event = context.run(self._work)
+        except BaseException as error:  # raised from another thread; without an event the user would wait for ever
+            event = FAILED, [error], None
+        context = None
+        if isinstance(event[1][0], SimulationExit):
+            # Nothing reads this traceback. Its frames must be freed while this thread runs, because the model's own
+            # greenlets can unwind in no other thread.
+            event[1][0].__traceback__ = event[1][0].__context__ = None
+        if self.lost:
+            self.ended = True
+            if event[0] is FAILED:
+                raise event[1].pop()  # the model has forked, and this process has no user to tell
+            return
+        self.idle = True
+        self._event = self._outcome_event = event
+        _wake(self._arrived)
+
+    def _wait(self) -> Any:
+        resumed = self._resumed
+        while self._reply is _NOTHING:
+            resumed.acquire()
+        reply, self._reply = self._reply, _NOTHING
+        return reply
+
+    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Taker:
+        deliver = event.deliver
+        rule = reporting_rule(hook, event, lambda report: self._decider(hook, report))
+
+        def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+            self._event = (event, args, kwargs)
+            _wake(self._arrived)
+            reply = self._wait()
+            if reply is RULE:
+                return rule(*args, **kwargs)
+            if reply is _EXIT:
+                raise SimulationExit
+            return reply if deliver is None else deliver(reply, *args, **kwargs)
+
+        return decide
 
 
 def _wake(lock: Any) -> None:

@@ -8,14 +8,14 @@ from typing import Any
 from greenlet import getcurrent
 
 from ..hooks.stacks import EVALUATING
-from .agent import WAIT
+from .driver import WAIT
 from .episode import Episode
 
 
 def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callable[[int, BaseException], None]) -> None:
     """Answer the pending decisions of many episodes, and run each episode to its next decision.
 
-    All simulations move before any agent is settled, so that the data of each loop stays in the processor's caches.
+    All simulations move before any agent is updated, so that the data of each loop stays in the processor's caches.
 
     Args:
         episodes: The episodes, of one plan. In each a decision is pending.
@@ -27,7 +27,7 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
     """
     agents: list[Any] = [episode.pending for episode in episodes]
     for number, agent in enumerate(agents) if None in agents else ():
-        if agent is None and not episodes[number].unheard:
+        if agent is None and not episodes[number].unreported_end:
             blame(number, error := episodes[number].refusal())
             raise error
     callers = {episode.driver.caller for episode in episodes}
@@ -50,10 +50,10 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
         events.reverse()  # popped one by one, so that the list keeps nothing alive that a model frees
         for number, episode in enumerate(episodes):  # noqa: B007 - the handler below needs the number
             event, args, kwargs = events.pop()
-            reply = event.arise(episode, args, kwargs)
+            reply = event.handle(episode, args, kwargs)
             if reply is not WAIT:
                 event = args = kwargs = None
-                episode.go_on(reply)
+                episode.advance(reply)
     except BaseException as error:
         events = event = args = kwargs = resume = None  # so that the error's traceback does not keep them alive
         for place, episode in enumerate(episodes):

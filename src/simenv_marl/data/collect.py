@@ -99,7 +99,7 @@ def learners_plan(
     keys = {key: entry.place for key, entry in found.items() if isinstance(entry, PolicyKey)}
     others = PolicyKey(len(found), BatchPolicy(_left_to_the_rule)) if all_points else None
     given = {**options, "policies": found}
-    return Plan.draw_up(simulation, points, given, unanswered=True, rewarded=True, others=others), keys
+    return Plan.draw_up(simulation, points, given, unattended=True, rewarded=True, others=others), keys
 
 
 def _left_to_the_rule(observations: Any) -> Any:

@@ -22,7 +22,7 @@ def check_knowable(
         if not defers(policies[key]):
             continue
         for point in plan.points:
-            if not point.recorded and answers(plan, point, places[key]):
+            if not point.report is not None and answers(plan, point, places[key]):
                 raise DefinitionError(
                     f"the actions of the rule of {point.point.name} are not known; give its make_step a"
                     " rule_action_mapping, which maps the rule's decision to an action"

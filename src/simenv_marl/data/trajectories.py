@@ -16,9 +16,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..core.agent import Agent
-from ..core.bound import BoundPoint
 from ..core.episode import Episode
 from ..core.plan import Plan
+from ..core.point import Point
 from ..core.spaces import blank
 from ..core.stacking import empty, joined, stack_masks, stacker, taken
 from ..errors import AgentError, OptionValueError, short_repr
@@ -440,7 +440,7 @@ def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
     )
 
 
-def answers(plan: Plan, point: BoundPoint, place: int) -> bool:
+def answers(plan: Plan, point: Point, place: int) -> bool:
     """Return whether it is known beforehand that the policy at this place answers at a decision point."""
     policy = point.policy if point.agent is None else plan.policies.get(point.agent, point.policy)
     return isinstance(policy, PolicyKey) and policy.place == place

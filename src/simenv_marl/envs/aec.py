@@ -6,14 +6,13 @@ from numpy import ndarray
 from pettingzoo import AECEnv
 
 from ..core.agent import Agent
-from ..core.episode import Episode, When
+from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.spaces import duplicate
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
+from .agents import AgentsView
 from .base import View
-from .padded import presence
-from .pettingzoo_base import AgentsView
 
 
 class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
@@ -21,9 +20,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     ``possible_agents`` exists only if all agents are known beforehand. The time for a step does not depend on the
     number of agents: PettingZoo's helpers for rewards and dead steps, which loop over all agents, are not used.
-
-    With ``padded=True``, ``agents`` has all of ``possible_agents`` until the episode ends. ``infos[agent]["present"]``
-    tells whether an agent lives. Agents that are not present are not selected before the end.
 
     Attributes:
         agents: The agents that have not yet taken the final ``None`` step of their episode.
@@ -64,10 +60,9 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        with self._session.claimed():
-            self._enter(self._start(seed, options, When.DECISION))
-            if self._shows:
-                self.render()
+        self._record(self._start(seed, options))
+        if self._shows:
+            self.render()
 
     def step(self, action: Any) -> None:
         """Answer the decision of ``agent_selection`` and run to the next one.
@@ -80,11 +75,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        claim = self._session.claim
-        if claim is not None and not claim.held:  # what comes of it is read under the claim, too
-            with claim:
-                SimulationAECEnv.step(self, action)
-            return
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()
@@ -104,7 +94,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             self._take_back_rewards()
         agent = episode.pending
         if agent is None or episode.just_ended:
-            self._enter(episode)
+            self._record(episode)
         else:
             self._select(agent)
         if self._shows:
@@ -189,38 +179,34 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             self._join(name)
         # It has had no other reward since its last step.
         self.rewards[name] = self._cumulative_rewards[name] = agent.reward
-        self.infos[name] = presence(agent) if self._padded else agent.info
+        self.infos[name] = agent.info
 
-    def _enter_reward(self, agent: Agent) -> None:
+    def _record_reward(self, agent: Agent) -> None:
         """Record the reward and the info of an agent that is not selected for its decision."""
         name, reward = agent.name, agent.reward
         self.rewards[name] = reward
         self._cumulative_rewards[name] += reward
         self._rewarded.append(name)
-        self.infos[name] = presence(agent) if self._padded else agent.info
+        self.infos[name] = agent.info
 
-    def _enter(self, episode: Episode) -> None:
+    def _record(self, episode: Episode) -> None:
         """Record the births and ends of a reset or a step."""
         if not self.agents:
             for name, agent in episode.agents.items():
                 self._join(name)
-                self.infos[name] = presence(agent) if self._padded else agent.info
+                self.infos[name] = agent.info
         for agent in episode.just_ended:
             if agent.name not in self.rewards:
                 self._join(agent.name)
-            self._enter_reward(agent)
-            if not self._padded:
-                self._dismiss(agent.name, terminated=True, truncated=False)
+            self._record_reward(agent)
+            self._dismiss(agent.name, terminated=True, truncated=False)
         if episode.over:
             terminated, truncated = episode.terminated, episode.truncated
-            if self._padded:
-                for name in episode.ended:
-                    self._dismiss(name, terminated=terminated, truncated=truncated)
             # Those that have never decided come last.
             for agent in sorted(episode.agents.values(), key=lambda agent: not agent.decided):
                 if agent.name not in self.rewards:
                     self._join(agent.name)
-                self._enter_reward(agent)
+                self._record_reward(agent)
                 self._dismiss(agent.name, terminated=terminated, truncated=truncated)
         self._leaving.reverse()
         if episode.pending is not None:

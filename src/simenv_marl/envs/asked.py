@@ -10,6 +10,7 @@ from gymnasium import spaces
 from ..core.agent import Agent
 from ..core.asking import AskingPolicy
 from ..core.session import Session
+from ..core.solo import single_out
 from ..errors import BranchError, CopyError, ReentrancyError
 from .single import SimulationEnv
 
@@ -46,7 +47,7 @@ class AskedEnv(SimulationEnv):
         if not self._branched:
             self._branched = True
             self._session.step_out()
-            self._running().single_out(self._own)
+            single_out(self._running(), self._own)
 
     def check_pending(self) -> None:
         """Make sure that the decision is pending.
@@ -94,14 +95,14 @@ class AskedEnv(SimulationEnv):
         Raises:
             BranchError: The replay does not reach the same decision.
         """
-        if self._running().alone:
+        if self._running().plan.solo:
             raise BranchError(
                 "a branch of the environment that a policy is given cannot be branched again by replay; use"
                 ' method="fork"'
             )
         session = Session(self._made_of)
         try:
-            session.take_over(copy.deepcopy(self._session.kept()))
+            session.restore(copy.deepcopy(self._session.snapshot()))
             session.replay(self._session)
             return type(self)(session)
         except BaseException:

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.provenance import describe
-from ..core.session import Session
+from ..core.session import Session, checked_seed
 from ..core.spaces import observation_cast
 from ..errors import UnknownOptionError, ViewError
 from ..hooks.plugins import Entry
@@ -27,11 +27,13 @@ class View:
         metadata: Its name, and the render modes of its simulation.
         render_mode: What ``render`` returns.
         takes: The options that only this view takes.
+        in_rounds: Whether all agents are updated when a step returns.
     """
 
     metadata: dict[str, Any]
     render_mode: str | None
     takes: ClassVar[tuple[str, ...]] = ()
+    in_rounds: ClassVar[bool] = False
     _together: tuple[spaces.Tuple[Any], spaces.Space[Any]] | None = None
 
     _finalizer: Any = None
@@ -71,7 +73,8 @@ class View:
     @staticmethod
     def metadata_of(plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": plan.render_fps}
+        model = plan.model
+        return {"name": f"{plan.name.lower()}_v0", "render_modes": model.render_modes, "render_fps": model.render_fps}
 
     @property
     def np_random(self) -> np.random.Generator:
@@ -134,7 +137,7 @@ class View:
         tell = getattr(self.simulation, "state", None)
         if not callable(tell):
             raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
-        with self._session.at_work():
+        with self._session.context():
             value = tell()
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 
@@ -180,11 +183,13 @@ class View:
                 # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
                 self._finalizer.detach()
 
-    def _make_way(self) -> None:
-        """End the running episode, and make sure that the next one ends if the environment is abandoned."""
+    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Episode:
+        """End the current episode, and begin another, which ends if the environment is abandoned."""
+        seed = checked_seed(seed)
         if self._finalizer is not None and not self._finalizer.alive:
             self._finalizer = weakref.finalize(self, self._session.abandon)
         self._end(self._session.end)
+        return self._session.start(seed, options, in_rounds=self.in_rounds)
 
     def _end(self, end: Callable[[], None]) -> None:
         """End the episode, and forget it unless that was refused."""
@@ -215,13 +220,13 @@ class View:
         return _made_again, (made, self._made_of), self._state(), None, None, _take_over
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
-        self._session.take_over(kept.pop("session"))
+        self._session.restore(kept.pop("session"))
         vars(self).update(kept)
 
     def _state(self) -> dict[str, Any]:
         """Return what a copy takes over."""
         kept = {name: value for name, value in vars(self).items() if name not in _OWN}
-        return kept | {"session": self._session.kept()}
+        return kept | {"session": self._session.snapshot()}
 
     @property
     def driver(self) -> str:
@@ -238,9 +243,9 @@ class View:
         if self._running().pending is None:
             raise self._session.refusal()
 
-    def opened(self) -> tuple[list[str], list[Any]]:
-        """Return what the simulation has opened that a forked process would share: see ``Session.opened``."""
-        return self._session.opened()
+    def open_resources(self) -> dict[Any, str]:
+        """Describe what the simulation has opened that a forked process would share: see ``Session``."""
+        return self._session.open_resources()
 
     def check_reseed(self) -> None:
         """Check that the random numbers ahead can be drawn anew: see ``Session.check_reseed``."""

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, iterate
 
-from ..core.bound import BoundPoint
+from ..core.point import Point
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
 
@@ -39,7 +39,7 @@ class Actions:
         complete: Whether this check is complete, so that the simulations need not check the actions.
     """
 
-    def __init__(self, space: spaces.Space[Any], number: int, point: BoundPoint | None) -> None:
+    def __init__(self, space: spaces.Space[Any], number: int, point: Point | None) -> None:
         """Prepare for batches of a space.
 
         Args:

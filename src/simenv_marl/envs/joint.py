@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from ..core.bound import BoundPoint
-from ..core.episode import Episode, When
+from ..core.episode import Episode
 from ..core.plan import Plan
+from ..core.point import Point
 from ..core.session import Session
 from ..core.spaces import duplicate
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE
-from .gymnasium_base import OneAgentView
+from .one_agent import OneAgentView
 
 
 class Joint:
@@ -25,7 +25,7 @@ class Joint:
         observation_space, action_space: The combined spaces: see ``SimulationJointEnv``.
     """
 
-    def __init__(self, roster: Mapping[str, BoundPoint], *, flatten: bool) -> None:
+    def __init__(self, roster: Mapping[str, Point], *, flatten: bool) -> None:
         """Combine the spaces.
 
         Raises:
@@ -79,7 +79,7 @@ class Joint:
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
             raise InvalidActionError("RULE is not an action in vector environments; use joint_env, or policies=")
-        episode.check(actions)
+        episode.rounds.check(episode, actions)  # type: ignore[union-attr]
 
     def observe(self, episode: Episode) -> Any:
         """Return the observations of all agents; an agent that has ended keeps its last observation."""
@@ -139,6 +139,7 @@ class SimulationJointEnv(OneAgentView):
     """
 
     takes = ("flatten",)
+    in_rounds = True
     _agent = "joint"
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
@@ -162,7 +163,7 @@ class SimulationJointEnv(OneAgentView):
                     " declare them with possible_agents=, let the simulation announce them (expected_calls), or name"
                     " the one agent of a single view with agent="
                 )
-            with_seed = self._session.start(0, None, When.RETURN)
+            with_seed = self._session.start(0, None, in_rounds=True)
             roster = {name: agent.point for name, agent in with_seed.agents.items()}
             self._session.close()
             self._session.np_random_seed = None
@@ -187,11 +188,10 @@ class SimulationJointEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        with self._session.claimed():
-            episode = self._begin(seed, options, When.RETURN)
-            if self._shows:
-                self.render()
-            return self.joint.observe(episode), self.joint.inform(episode)
+        episode = self._start(seed, options)
+        if self._shows:
+            self.render()
+        return self.joint.observe(episode), self.joint.inform(episode)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a round with an action for each agent.
@@ -211,10 +211,6 @@ class SimulationJointEnv(OneAgentView):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        claim = self._session.claim
-        if claim is not None and not claim.held:  # results are read under the claim, too
-            with claim:
-                return SimulationJointEnv.step(self, action)
         episode, joint = self._running(), self.joint
         episode.play(joint.actions(episode, action))
         if self._shows:

@@ -5,13 +5,15 @@ from typing import Any
 
 from pettingzoo import ParallelEnv
 
-from ..core.episode import Episode, When
+from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.spaces import duplicate
 from ..simulation import Sentinel
+from .agents import AgentsView
 from .base import View
-from .padded import Results, of_present_agents, pad
-from .pettingzoo_base import AgentsView
+
+Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
+"""The results of a step: observations, rewards, terminations, truncations and infos, by agent."""
 
 
 class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
@@ -22,12 +24,11 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
     moves, and giving one action at a time makes turns. When the step returns, all live agents are observed and
     rewarded.
 
-    With ``padded=True``, ``agents`` has all of ``possible_agents`` until the episode ends. ``infos[agent]["present"]``
-    tells whether an agent lives.
-
     Attributes:
         agents: The live agents.
     """
+
+    in_rounds = True
 
     def __init__(self, plan: Plan) -> None:
         """Make the environment of a plan.
@@ -60,20 +61,19 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        with self._session.claimed():
-            episode = self._start(seed, options, When.RETURN)
-            self.agents = [*episode.agents, *(agent.name for agent in episode.untold)]
-            if self._shows:
-                self.render()
-            observations, _, _, _, infos = self._results(episode)
-            return observations, infos
+        episode = self._start(seed, options)
+        self.agents = [*episode.agents, *(agent.name for agent in episode.just_ended)]
+        if self._shows:
+            self.render()
+        observations, _, _, _, infos = self._results(episode)
+        return observations, infos
 
     def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
         """Play a round.
 
         Args:
             actions: A dict from live agent to an action in its action space, or ``RULE``. ``RULE`` instead of the dict
-                stands for ``RULE`` of all agents. After the end of the episode, an empty dict is accepted and has no
+                means ``RULE`` for every agent. After the end of the episode, an empty dict is accepted and has no
                 effect.
 
         Returns:
@@ -87,10 +87,6 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        claim = self._session.claim
-        if claim is not None and not claim.held:  # results are read under the claim, too
-            with claim:
-                return SimulationParallelEnv.step(self, actions)
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()
@@ -98,8 +94,6 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             return {}, {}, {}, {}, {}  # PettingZoo's own do so
         if isinstance(actions, Sentinel):
             actions = dict.fromkeys(episode.agents, actions)
-        elif self._padded and isinstance(actions, Mapping):
-            actions = of_present_agents(episode, self._plan.roster, actions)
         try:
             episode.play(actions)
         except BaseException:
@@ -133,10 +127,6 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             terminations[agent.name], truncations[agent.name] = True, False
         if episode.pending is not None:
             episode.pending.info["deciding"] = True
-        if self._padded:
-            pad(episode, self.possible_agents, results)
-            if not episode.over:
-                self.agents = list(self.possible_agents)
         return results
 
     def _clear(self) -> None:

@@ -13,15 +13,15 @@ from typing import Any
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate
 
-from ..core.episode import Episode, When
+from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.session import Session
 from ..core.stacking import stacker
 from ..core.together import step_all
 from ..errors import InvalidActionError, OptionValueError, annotate, short_repr
 from .batches import IGNORED, Batch, of_one
-from .gymnasium_base import OneAgentView
 from .joint import Joint, SimulationJointEnv
+from .one_agent import OneAgentView
 from .single import single_view, with_goals
 
 Told = list[tuple[int, dict[str, Any]]]
@@ -172,7 +172,7 @@ class Row:
             try:
                 if episode is None:
                     raise self.sessions[number].refusal()
-                if joint is not None and not episode.unheard:
+                if joint is not None and not episode.unreported_end:
                     joint.check(episode, action)
                 elif episode.pending is not None:
                     episode.pending.point.checked(action, self._agent, episode.pending.mask)
@@ -271,7 +271,7 @@ class Row:
     def _begin(self, number: int, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode. Return its first observation and info."""
         joint, session = self._common.joint, self.sessions[number]
-        episode = session.start(seed, options, When.DECISION if joint is None else When.RETURN)
+        episode = session.start(seed, options, in_rounds=joint is not None)
         if self._shows:
             session.render()
         if joint is not None:

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from ..core.actions import open_mask
 from ..core.agent import Agent
-from ..core.bound import asks_for_simulation
-from ..core.episode import Episode, When
+from ..core.episode import Episode
 from ..core.plan import Plan
+from ..core.point import asks_for_simulation
 from ..core.session import Session
 from ..decision import Definition
 from ..errors import ViewError
-from .gymnasium_base import OneAgentView
+from .one_agent import OneAgentView
 
 
 class SimulationEnv(OneAgentView):
@@ -59,7 +59,7 @@ class SimulationEnv(OneAgentView):
         """
         super().check(plan)
         if plan.one_agent is None:
-            points = ", ".join(binding.point.name for binding in plan.active)
+            points = ", ".join(point.point.name for point in plan.active)
             raise ViewError(
                 "the single view needs one active decision point whose agent= is not a callable, or the name of one"
                 f" agent; active are {points}. Name the agent with agent=, name one point in points=, answer the"
@@ -81,13 +81,11 @@ class SimulationEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        with self._session.claimed():
-            episode = self._begin(seed, options, When.DECISION)
-            self._own = own = episode.agent(self._agent)
-            assert own is not None
-            if self._shows:
-                self.render()
-            return own.observation, own.info
+        self._own = own = self._start(seed, options).agent(self._agent)
+        assert own is not None
+        if self._shows:
+            self.render()
+        return own.observation, own.info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision and run to the next one.
@@ -103,10 +101,6 @@ class SimulationEnv(OneAgentView):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        claim = self._session.claim
-        if claim is not None and not claim.held:  # results are read under the claim, too
-            with claim:
-                return SimulationEnv.step(self, action)
         episode = self._session.episode
         if episode is None:
             raise self._session.refusal()

@@ -22,7 +22,7 @@ from ..errors import (
     short_repr,
 )
 from .batches import Actions, Batch
-from .gymnasium_base import OneAgentView
+from .one_agent import OneAgentView
 from .rows import Row, SubEnvironments
 from .worker import Recipe
 from .workers import Workers

@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from ..core.agent import Agent
-from ..core.episode import Episode, When
+from ..core.asking import AskingPolicy
+from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.session import Session
 from ..data.collect import learners_plan
@@ -312,15 +313,15 @@ def play(plan: Plan, seed: int, metrics: Metrics, team: Callable[[Returns], Any]
         raise
     try:
         with outside_simulation():
-            episode = session.start(seed, None, When.DECISION)
+            episode = session.start(seed, None)
             own_random = plan.options.global_rng
             tally.moved(episode)
             while (agent := episode.pending) is not None:
                 tally.count(0, agent)
-                if agent.looks:
+                if isinstance(agent.policy, AskingPolicy):
                     agent.consultations += 1
                 try:
-                    with episode.at_work() if own_random else nullcontext():
+                    with episode.context() if own_random else nullcontext():
                         action = agent.policy(agent.observation, agent.info)
                 except BaseException as error:
                     episode.fail(error)

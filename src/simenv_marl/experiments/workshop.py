@@ -9,8 +9,8 @@ from functools import partial
 from operator import is_
 from typing import Any, Final, NamedTuple
 
-from ..core.drivers import Spare
 from ..core.plan import Plan
+from ..core.prototype import Prototype as Spare
 from ..core.provenance import describe, written_plainly
 from ..errors import OptionValueError, short_repr
 from .playing import Policies, contender_plan, telling
@@ -141,8 +141,8 @@ class Workshop:
         for name in ("variant", "parameters", "seed"):
             del described[name]
         base = written(described)
-        if plan.looked_at is not None:
-            drawn.insert(0, _Drawn(plan, _depended_on(plan.looked_at, variant), base))
+        if plan.inspected is not None:
+            drawn.insert(0, _Drawn(plan, _depended_on(plan.inspected, variant), base))
             del drawn[KEPT:]
         return plan, base
 

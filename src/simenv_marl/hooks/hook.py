@@ -20,7 +20,7 @@ from greenlet import getcurrent, greenlet
 from ..errors import PatchError
 from .attached import CALLS, ITEMS
 from .handlers import AROUND, Target
-from .stacks import EVALUATING, LOCK, STACKS, Taker, spawner_of, stack_of
+from .stacks import EVALUATING, LOCK, STACKS, THREADS, Taker, stack_of, starter_of
 
 _ABSENT: Final = object()
 
@@ -29,9 +29,11 @@ _TAKEN: Final = ("ABSENT", "NOTHING", "bind", "rule")
 
 _FILE: Final = "<stand-in for "
 
-_ASK: Final = "TAKERS.get(getcurrent(), elsewhere)({}, {})".format
+_ASK: Final = "(TAKERS.get(getcurrent()) or elsewhere)({}, {})".format
 
-_SPAWNED: Final = 'a greenlet that the simulation has spawned on another library\'s hub (driver="thread" allows that)'
+_RULE = "not TAKERS or not OTHERS and getcurrent().parent is None"
+"""Whether the rule decides at once: the hook has no takers, or its takers are all on stacks of simulations, and the
+call comes from the root of a thread."""
 
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 
@@ -40,24 +42,26 @@ _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await 
 # passed.
 _WITHOUT_ARGUMENTS = """
 {define} stand_in({names}):
-    if not TAKERS:
+    if {at_once}:
         return {rule}
     return {ask}
 """
 _WITH_ARGUMENTS = """
 {define} stand_in({positional}, /, **kwargs):
-    if TAKERS or kwargs or {last} is ABSENT:
+    if kwargs or {last} is ABSENT:
         args = {passed}
-        if not TAKERS:
+        if {at_once}:
             return {rule_as_passed}
         if kwargs or len(args) < {required}:
             bind(*args, **kwargs)
         return {ask}
-    return {rule}
+    if {at_once} or {wrong}:
+        return {rule}
+    return {ask_all}
 """
 _VARIADIC = """
 {define} stand_in(*args, **kwargs):
-    if not TAKERS:
+    if {at_once}:
         return {rule_as_passed}
     bind(*args, **kwargs)
     return {ask}
@@ -121,6 +125,7 @@ def generate(
         "rule": call(f"rule({', '.join(names)})"),
         "rule_as_passed": call("rule(*args, **kwargs)"),
         "ask": call(_ASK("args", "kwargs")),
+        "at_once": _RULE,
     }
     if signature is None:
         template = _VARIADIC
@@ -140,6 +145,8 @@ def generate(
             "passed": passed,
             "last": names[-1],
             "required": str(required),
+            "wrong": str(required > len(names)),  # the rule raises Python's own error
+            "ask_all": call(_ASK(f"({', '.join(names)},)", "kwargs")),
         }
     else:
         template = _VARIADIC
@@ -182,18 +189,44 @@ MADE_OF: Final[WeakKeyDictionary[Any, WeakSet[Hook]]] = WeakKeyDictionary()
 class _Takers(dict[Any, Taker]):
     """The takers of one hook. A stand-in that is pickled by value finds those of the process where it is unpickled."""
 
-    __slots__ = ("hook",)
+    __slots__ = ("hook", "others")
 
     def __init__(self, hook: Hook) -> None:
         super().__init__()
         self.hook = hook
+        self.others = _Others(hook)
+
+    def __setitem__(self, key: Any, taker: Taker) -> None:
+        super().__setitem__(key, taker)
+        if not isinstance(key, greenlet) or key.parent is None:
+            self.others.add(key)
+
+    def remove(self, key: Any) -> None:
+        """Remove the taker of a key, if there is one."""
+        self.pop(key, None)
+        self.others.discard(key)
 
     def __reduce__(self) -> Any:
-        return _takers_of, (self.hook,)
+        return getattr, (self.hook, "takers")
 
 
-def _takers_of(hook: Hook) -> _Takers:
-    return hook.takers
+class _Others(set[Any]):
+    """The keys of takers that are not the stack of a greenlet: roots of threads, plugins, None; and drivers of
+    simulations that have started threads.
+    """
+
+    __slots__ = ("_hook",)
+
+    def __init__(self, hook: Hook) -> None:
+        super().__init__()
+        self._hook = hook
+
+    def __reduce__(self) -> Any:
+        return _others_of, (self._hook,)
+
+
+def _others_of(hook: Hook) -> _Others:
+    return hook.takers.others
 
 
 class Elsewhere:
@@ -217,11 +250,7 @@ class Elsewhere:
             WrongThreadError: It is a decision, and the simulation cannot wait for its answer here.
         """
         hook = self.hook
-        here = getcurrent()
-        if here.parent is None and not EVALUATING and here not in STACKS:  # a thread of the user
-            taker = hook.takers.get(None)
-        else:
-            taker = hook.taker_at(here)
+        taker = hook.taker_at(getcurrent())
         if taker is not None:
             return taker(args, kwargs)
         rule = hook.rule
@@ -300,6 +329,7 @@ class Hook(Target):
             alone=self.alone,
             namespace={
                 "TAKERS": self.takers,
+                "OTHERS": self.takers.others,
                 "elsewhere": Elsewhere(self, made_with).__call__,
                 "getcurrent": getcurrent,
             },
@@ -357,11 +387,11 @@ class Hook(Target):
         elif plugins in self.slot and plugins is not None:
             self.takers[stack] = self.around(self.run_rule, plugins)
         else:
-            self.takers.pop(stack, None)
+            self.takers.remove(stack)
 
     def leave(self, stack: greenlet) -> None:
         """Remove the taker of a stack."""
-        self.takers.pop(stack, None)
+        self.takers.remove(stack)
 
     def around(self, inner: Taker, plugins: Any) -> Taker:
         """Return a taker that runs the handlers of plugins, or of the whole process, around ``inner``."""
@@ -382,19 +412,18 @@ class Hook(Target):
 
     def taker_at(self, here: greenlet) -> Taker | None:
         """Return the taker of a call in a greenlet; None if only the rule runs."""
-        stack = stack_of(here)
-        if stack is None:
+        driver = stack_of(here) if STACKS else None
+        if THREADS or hasattr(here, "spawning_greenlet"):
+            starter, where = starter_of(here)
+            if starter is not None and starter.decides(self):
+                taker: Taker = starter.refuse(self, where)
+                return taker
+        if driver is None:
             evaluation = EVALUATING.get(here)
             plugins = None if evaluation is None else evaluation.plugins
-            if plugins is None and STACKS:
-                spawner = spawner_of(here)
-                refuse = None if spawner is None else spawner.refusal_of(self, _SPAWNED)
-                if refuse is not None:
-                    taker: Taker = refuse
-                    return taker
         else:
-            plugins = stack.plugins
-            decide = stack.taker(self, here)
+            plugins = driver.plugins
+            decide = driver.taker(self)
             if decide is not None:
                 return self.around(decide, plugins)
         return self.takers.get(plugins) or self.takers.get(None)
@@ -406,7 +435,7 @@ class Hook(Target):
         for key, taker in list(takers.items()):
             if not isinstance(key, greenlet):
                 if key not in slot and (key is not None or self.rule is self.function):
-                    takers.pop(key, None)
+                    takers.remove(key)
                 continue
             inner = taker.args[2] if isinstance(taker, partial) else taker
             plugins = getattr(STACKS.get(key), "plugins", None)

@@ -1,9 +1,9 @@
 """The stacks of simulations, and the environment for which code on a stack is evaluated.
 
-A *stack* is a greenlet; a thread without greenlets has one, too, its root. ``STACKS`` has the stack of each simulation
-as long as it lives. A greenlet belongs to the simulation whose stack is the nearest among itself, its parent, the
-parent of that, and so on. While an environment evaluates something on the caller's side (mappings, policies, the
-clock), ``EVALUATING`` has an entry for the greenlet that runs it.
+A *stack* is a greenlet; a thread without greenlets has one, too, its root. ``STACKS`` has the driver of each simulation
+by its stack. A greenlet belongs to the simulation whose stack is the nearest among itself and its parents. All other
+code is the user's: there, decision functions run their rule. While an environment evaluates something on the user's
+side (mappings, policies, the clock), ``EVALUATING`` has an entry for the greenlet that runs it.
 
 Resuming or suspending a simulation changes nothing here, since other stacks have other keys.
 """
@@ -12,45 +12,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from multiprocessing.util import register_after_fork
-from threading import RLock
+from threading import RLock, Thread, current_thread
 from typing import Any, Final, Protocol
 
 from greenlet import getcurrent, greenlet
 
 Taker = Callable[[tuple[Any, ...], dict[str, Any]], Any]
-"""A participant in a call: it gets the positional and keyword arguments, and returns the result of the call."""
+"""A function that intercepts a call. It gets the positional and keyword arguments, and returns the call's result."""
 
 LOCK: Final = RLock()
 """Held while patches or handlers change. Calls do not need it."""
-
-
-class Stack(Protocol):
-    """What hooks need to know of a simulation's stack.
-
-    Attributes:
-        plugins: The plugins of the simulation's environment; None if it has none.
-    """
-
-    plugins: Any
-
-    def taker(self, hook: Any, here: greenlet) -> Taker | None:
-        """Return what decides a call in a greenlet of the simulation; None for the rule with its handlers."""
-
-    def refusal_of(self, hook: Any, where: str) -> Taker | None:
-        """Return a taker that refuses a decision where the simulation cannot wait; None if it is not a decision."""
-
-    def hide(self) -> None:
-        """Take no part in calls on the simulation's stack until ``show``."""
-
-    def show(self) -> None:
-        """Take part again."""
-
-    def forked(self) -> None:
-        """React to a fork, in the child process."""
-
-    def forked_worker(self) -> None:
-        """React to a fork by which the simulation started a ``multiprocessing`` worker, in the worker."""
 
 
 class Evaluation(Protocol):
@@ -70,17 +41,14 @@ class Evaluation(Protocol):
         """The plugins that take part."""
 
 
-class Outside:
-    """The entry in ``STACKS`` for a simulation's stack on which another environment runs."""
-
-    def __repr__(self) -> str:
-        return "OUTSIDE"
-
-
-OUTSIDE: Final = Outside()
+OUTSIDE: Final = object()
+"""The entry in ``STACKS`` for a simulation's stack on which another environment runs."""
 
 STACKS: Final[dict[greenlet, Any]] = {}
-"""The stacks of simulations, by greenlet: a ``Stack`` for each, or ``OUTSIDE``."""
+"""The driver of each simulation by its stack, or ``OUTSIDE``."""
+
+THREADS: Final[dict[Thread, Any]] = {}
+"""The threads that simulations have started, each with the driver of its simulation."""
 
 EVALUATING: Final[dict[greenlet, Evaluation]] = {}
 """The running evaluation of each greenlet. Code that sets an entry restores the previous one."""
@@ -91,42 +59,39 @@ DIFFERENCES: Final[list[str]] = []
 
 
 def stack_of(here: greenlet | None) -> Any:
-    """Return the simulation's stack to which a greenlet belongs; None if it belongs to none."""
+    """Return the driver of the simulation to which a greenlet belongs; None if it belongs to none."""
     while here is not None:
-        stack = STACKS.get(here)
-        if stack is not None:
-            return None if stack is OUTSIDE else stack
+        driver = STACKS.get(here)
+        if driver is not None:
+            return None if driver is OUTSIDE else driver
         here = here.parent
     return None
 
 
-def spawner_of(here: greenlet) -> Any:
-    """Return the simulation's stack that spawned a greenlet on another hub, as gevent does; or None."""
-    spawned: Any = here
-    for _ in range(100):
-        spawner = getattr(spawned, "spawning_greenlet", None)
-        spawner = spawner() if callable(spawner) else spawner  # a weak reference
-        if spawner is None:
-            break
-        stack = stack_of(spawner)
-        if stack is not None:
-            return stack
-        spawned = spawner
-    # The greenlet that spawned this one may be gone, but all descendants of one stack share a dict.
-    tree = getattr(spawned, "spawn_tree_locals", None)
-    if tree is not None:
-        for stack in list(STACKS):
-            if getattr(stack, "spawn_tree_locals", None) is tree:
-                return stack_of(stack)
-    return None
+def starter_of(here: Any) -> tuple[Any, str]:
+    """Find the simulation that has started the code in a greenlet, where that simulation cannot wait for a decision.
+
+    Returns:
+        Its driver and a description of the place; None and an empty string if no simulation has started it.
+    """
+    driver = THREADS.get(current_thread()) if THREADS else None
+    if driver is not None:
+        return driver, "a thread that the simulation has started"
+    spawner = getattr(here, "spawning_greenlet", None)  # gevent spawns on a hub of its own
+    while spawner is not None and (here := spawner()) is not None:
+        driver = stack_of(here)
+        if driver is not None:
+            return driver, 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
+        spawner = getattr(here, "spawning_greenlet", None)
+    return None, ""
 
 
 def plugins_at_work() -> Any:
     """Return the plugins that take part here. None: only the handlers of the whole process."""
     here = getcurrent()
-    stack = stack_of(here) if STACKS else None
-    if stack is not None:
-        return stack.plugins
+    driver = stack_of(here) if STACKS else None
+    if driver is not None:
+        return driver.plugins
     evaluation = EVALUATING.get(here)
     return None if evaluation is None else evaluation.plugins
 
@@ -140,7 +105,7 @@ class outside_simulation:  # noqa: N801 - it is used like a function
     dataclasses.
     """
 
-    __slots__ = ("_before", "_evaluation", "_here", "_hidden", "_mask")
+    __slots__ = ("_before", "_driver", "_entry", "_evaluation", "_here")
 
     def __init__(self, evaluation: Evaluation | None = None) -> None:
         """Prepare the separation.
@@ -152,54 +117,35 @@ class outside_simulation:  # noqa: N801 - it is used like a function
 
     def __enter__(self) -> None:
         self._here = here = getcurrent()
-        self._before = EVALUATING.get(here)
-        self._hidden = stack_of(here) if STACKS else None
-        self._mask = STACKS.get(here)
-        if self._hidden is not None:
-            if self._mask is not None:
-                self._hidden.hide()
+        self._before, self._entry = EVALUATING.get(here), STACKS.get(here)
+        self._driver = stack_of(here) if STACKS else None
+        if self._driver is not None:
+            if self._entry is not None:
+                self._driver.hide()
             STACKS[here] = OUTSIDE
-        self._put(EVALUATING, self._evaluation)
-
-    def __del__(self) -> None:
-        # An interrupt at the entry of ``__exit__`` kept it from running.
-        if hasattr(self, "_mask") and EVALUATING.get(self._here) is self._evaluation:
-            outside_simulation.__exit__(self)
+        _put(EVALUATING, here, self._evaluation)
 
     def __exit__(self, *error: object) -> None:
-        self._put(EVALUATING, self._before)
-        if self._hidden is not None:
-            self._put(STACKS, self._mask)
-            if self._mask is not None:
-                self._hidden.show()
-        del self._here, self._hidden, self._mask, self._before
-
-    def _put(self, book: dict[greenlet, Any], value: Any) -> None:
-        if value is None:
-            book.pop(self._here, None)
-        else:
-            book[self._here] = value
+        _put(EVALUATING, self._here, self._before)
+        if self._driver is not None:
+            _put(STACKS, self._here, self._entry)
+            if self._entry is not None:
+                self._driver.show()
 
 
-def _in_the_child_of_a_fork() -> None:
-    for stack in [stack for stack in STACKS.values() if stack is not OUTSIDE]:
-        stack.forked()
-    here: greenlet | None = getcurrent()
-    kept = set()
-    while here is not None:
-        kept.add(here)
-        here = here.parent
-    for other in EVALUATING.keys() - kept:
-        del EVALUATING[other]
+def _put(entries: dict[greenlet, Any], here: greenlet, value: Any) -> None:
+    if value is None:
+        entries.pop(here, None)
+    else:
+        entries[here] = value
 
 
-def _in_a_forked_worker(_: object) -> None:
-    stack = stack_of(getcurrent())
-    if stack is not None:
-        stack.forked_worker()
+def _refuse_after_fork() -> None:
+    """In a process that a simulation has forked: refuse its decisions, because its user is in the other process."""
+    driver = stack_of(getcurrent()) or THREADS.get(current_thread())
+    if driver is not None:
+        driver.refuse_all("a process that the simulation has forked")
 
-
-register_after_fork(OUTSIDE, _in_a_forked_worker)  # only for multiprocessing: after a plain fork, both processes go on
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_in_the_child_of_a_fork)
+    os.register_at_fork(after_in_child=_refuse_after_fork)

@@ -17,9 +17,9 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from ..core.asking import AskingPolicy, asks_for_environment
-from ..core.bound import BoundPoint, DeferredPolicy
-from ..core.episode import Episode, When
-from ..core.plan import Plan
+from ..core.episode import Episode
+from ..core.plan import DeferredPolicy, Plan
+from ..core.point import Point
 from ..core.reuse import processes_kept
 from ..core.roster import two_arguments
 from ..core.session import Session
@@ -63,7 +63,7 @@ class BatchPolicy:
             return self.policy(observations, infos, identities)
         return self.policy(observations, infos)
 
-    def group(self, point: BoundPoint) -> Group:
+    def group(self, point: Point) -> Group:
         """Return the group of the decisions at a point."""
         group = next((group for group in self.groups if group.takes(point)), None)
         if group is None:
@@ -90,7 +90,7 @@ class PolicyKey(DeferredPolicy):
         self.asked = asked
         self._groups: dict[DecisionPoint, Group] = {}
 
-    def group(self, point: BoundPoint) -> Group:
+    def group(self, point: Point) -> Group:
         """Return the group of its decisions at a point."""
         group = self._groups.get(point.point)
         if group is None:
@@ -159,7 +159,7 @@ class Group:
 
     __slots__ = ("_discrete", "asked", "book", "observations", "places", "point", "stack", "waiting")
 
-    def __init__(self, asked: BatchPolicy, point: BoundPoint) -> None:
+    def __init__(self, asked: BatchPolicy, point: Point) -> None:
         self.asked, self.point = asked, point
         self.stack = stacker(point.definition.observation_space, cast=True)
         self.waiting: list[Episode] = []
@@ -169,7 +169,7 @@ class Group:
         self.book: Any = None
         self._discrete = not point.definition.action_space.shape
 
-    def takes(self, point: BoundPoint) -> bool:
+    def takes(self, point: Point) -> bool:
         """Return whether decisions at a point can be stacked with those of this group."""
         own, other = self.point.definition, point.definition
         return point is self.point or (
@@ -310,7 +310,6 @@ class _Batches:
     ) -> None:
         self._plan, self._seeds, self._size = plan, seeds, size
         self._finish, self._watcher = finish, watcher
-        self._when = When.NEVER if watcher is None else When.DECISION
         self._crowd = min(size, CROWD)
         self._next = 0
         self._sessions: dict[int, Session] = {}  # by the place of their seed
@@ -396,7 +395,7 @@ class _Batches:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
             self._sessions[place] = session
-            self._settle(place, session.start(seed, None, self._when))
+            self._settle(place, session.start(seed, None))
 
     def _end(self, place: int) -> None:
         session = self._sessions[place]

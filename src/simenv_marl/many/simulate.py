@@ -6,7 +6,6 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from ..core.episode import When
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
@@ -43,11 +42,11 @@ def simulate(
         SimEnvError: Something cannot work. The subclass tells what.
         BaseException: Any exception of the model, a mapping or a policy.
     """
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unattended=True)
     with processes_kept():  # policies may branch
         session = Session(plan)
         try:
-            session.start(checked_seed(seed), None, When.NEVER)
+            session.start(checked_seed(seed), None)
         except BaseException as error:
             close_after(error, session.close, "the simulation")
             raise
@@ -113,7 +112,7 @@ def simulate_many(
     check_collect(collect)
     arguments = (simulation, checked_policies(policies), points, collect, int(batch_size), options)
     # The plan is made here even if workers do the work: errors show up before any work starts.
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unanswered=True)
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unattended=True)
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:
             return _simulate(plan, collect, int(batch_size), checked, bar)
@@ -135,7 +134,7 @@ def _simulate_part(
     seeds: list[int],
 ) -> list[Any]:
     """Simulate a part of the seeds, in a worker process."""
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unanswered=True)
+    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
     return _simulate(plan, collect, batch_size, seeds, None)
 
 

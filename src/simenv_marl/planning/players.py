@@ -135,7 +135,7 @@ class Player:
                 raise OptionValueError(f"base must be RULE, a policy, or policies by agent, not {short_repr(base)}")
         for name in base if isinstance(base, Mapping) else ():
             if not self._may_be(name):
-                known = [*self.episode.agents, *self.episode.answered]
+                known = [*self.episode.agents, *self.episode.others]
                 raise UnknownAgentError(
                     f"base names {short_repr(name)}, which is not an agent here; the agents are:"
                     f" {known}{did_you_mean(name, known)}"

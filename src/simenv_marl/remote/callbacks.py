@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from greenlet import getcurrent
 
-from ..core.switch import SECONDS_TO_UNWIND, BaseDriver, SimulationExit
+from ..core.driver import SECONDS_TO_UNWIND, Driver, SimulationExit
 from ..hooks.stacks import stack_of
 
 
@@ -112,7 +112,7 @@ class CallbackGuard:
             return
         self._patience = monotonic() + SECONDS_TO_UNWIND
         driver = stack_of(getcurrent())
-        if isinstance(driver, BaseDriver):
+        if isinstance(driver, Driver):
             assert self._error is not None
             driver.stall(self._error, SECONDS_TO_UNWIND)
 

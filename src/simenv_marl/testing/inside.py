@@ -10,10 +10,10 @@ from typing import Any
 from greenlet import getcurrent
 
 from ..core.actions import MASK
-from ..core.contexts import at_work
+from ..core.context import environment_context
+from ..core.driver import SimulationExit
 from ..core.plan import Plan
 from ..core.rng import GlobalRandom
-from ..core.switch import SimulationExit
 from ..decision import DecisionPoint, Definition
 from ..envs.make import VIEWS, view_class
 from ..hooks.places import Held
@@ -100,7 +100,7 @@ def plain_loop(plan: Plan, *, watched: bool) -> Iterator[tuple[Reset, Main]]:
 
     held = Held(plan.patches if watched else ())
     try:
-        with at_work(plan.plugins, rng):
+        with environment_context(plan.plugins, rng):
             yield reset, main
     finally:
         held.let_go()

@@ -1,4 +1,4 @@
-"""Decision points bound to the definitions of one environment, ready to be called."""
+"""Decision points under the definitions of one environment, and the other events that a simulation sends."""
 
 from __future__ import annotations
 
@@ -7,28 +7,20 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from types import FunctionType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
 from ..errors import InvalidActionError, MaskError, short_repr, warn_user
+from ..simulation import RULE
 from . import actions, spaces
 from .actions import ILLEGAL, MASK
 from .points import NamedPoint
 
-Policy = Callable[[Any, dict[str, Any]], Any]
-"""A policy as the episode calls it: it takes the observation and the info, and returns the action."""
-
-
-class DeferredPolicy:
-    """A policy that answers many decisions in one call. An episode waits for it as it waits for the user."""
-
-    def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer one decision at once, in an episode that is a branch and waits for one agent only."""
-        raise NotImplementedError
-
+if TYPE_CHECKING:
+    from .episode import Episode
 
 MAPPINGS: Final = (
     "observation_space_mapping", "action_space_mapping", "reward_mapping", "apply", "choices", "rule_action_mapping",
@@ -81,12 +73,13 @@ def given_simulation(definition: Definition, simulation: Any) -> Definition:
     return replace(definition, **changes) if changes else definition
 
 
-class BoundPoint:
-    """A decision point bound to the definition of one environment. It holds no state of any episode.
+class Point:
+    """A decision point under the definition of one environment. It holds no state of any episode.
+
+    It is also the event of a decision there, if the deciding agent must be found.
 
     Attributes:
-        point: The decision point.
-        definition: The definition.
+        point, definition: The decision point and its definition.
         agent: The name of the agent. None if ``name_agent`` names it at each call.
         name_agent: A callable that takes the call's arguments and names the agent. None if ``agent`` names it.
         policy: The policy that answers all decisions of the point. None: the agents' own policies answer them, or the
@@ -100,43 +93,35 @@ class BoundPoint:
         legal: Returns the mask of a call, and its choices if it has any. None if all actions are always legal.
         deliver: Turns the reply, on the simulation's side, into the value that the decision function returns. None if
             the reply is that value.
-        tells: Whether infos contain the action that corresponds to a decision of the rule.
-        recorded: Whether the simulation reports the rule's decisions to the episode.
-        told: The event that reports them. None if they are not reported.
-        settle: Rewards and observes the agents of the point.
+        report: The event of the rule's decisions. None if they are not reported.
+        informs_rule_action: Whether infos contain the action that corresponds to a decision of the rule.
+        updates: The functions that reward and observe the agents of the point: see ``make_updates``.
         one_entity: Whether one object is expected to make all decisions, because the definition does not name agents.
     """
 
     __slots__ = (
-        "_inverse", "_rule_action", "agent", "cast", "check", "convert", "definition", "deliver", "finite", "legal",
-        "masked_parts", "name_agent", "observation_mapping", "one_entity", "point", "policy", "recorded",
-        "reward_mapping", "settle", "tells", "told",
+        "agent", "cast", "check", "convert", "definition", "deliver", "finite", "informs_rule_action", "legal",
+        "masked_parts", "name_agent", "observation_mapping", "one_entity", "point", "policy", "report",
+        "reward_mapping", "updates",
     )  # fmt: skip
 
     def __init__(
-        self,
-        named: NamedPoint,
-        agent: str | None,
-        policy: Policy | None = None,
-        *,
-        recorded: bool = False,
-        clips: bool = False,
+        self, named: NamedPoint, agent: str | None, policy: Any = None, *, records: bool = False, clips: bool = False
     ) -> None:
-        """Bind a decision point.
+        """Prepare a decision point.
 
         Args:
             named: The decision point and its definition.
             agent: The name of its agent. None if a callable names its agents.
             policy: The policy that answers all decisions of the point.
-            recorded: Whether decisions are recorded, including those of the rule.
+            records: Whether decisions are recorded, including those of the rule.
             clips: Whether actions outside a ``Box`` are clipped.
         """
         definition = named.definition
         self.point: DecisionPoint = named.point
         self.definition: Definition = definition
-        self.agent = agent
+        self.agent, self.policy = agent, policy
         self.name_agent: Any = definition.agent if agent is None else None
-        self.policy = policy
         self.reward_mapping: Any = definition.reward_mapping
         self.observation_mapping: Any = definition.observation_space_mapping
         self.cast = spaces.observation_cast(definition.observation_space)
@@ -144,16 +129,26 @@ class BoundPoint:
         self.check = (actions.clipping_check if clips else actions.action_check)(definition.action_space)
         self.convert: Any = definition.action_space_mapping or _same
         self.deliver = _delivery(definition, named.point.kind)
-        self.tells = definition.rule_action_mapping is not None
-        self._rule_action = _rule_action(definition.rule_action_mapping)
-        self._inverse = inverse(definition)
-        readable = definition.choices is not None or self._inverse is not None
-        self.recorded = self.tells or (recorded and readable)
-        self.masked_parts = _masked_parts(definition.observation_space)
-        self.told: Any = None
-        self.settle: Any = None
-        self.one_entity = definition.agent is None and named.point.hook.bound
         self.legal = _legal(definition, named.point.name)
+        self.masked_parts = _masked_parts(definition.observation_space)
+        self.informs_rule_action = definition.rule_action_mapping is not None
+        readable = definition.choices is not None or inverse(definition) is not None
+        self.report = RuleDecided(self) if self.informs_rule_action or (records and readable) else None
+        self.one_entity = definition.agent is None and named.point.hook.bound
+        self.updates: Any = None
+
+    def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Find the agent that decides, or let it join; then handle its decision."""
+        name = self.agent
+        if name is None:
+            name_agent = self.name_agent
+            name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
+            if name is None:
+                return RULE
+        agent = episode.agents.get(name) if type(name) is str else None
+        if agent is None or agent.point is not self:
+            agent = episode.agent_for(self, name)
+        return agent.handle(episode, args, kwargs)
 
     def warn_of_several(self, agent: str) -> None:
         """Warn once that several objects decide under the name of one agent."""
@@ -226,40 +221,6 @@ class BoundPoint:
             )
         return legal
 
-    def rule_action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any], choices: Any) -> Any:
-        """Find the action that a decision of the rule corresponds to.
-
-        Args:
-            decision: The decision.
-            args: The positional arguments of the call that was decided.
-            kwargs: Its keyword arguments.
-            choices: The choices of the call, if the point has choices.
-
-        Returns:
-            The action; None if no action corresponds.
-
-        Raises:
-            InvalidActionError: The corresponding action is not in the action space.
-        """
-        definition = self.definition
-        if self._rule_action is not None:
-            action = self._rule_action(decision, *args, **kwargs)
-            legal = None if action is None else self.check(action)
-            if legal is ILLEGAL:
-                raise InvalidActionError(
-                    f"rule_action_mapping of {self.point.name} maps the rule's decision {short_repr(decision)} to the"
-                    f" action {short_repr(action)}, which is not in its action space"
-                    f" {short_repr(definition.action_space)}"
-                )
-            return legal
-        if choices is not None:
-            same = (place for place, choice in enumerate(choices) if choice is decision or choice == decision)
-            return next(same, None)
-        try:
-            return None if self._inverse is None else self._inverse.get(decision)
-        except TypeError:  # the decision is not hashable
-            return None
-
 
 def _same(action: Any) -> Any:
     return action
@@ -273,67 +234,25 @@ def _masked_parts(space: gym_spaces.Space[Any]) -> list[str]:
     return [key for key, part in parts.items() if isinstance(part, gym_spaces.Dict) and MASK in part.spaces]
 
 
-# -- actions of the rule --------------------------------------------------------------------------
-
-
-def _rule_action(mapping: Any) -> Callable[..., Any] | None:
-    """Make ``rule_action_mapping``, a dict or a callable, a function of the decision and the call's arguments."""
-    if mapping is None:
-        return None
-    return _look_back(mapping) if isinstance(mapping, Mapping) else _of_decision(mapping)
-
-
-def _look_back(actions: Mapping[Any, Any]) -> Callable[..., Any]:
-    known = dict(actions)
-
-    def look_back(decision: Any, *args: Any, **kwargs: Any) -> Any:
-        try:
-            return known[decision]
-        except (KeyError, TypeError):
-            raise InvalidActionError(
-                "the dict rule_action_mapping has no action for the rule's decision"
-                f" {short_repr(decision)}; add one, or"
-                " pass a callable that returns None where no action corresponds"
-            ) from None
-
-    return look_back
-
-
-def _of_decision(mapping: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a mapping a function of the decision and the call's arguments, even if it takes the decision only."""
-    try:
-        parameters = list(inspect.signature(mapping).parameters.values())
-    except (TypeError, ValueError):
-        parameters = []
-    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    if any(p.default is p.empty for p in positional[1:]) or any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        return mapping
-    return lambda decision, *args, **kwargs: mapping(decision)
-
-
-# -- legal actions --------------------------------------------------------------------------------
-
-
 def _legal(definition: Definition, name: str) -> Callable[[Any, Any], tuple[Any, Any]] | None:
-    space: Any = definition.action_space
-    if definition.action_mask_mapping is not None:
-        return partial(_masked, definition.action_mask_mapping, actions.mask_cast(space))
-    if definition.choices is not None:
-        return partial(_chosen, definition.choices, int(space.n), name)
-    return None
+    """Make the function that returns the mask of a call, and its choices."""
+    mapping, choose, space = definition.action_mask_mapping, definition.choices, definition.action_space
+    if mapping is not None:
+        cast = actions.mask_cast(space)
+        return lambda args, kwargs: (cast(mapping(*args, **kwargs)), None)
+    if choose is None:
+        return None
+    most = int(space.n)  # type: ignore[attr-defined]
 
+    def legal(args: Any, kwargs: Any) -> tuple[Any, Any]:
+        choices = list(choose(*args, **kwargs))
+        if not 1 <= len(choices) <= most:
+            raise MaskError(f"{name} has {len(choices)} choices; its action space holds 1 to {most}")
+        mask = np.zeros(most, np.int8)
+        mask[: len(choices)] = 1
+        return mask, choices
 
-def _masked(mapping: Callable[..., Any], cast: Callable[[Any], Any], args: Any, kwargs: Any) -> tuple[Any, None]:
-    return cast(mapping(*args, **kwargs)), None
-
-
-def _chosen(mapping: Callable[..., Any], most: int, name: str, args: Any, kwargs: Any) -> tuple[Any, Any]:
-    choices = list(mapping(*args, **kwargs))
-    if not 1 <= len(choices) <= most:
-        raise MaskError(f"{name} has {len(choices)} choices; its action space holds 1 to {most}")
-    mask = np.zeros(most, np.int8)
-    mask[: len(choices)] = 1
-    return mask, choices
+    return legal
 
 
 # -- in the simulation ----------------------------------------------------------------------------
@@ -343,7 +262,7 @@ def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
     """Make the function that turns a reply into the value of a call; for a generator function that is a generator."""
     apply = definition.apply
     if definition.choices is not None:
-        apply = _unboxed if apply is None else partial(_applied, apply)
+        apply = partial(_deliver_choice, definition.apply)
     if kind == "function":
         return apply
     wrap = _returning if kind == "generator" else _awaiting
@@ -357,14 +276,9 @@ def _delivery(definition: Definition, kind: str) -> Callable[..., Any] | None:
     return deliver
 
 
-def _unboxed(box: list[Any], *args: Any, **kwargs: Any) -> Any:
+def _deliver_choice(apply: Callable[..., Any] | None, box: list[Any], *args: Any, **kwargs: Any) -> Any:
     """Take the choice out of its list. It crosses in a list so that the user's side keeps no reference to it."""
-    return box.pop()
-
-
-def _applied(apply: Callable[..., Any], box: list[Any], *args: Any, **kwargs: Any) -> Any:
-    """Call ``apply`` with the choice, which crosses in a list."""
-    return apply(box.pop(), *args, **kwargs)
+    return box.pop() if apply is None else apply(box.pop(), *args, **kwargs)
 
 
 def _returning(value: Any) -> Any:
@@ -374,3 +288,129 @@ def _returning(value: Any) -> Any:
 
 async def _awaiting(value: Any) -> Any:
     return value
+
+
+# -- other events -----------------------------------------------------------------------------------
+
+
+class Removal:
+    """The event of a call that ends the episode of agents: of a function that ``removed_by=`` names.
+
+    Attributes:
+        point: The function.
+        of: A tuple for each decision point whose agents it ends: the point; a callable that takes the call's arguments
+            and names the agent, or None; the class whose instances are such agents, or None if it is not known.
+        deliver, report: None, because the call always runs the function, and its result is not reported.
+    """
+
+    deliver = report = None
+
+    def __init__(self, point: DecisionPoint) -> None:
+        self.point = point
+        self.of: list[tuple[Point, Callable[..., Any] | None, type | None]] = []
+
+    def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Give the agents their last rewards and observations while their entities are whole; then run the call."""
+        named: list[tuple[Point, Any]] = []  # first all names, since ending an agent may change them
+        for point, name, owner in self.of:
+            if name is not None:
+                named.append((point, name(*args, **kwargs)))
+            elif args and (owner is None or isinstance(args[0], owner)):
+                found = point.agent or point.name_agent(args[0])
+                named.append((point, episode.named_before(point, args[0]) if found is None else found))
+        for point, name in named:
+            agent = episode.agents.get(name)  # type: ignore[call-overload]
+            if agent is not None and agent.point is point:
+                episode.end_agent(agent)
+        return RULE
+
+
+class EndAgent:
+    """The event of a call of the simulation's ``end_agent``.
+
+    Attributes:
+        deliver, report: None, because the call always runs the function, and its result is not reported.
+    """
+
+    deliver = report = None
+
+    def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """End the agent's episode if it is a live agent of the environment."""
+        name = kwargs["name"] if "name" in kwargs else args[1]
+        agent = episode.agents.get(name) if isinstance(name, str) else None
+        if agent is not None:
+            episode.end_agent(agent)
+        return RULE
+
+
+class RuleDecided:
+    """The event of a decision that the rule of a point has made.
+
+    Attributes:
+        point: The decision point.
+        deliver, report: None, because the simulation continues with its own decision.
+    """
+
+    deliver = report = None
+
+    def __init__(self, point: Point) -> None:
+        self.point = point
+        definition, mapping = point.definition, point.definition.rule_action_mapping
+        self._mapping = dict(mapping) if isinstance(mapping, Mapping) else mapping
+        self._decision_only = mapping is not None and not _takes_arguments(mapping)
+        self._inverse = None if mapping is not None or definition.choices is not None else inverse(definition)
+
+    def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """Note the action that corresponds to the decision. ``args``: the decision, its call's args and kwargs."""
+        decision, call_args, call_kwargs = args
+        point = self.point
+        name = point.agent or point.name_agent(*call_args, **call_kwargs)
+        agent = (episode.agents.get(name) or episode.others.get(name)) if type(name) is str else None
+        if agent is not None and agent.point is point:
+            episode.latest = agent
+            offered, agent.offered = agent.offered, None
+            agent.rule_action = action = self._action(decision, call_args, call_kwargs, offered)
+            agent.informs_rule_action = point.informs_rule_action and action is not None
+
+    def _action(self, decision: Any, args: tuple[Any, ...], kwargs: dict[str, Any], choices: Any) -> Any:
+        """Find the action that a decision corresponds to; None if no action does.
+
+        Raises:
+            InvalidActionError: The corresponding action is not in the action space, or the dict lacks the decision.
+        """
+        mapping, point = self._mapping, self.point
+        if mapping is None and choices is not None:
+            same = (place for place, choice in enumerate(choices) if choice is decision or choice == decision)
+            return next(same, None)
+        try:
+            if mapping is None:
+                return None if self._inverse is None else self._inverse.get(decision)
+            if isinstance(mapping, dict):
+                action = mapping[decision]
+        except (KeyError, TypeError):  # a TypeError: the decision is not hashable
+            if mapping is None:
+                return None
+            raise InvalidActionError(
+                f"the dict rule_action_mapping has no action for the rule's decision {short_repr(decision)}; add one,"
+                " or pass a callable that returns None where no action corresponds"
+            ) from None
+        if not isinstance(mapping, dict):
+            action = mapping(decision) if self._decision_only else mapping(decision, *args, **kwargs)
+        legal = None if action is None else point.check(action)
+        if legal is ILLEGAL:
+            raise InvalidActionError(
+                f"rule_action_mapping of {point.point.name} maps the rule's decision {short_repr(decision)} to the"
+                f" action {short_repr(action)}, which is not in its action space"
+                f" {short_repr(point.definition.action_space)}"
+            )
+        return legal
+
+
+def _takes_arguments(mapping: Any) -> bool:
+    """Whether a ``rule_action_mapping`` takes the call's arguments after the decision."""
+    try:
+        parameters = list(inspect.signature(mapping).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    return any(p.default is p.empty for p in positional[1:]) or any(p.kind is p.VAR_POSITIONAL for p in parameters)

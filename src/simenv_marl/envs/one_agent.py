@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.episode import Episode, When
-from ..core.session import checked_seed, seed_space
+from ..core.episode import Episode
+from ..core.session import seed_space
 from ..errors import ViewError
 from .base import View
 
@@ -85,10 +85,9 @@ class OneAgentView(View, gym.Env[Any, Any]):
         """The masks of all decisions that one step answers."""
         raise NotImplementedError
 
-    def _begin(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
+    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Episode:
         """End the current episode, begin another, and seed the generator and the spaces."""
-        seed = checked_seed(seed)
-        self._make_way()
+        episode = super()._start(seed, options)
         if seed is not None and self._own_spaces is not None:
-            self._seed_spaces(seed)
-        return self._session.start(seed, options, when)
+            self._seed_spaces(int(seed))
+        return episode

@@ -7,12 +7,12 @@ from typing import Any
 
 from gymnasium import spaces
 
-from ..core.bound import BoundPoint
-from ..core.episode import Episode, When
+from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.session import checked_seed, seed_space
+from ..core.point import Point
+from ..core.session import seed_space
 from ..core.spaces import duplicate
-from ..errors import OptionValueError, UnknownAgentError, ViewError, did_you_mean, short_repr
+from ..errors import UnknownAgentError, ViewError, did_you_mean, short_repr
 from .base import View
 
 
@@ -31,25 +31,20 @@ class AgentsView(View):
         Raises:
             SimEnvError: The plan does not work in this view.
         """
-        if plan.options.padded and not plan.complete:
-            raise OptionValueError("padded=True needs to know all agents: declare them in possible_agents=")
         super().__init__(plan)
         if plan.possible_agents is not None:
             self.possible_agents = plan.possible_agents
-        self._padded = plan.options.padded
         self._observation_spaces: dict[str, spaces.Space[Any]] = {}
         self._action_spaces: dict[str, spaces.Space[Any]] = {}
 
-    def _start(self, seed: int | None, options: dict[str, Any] | None, when: When) -> Episode:
+    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Episode:
         """End the current episode, begin another, and seed the agents' spaces."""
-        seed = checked_seed(seed)
-        self._make_way()
-        episode = self._session.start(seed, options, when)
+        episode = super()._start(seed, options)
         if not self._plan.complete:  # the agents of the last episode may never appear again
             self._observation_spaces, self._action_spaces = {}, {}
         elif seed is not None:
             for agent in self._action_spaces:
-                self._seed_spaces(agent, seed)
+                self._seed_spaces(agent, int(seed))
         return episode
 
     @classmethod
@@ -107,7 +102,7 @@ class AgentsView(View):
         """
         return {agent: self.action_space(agent) for agent in self.possible_agents}
 
-    def _point(self, agent: str) -> BoundPoint:
+    def _point(self, agent: str) -> Point:
         point = self._plan.roster.get(agent)
         if point is None:
             episode = self._session.episode
@@ -135,6 +130,6 @@ class AgentsView(View):
     def _observation(self, episode: Episode, agent: str) -> Any:
         """A copy of the latest observation of an agent."""
         found = episode.agent(agent)
-        if found is None or found.observation is None or (self._padded and found.ended):
+        if found is None or found.observation is None:
             return self._point(agent).blank()
         return duplicate(found.observation)

@@ -15,6 +15,7 @@ from pettingzoo.utils import wrappers
 from pettingzoo.utils.conversions import aec_to_parallel
 
 from simenv_marl import RULE, aec_env, make_step, parallel_env
+from simenv_marl.envs import pad_agents
 from tests.worlds.many_worlds import ROSTER, Announcing, Creature, Design, colony_points
 from tests.worlds.models import play
 
@@ -90,7 +91,10 @@ def world(request):
 
 def maker(world, view, **options):
     simulation, points, given = world
-    return partial(view, simulation, points, **given, **options)
+    given = given | options
+    padded = given.pop("padded", False)
+    make = partial(view, simulation, points, **given)
+    return (lambda **more: pad_agents(make(**more))) if padded else make
 
 
 def test_nothing_of_the_kit_is_left_out():
@@ -133,8 +137,8 @@ def test_numbers_of_rounds(name):
     def env(view, max_cycles):
         if simulation is Pasture:
             fed = partial(Pasture, max_cycles, initial_wolves=1, sheep_gain_from_food=1000.0)
-            return view(fed, points, **options)
-        return view(simulation, points, max_steps=max_cycles * (2 if view is aec_env else 1), **options)
+            return maker((fed, points, options), view)()
+        return maker(WORLDS[name], view, max_steps=max_cycles * (2 if view is aec_env else 1))()
 
     kit.max_cycles_test(SimpleNamespace(env=partial(env, aec_env), parallel_env=partial(env, parallel_env)))
 

@@ -14,6 +14,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 from pettingzoo.utils.conversions import parallel_to_aec, turn_based_aec_to_parallel
 
 from simenv_marl import RULE, TRUNCATED, aec_env, difference, generate_env, parallel_env
+from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     AgentError,
     ClosedError,
@@ -432,7 +433,8 @@ def test_a_mask_that_cannot_be_ends_the_episode(mask):
 def test_a_step_without_actions_after_the_end_brings_nothing(end, padded):
     """PettingZoo's own environments do so, and wrappers rely on it."""
     ant = decision(agent="ant_0")
-    env = parallel_env(calling(ant, ends=end), ant, padded=padded)
+    env = parallel_env(calling(ant, ends=end), ant)
+    env = pad_agents(env) if padded else env
     env.reset()
     env.step({"ant_0": 1})
     assert env.step({}) == ({}, {}, {}, {}, {})

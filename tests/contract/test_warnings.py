@@ -21,7 +21,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.core import draws
+from simenv_marl.core import session
 from simenv_marl.errors import ObservationError, UnknownPointError
 from tests.worlds.models import calling, decision, define, script
 
@@ -43,7 +43,7 @@ def heard():
 @pytest.fixture
 def _alone(monkeypatch):
     """As if no threads of other tests were left, beside which the driver of threads can blame no simulation."""
-    monkeypatch.setattr(draws, "enumerate_threads", lambda: [threading.current_thread()])
+    monkeypatch.setattr(session, "enumerate_threads", lambda: [threading.current_thread()])
 
 
 # -- global generators ----------------------------------------------------------------------------
@@ -52,17 +52,17 @@ decide = decision(agent="chooser")
 
 
 def gambler(draw, *, in_reset=False):
-    """A class of simulations that draw from what the process shares, once in each day."""
+    """A class of simulations that draw from what the process shares, in the reset or before the first decision."""
 
     class Gambler:
         def reset(self):
             self.drawn = [draw()] if in_reset else []
 
         def run(self):
-            for day in range(4):
+            if not in_reset:
+                self.drawn.append(draw())
+            for _ in range(4):
                 decide()
-                if day == 2 and not in_reset:
-                    self.drawn.append(draw())
 
     return Gambler
 
@@ -172,18 +172,13 @@ def test_threads_that_only_wait_are_no_excuse(heard) -> None:
     assert len(heard(DRAWS)) == 1
 
 
-def test_it_costs_nothing_once_enough_was_seen(monkeypatch) -> None:
-    monkeypatch.setattr(draws, "DECISIONS", 5)
-    seen = []
-    monkeypatch.setattr(
-        draws, "watched", lambda *args, inner=draws.watched, **kwargs: (seen.append(1), inner(*args, **kwargs))[1]
-    )
+def test_each_class_is_checked_at_its_first_reset_only(monkeypatch) -> None:
+    checked = []
+    monkeypatch.setattr(session, "global_state", lambda state=session.global_state: (checked.append(1), state())[1])
     kind = gambler(lambda: 0)
     for _ in range(3):
-        env = single_env(kind, decide)
-        play(env)
-    assert len(seen) == 4  # all but the reset, which was the first of five
-    assert type(env.unwrapped._session._driver).__name__ != "WatchedDriver"
+        play(single_env(kind, decide))
+    assert len(checked) == 2  # before the reset, and at the first decision
 
 
 # -- agents that never come -----------------------------------------------------------------------

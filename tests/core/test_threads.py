@@ -18,7 +18,7 @@ import pytest
 
 from simenv_marl import RULE, aec_env, joint_env, parallel_env, simulate, single_env
 from simenv_marl.core import threads
-from simenv_marl.core.contexts import Claim
+from simenv_marl.core.context import ExclusiveLock
 from simenv_marl.core.plan import Plan
 from simenv_marl.errors import ReentrancyError
 from tests.worlds.models import Script, calling, decision, notes, play, script
@@ -283,7 +283,7 @@ def test_a_move_that_is_about_to_begin_lets_no_other_pass(view, monkeypatch):
     decide = decision()
     env = view(calling(*[decide] * 4), decide, driver="thread")
     env.reset()
-    claims, enter = [], Claim.__enter__
+    claims, enter = [], ExclusiveLock.__enter__
 
     def slowly(claim):
         claims.append(threading.get_ident())
@@ -291,7 +291,7 @@ def test_a_move_that_is_about_to_begin_lets_no_other_pass(view, monkeypatch):
             in_a_thread(env.step, action)
         enter(claim)
 
-    monkeypatch.setattr(Claim, "__enter__", slowly)
+    monkeypatch.setattr(ExclusiveLock, "__enter__", slowly)
     env.step(action)
     assert len(set(claims)) == 2
     assert env.simulation.log == [1, 1]
@@ -303,7 +303,7 @@ def test_an_interrupt_leaves_an_environment_to_any_thread():
         if event == "c_return" and arg.__name__ == "acquire":
             raise KeyboardInterrupt
 
-    claim = Claim()
+    claim = ExclusiveLock()
     sys.setprofile(interrupt)
     try:
         with pytest.raises(KeyboardInterrupt), claim:

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.test import api_test, parallel_api_test, seed_test
 
-from simenv_marl import RULE, aec_env, generate_env, joint_env, parallel_env, single_env
-from simenv_marl.errors import AgentError, OptionValueError, UnknownAgentError
+from simenv_marl import RULE, aec_env, parallel_env, single_env
+from simenv_marl.envs import pad_agents
+from simenv_marl.errors import AgentError, UnknownAgentError, ViewError
 from tests.worlds.many_worlds import (
     ROSTER,
     Announcing,
@@ -31,9 +32,10 @@ from tests.worlds.models import decision, notes, script
 EVERYBODY = st.tuples(designs, seeds, st.sampled_from([Colony, Announcing]))
 
 
-def colony(design, kind, view, **options):
+def colony(design, kind, view, padded=False):
     overseen = bool(design.overseen)
-    return view(lambda: kind(design), colony_points(overseen=overseen), possible_agents=roster(overseen), **options)
+    env = view(lambda: kind(design), colony_points(overseen=overseen), possible_agents=roster(overseen))
+    return pad_agents(env) if padded else env
 
 
 def roster(overseen):
@@ -160,7 +162,7 @@ def generations(simulation):
 
 
 def test_the_removed_are_paid_at_once_and_blank_from_then_on():
-    env = parallel_env(script(generations), beings(), possible_agents=["being_1", "being_2"], padded=True)
+    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=["being_1", "being_2"]))
     observations, infos = env.reset(seed=0)
     assert observations["being_1"].tolist() == [1, 0]
     assert [infos[agent]["present"] for agent in env.agents] == [True, False]
@@ -185,14 +187,14 @@ def test_the_removed_are_paid_at_once_and_blank_from_then_on():
 
 @pytest.mark.parametrize("steps", [1, 2])
 def test_a_limit_of_time_truncates_all_alike(steps):
-    options = {"possible_agents": ["being_1", "being_2"], "padded": True, "max_steps": steps}
-    env = parallel_env(script(generations), beings(), **options)
+    options = {"possible_agents": ["being_1", "being_2"], "max_steps": steps}
+    env = pad_agents(parallel_env(script(generations), beings(), **options))
     env.reset(seed=0)
     for _ in range(steps):
         _, _, terminations, truncations, _ = env.step({"being_1": 1, "being_2": 1})
     assert truncations == {"being_1": True, "being_2": True}
     assert terminations == {"being_1": False, "being_2": False}
-    env = aec_env(script(generations), beings(), **options)
+    env = pad_agents(aec_env(script(generations), beings(), **options))
     env.reset(seed=0)
     for _ in range(steps):
         env.step(1)
@@ -223,7 +225,7 @@ def test_masks_are_open_and_clocks_go_on():
         observation_space_mapping=lambda being: {"health": being.health},
     )  # fmt: skip
     names = ["being_1", "being_2", "being_3"]
-    env = parallel_env(lambda: Timed(main), masked, possible_agents=names, padded=True)
+    env = pad_agents(parallel_env(lambda: Timed(main), masked, possible_agents=names))
     observations, infos = env.reset(seed=0)
     hours = [0.0]
     while True:
@@ -246,34 +248,27 @@ def test_nobody_comes_back():
         being.leave()
         being.act()
 
-    env = parallel_env(script(main), beings(), possible_agents=["being_1", "being_2"], padded=True)
+    env = pad_agents(parallel_env(script(main), beings(), possible_agents=["being_1", "being_2"]))
     env.reset(seed=0)
     with pytest.raises(AgentError, match="after its end"):
         env.step({"being_1": 1, "being_2": 1})
 
 
-def test_without_a_roster_there_is_nobody_to_pad():
+def test_padding_needs_a_roster():
     for view in (aec_env, parallel_env):
-        with pytest.raises(OptionValueError, match="possible_agents"):
-            view(script(generations), beings(), padded=True)
-    with pytest.raises(OptionValueError, match="padded"):
-        aec_env(script(generations), beings(), possible_agents=["being_1"], padded="yes")
-    made = generate_env(script(generations), beings(), view="parallel", padded=True)
-    assert made(possible_agents=["being_1", "being_2"]).possible_agents == ["being_1", "being_2"]
+        with pytest.raises(ViewError, match="possible_agents"):
+            pad_agents(view(script(generations), beings()))
 
 
-def test_views_of_one_agent_have_nobody_to_pad():
+def test_views_of_one_agent_are_not_padded():
     function = decision()
-    env = single_env(script(lambda simulation: function()), function, padded=True)
-    assert env.reset(seed=0)[0].tolist() == [1.0, 2.0]
-    env = joint_env(script(generations), beings(), possible_agents=["being_1", "being_2"], padded=True)
-    env.reset(seed=0)
-    assert not env.step({"being_1": 3, "being_2": 3})[2]
+    with pytest.raises(ViewError, match="aec_env or parallel_env"):
+        pad_agents(single_env(script(lambda simulation: function()), function))
 
 
 def test_errors_leave_it_as_errors_do():
     points = beings(reward_mapping=lambda being: 1 / (1 - being.health))
-    env = aec_env(script(generations), points, possible_agents=["being_1", "being_2"], padded=True)
+    env = pad_agents(aec_env(script(generations), points, possible_agents=["being_1", "being_2"]))
     env.reset(seed=0)
     with pytest.raises(ZeroDivisionError) as caught:
         env.step(1)
@@ -305,7 +300,7 @@ def test_what_a_round_tells_stands_in_the_order_of_the_roster():
                 being.act()
 
     names = ["being_0", "being_1", "being_2"]
-    env = parallel_env(script(main), beings(), possible_agents=names, padded=True)
+    env = pad_agents(parallel_env(script(main), beings(), possible_agents=names))
     told = env.reset()
     while env.agents:
         assert env.agents == names

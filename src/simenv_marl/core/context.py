@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from threading import RLock
 from typing import Any
 
@@ -14,10 +15,21 @@ class ExclusiveLock:
     """A lock for an environment that any thread may use, but only one at a time. One thread may enter it repeatedly."""
 
     def __init__(self) -> None:
-        self._lock = RLock()
+        self._lock: Any = RLock()  # ``_is_owned`` is private, but ``threading.Condition`` relies on it, too
+
+    @property
+    def held(self) -> bool:
+        """Whether the current thread uses the environment."""
+        return bool(self._lock._is_owned())
 
     def __enter__(self) -> None:
-        if not self._lock.acquire(blocking=False):
+        try:
+            acquired = self._lock.acquire(blocking=False)
+        except BaseException:  # an interrupt
+            with suppress(RuntimeError):
+                self._lock.release()
+            raise
+        if not acquired:
             raise ReentrancyError(
                 "the environment was used from inside its own simulation, or while another thread was stepping,"
                 " resetting or closing it; any thread may use it, but one at a time"

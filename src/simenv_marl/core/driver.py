@@ -23,7 +23,7 @@ from greenlet import getcurrent, greenlet
 
 from ..errors import SimulationError, WrongThreadError, annotate
 from ..hooks.hook import Hook
-from ..hooks.stacks import STACKS, THREADS, Taker
+from ..hooks.stacks import STACKS, Taker
 from ..simulation import TRUNCATED, Sentinel
 from .resources import watch_resources
 
@@ -109,12 +109,14 @@ class Driver:
         given_up: The reason why a job was given up. None if no job was.
         ended: Whether the stack has ended.
         idle: Whether no job is under way.
+        has_started_threads: Whether the simulation has started threads.
         opened: Weak references to the sockets, processes and threads that the simulation has opened: see
             ``open_resources``.
     """
 
     __slots__ = (
         "__weakref__", "_events", "_exiting", "_job", "_process_refused", "_refused", "caller", "ended", "given_up",
+        "has_started_threads",
         "idle", "opened", "plugins", "stack",
     )  # fmt: skip
 
@@ -135,7 +137,7 @@ class Driver:
         self.stack: greenlet | None = None
         self.caller: greenlet | None = None
         self.given_up: str | None = None
-        self.ended, self.idle, self._exiting = False, True, False
+        self.ended, self.idle, self._exiting, self.has_started_threads = False, True, False, False
         self._job: Any = None
         self._events = NO_EVENTS
         self._refused: WrongThreadError | None = None
@@ -285,8 +287,6 @@ class Driver:
         stack, self.stack = self.stack, None
         if stack is not None:
             STACKS.pop(stack, None)
-        for thread in [thread for thread, driver in list(THREADS.items()) if driver is self]:
-            THREADS.pop(thread, None)
         if not STACKS:
             watch_resources(False)
 
@@ -329,7 +329,7 @@ class Driver:
         if stack is not None:
             for hook in self._hooks():
                 hook.enter(stack, self._interceptor(hook), self.plugins)
-                if THREADS and self in THREADS.values():
+                if self.has_started_threads:
                     hook.takers.others.add(self)
 
     def _hooks(self) -> list[Hook]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import copy_context
@@ -16,6 +15,7 @@ from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Taker
 from ..simulation import RULE
 from .driver import FINISHED, NO_EVENTS, Driver, Event, SimulationExit, reporting_rule
+from .loops import ASYNCIO, Loops, silence_unwound_tasks
 
 
 def _root() -> greenlet:
@@ -42,7 +42,7 @@ class GreenletDriver(Driver):
         super().__init__(plugins, opened)
         self._direct = direct
         self._root = _root()
-        self._loops = _Loops()
+        self._loops = Loops()
         self._body: Any = greenlet(self._serve)
         self._asker: greenlet | None = None  # the model's own greenlet that waits for an answer
         self._leave: Any = None
@@ -152,6 +152,7 @@ class GreenletDriver(Driver):
                     if away:
                         driver._ask_from(None)
                     loops.enter()
+                    silence_unwound_tasks()
                 raise
             if away:
                 driver._ask_from(None)
@@ -171,56 +172,3 @@ class GreenletDriver(Driver):
 
 _abandoned: Final[list[GreenletDriver]] = []
 """Drivers of simulations that did not unwind. Freeing a greenlet would resume it, at an arbitrary moment."""
-
-
-# -- asyncio --------------------------------------------------------------------------------------
-
-ASYNCIO: Final = "asyncio.events"
-"""The module that knows a thread's running event loop, whatever its stack. If it is not imported, no loop runs."""
-
-_NO_LOOP: Final = (None, (None, None))
-
-
-class _Loops:
-    """The asyncio event loops of a simulation and of its user, which share a thread.
-
-    Attributes:
-        running: Returns the loop that runs in this thread. None until it is known that asyncio is imported.
-        users: The user's loop and its hooks, while the simulation runs. None if there is nothing to restore.
-    """
-
-    __slots__ = ("_own", "running", "users")
-
-    def __init__(self) -> None:
-        self.running: Callable[[], Any] | None = None
-        self.users: Any = None
-        self._own: Any = None
-
-    def begin(self) -> None:
-        """Switch to the simulation for a new job, which begins without a loop."""
-        self._own = None
-        self.enter()
-
-    def enter(self) -> None:
-        """Switch to the simulation's loop."""
-        users, own = _present_loop(), self._own or _NO_LOOP
-        self.users = None if users[0] is None and own is _NO_LOOP else users
-        if self.users is not None:
-            _set_loop(own)
-
-    def leave(self) -> None:
-        """Switch to the user's loop."""
-        self._own = _present_loop()
-        if self._own[0] is not None or self.users is not None:
-            _set_loop(self.users or _NO_LOOP)
-
-
-def _present_loop() -> tuple[Any, Any]:
-    events = modules.get(ASYNCIO)
-    return None if events is None else events._get_running_loop(), sys.get_asyncgen_hooks()
-
-
-def _set_loop(state: Any) -> None:
-    loop, hooks = state
-    modules[ASYNCIO]._set_running_loop(loop)
-    sys.set_asyncgen_hooks(*hooks)

@@ -28,7 +28,6 @@ class _CommonOptions(TypedDict, total=False):
     possible_agents: Iterable[str] | Mapping[Any, Iterable[str]] | None
     undeclared: Literal["error", "rule"]
     agent: str | None
-    padded: bool
     skip_forced: bool
     clip_actions: bool
     plugins: Iterable[Any]
@@ -69,8 +68,6 @@ class Options:
             model's own rule decide.
         agent: The agent of a single view. All other agents are left to their policies or their rule. None: the only
             agent of the only active decision point.
-        padded: Whether ``agents`` has all possible agents from the reset to the end of the episode, also those that
-            are not born yet and those that the model has removed. These do not decide.
         skip_forced: Whether a decision with one legal choice is taken without asking for an action.
         clip_actions: Whether an action outside a ``Box`` space is clipped instead of refused.
         max_steps: The number of calls of ``step`` with an action after which an episode is truncated. None: no limit.
@@ -92,7 +89,6 @@ class Options:
     possible_agents: Any = None
     undeclared: str = "error"
     agent: str | None = None
-    padded: bool = False
     skip_forced: bool = False
     clip_actions: bool = False
     max_steps: int | None = None
@@ -114,7 +110,7 @@ class Options:
             raise OptionValueError(f'undeclared must be "error" or "rule", not {short_repr(self.undeclared)}')
         if self.agent is not None and not (isinstance(self.agent, str) and self.agent):
             raise OptionValueError(f"agent must be the name of an agent or None, not {short_repr(self.agent)}")
-        for name in ("clip_actions", "global_rng", "padded", "skip_forced"):
+        for name in ("clip_actions", "global_rng", "skip_forced"):
             if not isinstance(getattr(self, name), bool):
                 raise OptionValueError(f"{name} must be True or False, not {short_repr(getattr(self, name))}")
         state_space = self.state_space

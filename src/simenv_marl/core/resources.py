@@ -17,7 +17,7 @@ from weakref import ref
 
 from greenlet import getcurrent
 
-from ..hooks.stacks import LOCK, STACKS, THREADS, stack_of
+from ..hooks.stacks import LOCK, STACKS, stack_of
 
 _METHODS: Final = ((Thread, "start"), (socket, "__init__"), (Popen, "__init__"), (BaseProcess, "start"))
 
@@ -42,20 +42,62 @@ def watch_resources(on: bool) -> None:
                     del _PATCHES[owner, name]
 
 
+class StartedThread:
+    """The entry in ``STACKS`` for a thread that a simulation has started. Decisions are refused there."""
+
+    plugins = None
+    own_thread = True
+    where = "a thread that the simulation has started"
+
+    def __init__(self, driver: Any) -> None:
+        self.driver = driver
+
+    def taker(self, hook: Any) -> Any:
+        """Return the interceptor that refuses a decision; None for other calls, and after the simulation's end."""
+        if not self.driver.decides(hook):
+            return None
+        return self.driver.refuse(hook, self.where)
+
+    def hide(self) -> None:
+        """Do nothing: no hook has an entry for this thread."""
+
+    show = hide
+
+    def refuse_all(self, where: str) -> None:
+        """Refuse decisions in this process, which the thread has forked."""
+        self.where = where
+
+
 def _noting(method: Any) -> Any:
     @wraps(method)
     def note(self: Any, *args: Any, **kwargs: Any) -> None:
-        driver = stack_of(getcurrent()) if STACKS else None
-        if driver is not None and isinstance(self, Thread):
-            for thread in [thread for thread in THREADS if thread.ident is not None and not thread.is_alive()]:
-                THREADS.pop(thread, None)
-            THREADS[self] = driver  # before it starts, since it may decide at once
+        stack = stack_of(getcurrent()) if STACKS else None
+        if stack is None:
+            method(self, *args, **kwargs)
+            return
+        driver = stack.driver if isinstance(stack, StartedThread) else stack
+        if isinstance(self, Thread):
+            self.run = _registered(self.run, driver)  # type: ignore[method-assign]
+            driver.has_started_threads = True
             driver.show()
         method(self, *args, **kwargs)
-        if driver is not None:
-            driver.opened.append(ref(self))
+        driver.opened.append(ref(self))
 
     return note
+
+
+def _registered(run: Any, driver: Any) -> Any:
+    """Wrap the ``run`` of a thread to register the thread while it runs."""
+
+    def registered() -> None:
+        here = getcurrent()
+        STACKS[here] = StartedThread(driver)
+        try:
+            run()
+        finally:
+            STACKS.pop(here, None)
+
+    return registered
 
 
 def open_resources(opened: list[Any]) -> dict[Any, str]:

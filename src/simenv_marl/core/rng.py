@@ -11,12 +11,13 @@ import random
 from _random import Random as Twister
 from ctypes import memmove, string_at
 from sys import modules
-from threading import get_ident
+from threading import current_thread, get_ident
 from typing import Any, Final
 
 import numpy as np
 
 from ..errors import WrongThreadError
+from ..hooks.stacks import SIMULATION
 
 _python: Any = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
 _numpy: Any = np.random.mtrand._rand
@@ -137,7 +138,8 @@ class GlobalRandom:
             WrongThreadError: The state of another environment, which runs in another thread, is in place.
         """
         thread = get_ident()
-        if self._entered and self._entered[-1]._thread != thread:
+        nested = current_thread().name == SIMULATION  # its user waits in another thread meanwhile
+        if self._entered and self._entered[-1]._thread != thread and not nested:
             raise WrongThreadError(
                 "two environments with global_rng=True ran in two threads at once, but a process has only one state of"
                 " the global generators; run them one after the other, or in separate processes"

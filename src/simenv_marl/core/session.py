@@ -24,6 +24,7 @@ from gymnasium.utils import seeding
 
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..hooks.places import Held
+from ..hooks.stacks import SIMULATION
 from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, environment_context
 from .driver import Driver
@@ -34,14 +35,13 @@ from .resources import open_resources
 from .rng import GlobalRandom, global_state, is_seed
 from .run import refusal
 from .spaces import same
-from .threads import SIMULATION
 
 _CHECKED: Final[WeakSet[type]] = WeakSet()
 """The classes of simulations that were checked for draws from the global generators."""
 
 
-TOO_SHORT: Final = 5_000
-"""A time in nanoseconds that is too short for another thread to wake up and draw."""
+TOO_SHORT: Final = 100_000
+"""A time in nanoseconds. Another thread that wakes up and draws runs for longer; the clocks differ by less."""
 
 
 class State(Enum):
@@ -73,11 +73,12 @@ class Session:
         options: The options that the latest ``reset`` of the environment got.
         episode: The current or latest episode. None before the first one, and after it was closed.
         np_random_seed: The seed of ``np_random``. -1 if the user has set a generator.
+        lock: The lock that lets one thread at a time use the environment. None if only one thread can use it.
     """
 
     __slots__ = (
-        "__weakref__", "_driver", "_installed", "_lock", "_np_random", "_plan_of_simulation", "_reset", "_rng",
-        "_was_reset", "episode", "np_random_seed", "options", "plan", "seed", "simulation", "state",
+        "__weakref__", "_driver", "_installed", "_np_random", "_plan_of_simulation", "_reset", "_rng",
+        "_was_reset", "episode", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state",
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:
@@ -98,7 +99,7 @@ class Session:
         self._installed: Held | None = None
         self._driver: Driver | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
-        self._lock = ExclusiveLock() if plan.options.driver == "thread" else None
+        self.lock = ExclusiveLock() if plan.options.driver == "thread" else None
         self.simulation: Any = None
         self._install()
         try:
@@ -153,11 +154,11 @@ class Session:
 
     def context(self) -> environment_context:
         """The context in which the environment's code must run."""
-        return environment_context(self.plan.plugins, self._rng, self._lock)
+        return environment_context(self.plan.plugins, self._rng, self.lock)
 
     def exclusive(self) -> AbstractContextManager[None]:
         """The context in which no other thread can use the environment."""
-        return nullcontext() if self._lock is None else self._lock
+        return nullcontext() if self.lock is None else self.lock
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -239,7 +240,7 @@ class Session:
         self._was_reset = True
         driver = self._usable_driver()
         episode = Episode(
-            self._bound_plan(), self.simulation, driver, seed, in_rounds=in_rounds, rng=self._rng, lock=self._lock,
+            self._bound_plan(), self.simulation, driver, seed, in_rounds=in_rounds, rng=self._rng, lock=self.lock,
             script=script,
         )  # fmt: skip
         driver.begin(self.simulation.run, episode.events_by_hook(), context)
@@ -269,7 +270,7 @@ class Session:
         _CHECKED.add(kind)
         drawn = zip(("random", "numpy.random"), before, global_state(), strict=False)
         names = [name for name, old, new in drawn if old != new]
-        if names and (_is_alone() or (self._lock is None and _time_of_others() - before[2] < TOO_SHORT)):
+        if names and (_is_alone() or (self.lock is None and _time_of_others() - before[2] < TOO_SHORT)):
             warn_user(
                 f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which all code in the"
                 " process shares: its environments influence each other, and a seed does not repeat an episode. Make"

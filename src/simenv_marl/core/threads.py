@@ -11,15 +11,13 @@ from typing import Any, Final
 
 from ..errors import WrongThreadError, warn_user
 from ..hooks.hook import Hook
-from ..hooks.stacks import Taker
+from ..hooks.stacks import SIMULATION, Taker
 from ..simulation import RULE, Sentinel
 from .driver import FAILED, FINISHED, NO_EVENTS, SECONDS_TO_UNWIND, Driver, Event, SimulationExit, reporting_rule
+from .loops import silence_unwound_tasks
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
-
-SIMULATION: Final = "simulation"
-"""The name of the threads of simulations."""
 
 _NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
@@ -205,6 +203,7 @@ class ThreadDriver(Driver):
             if reply is RULE:
                 return rule(*args, **kwargs)
             if reply is _EXIT:
+                silence_unwound_tasks()
                 raise SimulationExit
             return reply if deliver is None else deliver(reply, *args, **kwargs)
 

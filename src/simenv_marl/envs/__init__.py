@@ -2,6 +2,7 @@
 
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
+from .padding import pad_agents
 from .parallel import SimulationParallelEnv
 from .single import SimulationEnv
 from .vector import SimulationVectorEnv
@@ -12,4 +13,5 @@ __all__ = [
     "SimulationJointEnv",
     "SimulationParallelEnv",
     "SimulationVectorEnv",
+    "pad_agents",
 ]

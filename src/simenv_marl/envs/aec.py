@@ -60,9 +60,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        self._record(self._start(seed, options))
-        if self._shows:
-            self.render()
+        with self._session.exclusive():
+            self._record(self._start(seed, options))
+            if self._shows:
+                self.render()
 
     def step(self, action: Any) -> None:
         """Answer the decision of ``agent_selection`` and run to the next one.
@@ -75,9 +76,14 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        episode = self._session.episode
+        session = self._session
+        if session.lock is not None and not session.lock.held:  # the lock also covers recording the results
+            with session.lock:
+                SimulationAECEnv.step(self, action)
+            return
+        episode = session.episode
         if episode is None:
-            raise self._session.refusal()
+            raise session.refusal()
         if self._leaving:
             self._dead_step(action)
             return

@@ -188,10 +188,11 @@ class SimulationJointEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        episode = self._start(seed, options)
-        if self._shows:
-            self.render()
-        return self.joint.observe(episode), self.joint.inform(episode)
+        with self._session.exclusive():
+            episode = self._start(seed, options)
+            if self._shows:
+                self.render()
+            return self.joint.observe(episode), self.joint.inform(episode)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a round with an action for each agent.
@@ -211,6 +212,10 @@ class SimulationJointEnv(OneAgentView):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
+        session = self._session
+        if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
+            with session.lock:
+                return SimulationJointEnv.step(self, action)
         episode, joint = self._running(), self.joint
         episode.play(joint.actions(episode, action))
         if self._shows:

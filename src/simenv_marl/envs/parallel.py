@@ -61,12 +61,13 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        episode = self._start(seed, options)
-        self.agents = [*episode.agents, *(agent.name for agent in episode.just_ended)]
-        if self._shows:
-            self.render()
-        observations, _, _, _, infos = self._results(episode)
-        return observations, infos
+        with self._session.exclusive():
+            episode = self._start(seed, options)
+            self.agents = [*episode.agents, *(agent.name for agent in episode.just_ended)]
+            if self._shows:
+                self.render()
+            observations, _, _, _, infos = self._results(episode)
+            return observations, infos
 
     def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
         """Play a round.
@@ -87,9 +88,13 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        episode = self._session.episode
+        session = self._session
+        if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
+            with session.lock:
+                return SimulationParallelEnv.step(self, actions)
+        episode = session.episode
         if episode is None:
-            raise self._session.refusal()
+            raise session.refusal()
         if not self.agents and not actions and (episode.terminated or episode.truncated):
             return {}, {}, {}, {}, {}  # PettingZoo's own do so
         if isinstance(actions, Sentinel):

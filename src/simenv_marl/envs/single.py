@@ -81,11 +81,12 @@ class SimulationEnv(OneAgentView):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        self._own = own = self._start(seed, options).agent(self._agent)
-        assert own is not None
-        if self._shows:
-            self.render()
-        return own.observation, own.info
+        with self._session.exclusive():
+            self._own = own = self._start(seed, options).agent(self._agent)
+            assert own is not None
+            if self._shows:
+                self.render()
+            return own.observation, own.info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision and run to the next one.
@@ -101,9 +102,13 @@ class SimulationEnv(OneAgentView):
             ResetNeededError: There is no running episode.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        episode = self._session.episode
+        session = self._session
+        if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
+            with session.lock:
+                return SimulationEnv.step(self, action)
+        episode = session.episode
         if episode is None:
-            raise self._session.refusal()
+            raise session.refusal()
         episode.step(action)
         if self._shows:
             self.render()

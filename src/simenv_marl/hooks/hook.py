@@ -20,7 +20,7 @@ from greenlet import getcurrent, greenlet
 from ..errors import PatchError
 from .attached import CALLS, ITEMS
 from .handlers import AROUND, Target
-from .stacks import EVALUATING, LOCK, STACKS, THREADS, Taker, stack_of, starter_of
+from .stacks import EVALUATING, LOCK, STACKS, Taker, spawner_of, stack_of
 
 _ABSENT: Final = object()
 
@@ -34,6 +34,8 @@ _ASK: Final = "(TAKERS.get(getcurrent()) or elsewhere)({}, {})".format
 _RULE = "not TAKERS or not OTHERS and getcurrent().parent is None"
 """Whether the rule decides at once: the hook has no takers, or its takers are all on stacks of simulations, and the
 call comes from the root of a thread."""
+
+_SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
 
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 
@@ -211,9 +213,7 @@ class _Takers(dict[Any, Taker]):
 
 
 class _Others(set[Any]):
-    """The keys of takers that are not the stack of a greenlet: roots of threads, plugins, None; and drivers of
-    simulations that have started threads.
-    """
+    """The keys of takers that are no greenlet's stack (a thread's root, plugins, None), and drivers with threads."""
 
     __slots__ = ("_hook",)
 
@@ -413,10 +413,10 @@ class Hook(Target):
     def taker_at(self, here: greenlet) -> Taker | None:
         """Return the taker of a call in a greenlet; None if only the rule runs."""
         driver = stack_of(here) if STACKS else None
-        if THREADS or hasattr(here, "spawning_greenlet"):
-            starter, where = starter_of(here)
-            if starter is not None and starter.decides(self):
-                taker: Taker = starter.refuse(self, where)
+        if hasattr(here, "spawning_greenlet"):
+            spawner = spawner_of(here)
+            if spawner is not None and not spawner.own_thread and spawner.decides(self):
+                taker: Taker = spawner.refuse(self, _SPAWNED)
                 return taker
         if driver is None:
             evaluation = EVALUATING.get(here)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from threading import RLock, Thread, current_thread
+from threading import RLock
 from typing import Any, Final, Protocol
 
 from greenlet import getcurrent, greenlet
@@ -41,14 +41,15 @@ class Evaluation(Protocol):
         """The plugins that take part."""
 
 
+SIMULATION: Final = "simulation"
+"""The name of the threads in which simulations run."""
+
 OUTSIDE: Final = object()
 """The entry in ``STACKS`` for a simulation's stack on which another environment runs."""
 
 STACKS: Final[dict[greenlet, Any]] = {}
-"""The driver of each simulation by its stack, or ``OUTSIDE``."""
-
-THREADS: Final[dict[Thread, Any]] = {}
-"""The threads that simulations have started, each with the driver of its simulation."""
+"""The driver of each simulation by its stack, or ``OUTSIDE``; and a ``StartedThread`` for each thread that a simulation
+has started, by its root."""
 
 EVALUATING: Final[dict[greenlet, Evaluation]] = {}
 """The running evaluation of each greenlet. Code that sets an entry restores the previous one."""
@@ -59,7 +60,7 @@ DIFFERENCES: Final[list[str]] = []
 
 
 def stack_of(here: greenlet | None) -> Any:
-    """Return the driver of the simulation to which a greenlet belongs; None if it belongs to none."""
+    """Return the entry of the nearest stack to which a greenlet belongs; None if it belongs to none."""
     while here is not None:
         driver = STACKS.get(here)
         if driver is not None:
@@ -68,22 +69,15 @@ def stack_of(here: greenlet | None) -> Any:
     return None
 
 
-def starter_of(here: Any) -> tuple[Any, str]:
-    """Find the simulation that has started the code in a greenlet, where that simulation cannot wait for a decision.
-
-    Returns:
-        Its driver and a description of the place; None and an empty string if no simulation has started it.
-    """
-    driver = THREADS.get(current_thread()) if THREADS else None
-    if driver is not None:
-        return driver, "a thread that the simulation has started"
-    spawner = getattr(here, "spawning_greenlet", None)  # gevent spawns on a hub of its own
+def spawner_of(here: Any) -> Any:
+    """Return the entry of the stack whose code has spawned a greenlet with gevent; None if none has."""
+    spawner = getattr(here, "spawning_greenlet", None)
     while spawner is not None and (here := spawner()) is not None:
         driver = stack_of(here)
         if driver is not None:
-            return driver, 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
+            return driver
         spawner = getattr(here, "spawning_greenlet", None)
-    return None, ""
+    return None
 
 
 def plugins_at_work() -> Any:
@@ -131,6 +125,12 @@ class outside_simulation:  # noqa: N801 - it is used like a function
             _put(STACKS, self._here, self._entry)
             if self._entry is not None:
                 self._driver.show()
+        del self._here, self._before, self._entry, self._driver
+
+    def __del__(self) -> None:
+        # An interrupt at the entry of ``__exit__`` kept it from running.
+        if hasattr(self, "_driver") and EVALUATING.get(self._here) is self._evaluation:
+            outside_simulation.__exit__(self)
 
 
 def _put(entries: dict[greenlet, Any], here: greenlet, value: Any) -> None:
@@ -142,7 +142,7 @@ def _put(entries: dict[greenlet, Any], here: greenlet, value: Any) -> None:
 
 def _refuse_after_fork() -> None:
     """In a process that a simulation has forked: refuse its decisions, because its user is in the other process."""
-    driver = stack_of(getcurrent()) or THREADS.get(current_thread())
+    driver = stack_of(getcurrent())
     if driver is not None:
         driver.refuse_all("a process that the simulation has forked")
 

@@ -1,0 +1,155 @@
+"""Wrappers that pad agents to a fixed roster, for learners that need all agents from the reset to the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+from pettingzoo import AECEnv
+from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
+
+from ..core.agent import Agent
+from ..core.episode import Episode
+from ..errors import ViewError, short_repr
+from .agents import AgentsView
+from .parallel import Results
+
+
+def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
+    """Pad the agents of an environment to its ``possible_agents``, from the reset to the end of the episode.
+
+    ``infos[agent]["present"]`` tells whether an agent lives. Agents that are not born yet, or that the model has
+    removed, do not decide. Their observations are zero with all actions legal, their rewards 0.0, and actions for them
+    are ignored. All agents end together, with the episode. This is also known as black death.
+
+    Args:
+        env: An AEC or parallel environment of a simulation, with ``possible_agents``.
+
+    Raises:
+        ViewError: It is another environment, or not all of its agents are known beforehand.
+    """
+    view = getattr(env, "unwrapped", env)
+    if not isinstance(view, AgentsView):
+        raise ViewError(f"pad_agents needs the environment of aec_env or parallel_env, not {short_repr(env)}")
+    if not hasattr(view, "possible_agents"):
+        raise ViewError("pad_agents needs to know all agents: declare them in possible_agents=")
+    return PaddedAECEnv(env) if isinstance(env, AECEnv) else PaddedParallelEnv(env)
+
+
+def _is_present(agent: Agent | None) -> bool:
+    """Whether an agent is live and was observed."""
+    return agent is not None and agent.present and not agent.ended
+
+
+def _info(agent: Agent | None, info: dict[str, Any]) -> dict[str, Any]:
+    """The info of an agent, with the entry ``"present"``. An absent agent has all actions legal."""
+    if agent is not None and not _is_present(agent):
+        reward = agent.reward
+        agent.clear_observation()
+        agent.reward = reward
+        info = {**agent.info, **{key: info[key] for key in ("deciding", "acted") if key in info}}
+    return {**info, "present": _is_present(agent)}
+
+
+class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
+    """A parallel environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Reset the environment; return the observations and infos of all possible agents."""
+        observations, infos = super().reset(seed=seed, options=options)
+        observations, _, _, _, infos = self._padded((observations, {}, {}, {}, infos))
+        return observations, infos
+
+    def step(self, actions: Any) -> Results:
+        """Play a round; return the results of all possible agents."""
+        if isinstance(actions, Mapping) and self.agents:
+            agents = self._episode.agents
+            roster = {*self.possible_agents}
+            actions = {
+                name: action for name, action in actions.items() if name not in roster or _is_present(agents.get(name))
+            }
+        if not self.agents and not actions:
+            return cast("Results", super().step(actions))
+        try:
+            results = cast("Results", super().step(actions))
+        except BaseException:
+            if self._episode_is_over():
+                self.agents = []
+            raise
+        return self._padded(results)
+
+    @property
+    def _episode(self) -> Episode:
+        return cast("AgentsView", self.unwrapped).episode
+
+    def _episode_is_over(self) -> bool:
+        return not cast("AgentsView", self.unwrapped).agents
+
+    def _padded(self, results: Results) -> Results:
+        """Add the agents that are not present to the results of a round, and let all agents end together."""
+        episode, view = self._episode, cast("AgentsView", self.unwrapped)
+        observations, rewards, _, _, infos = results
+        padded: Results = {}, {}, {}, {}, {}
+        for name in view.possible_agents:
+            agent = episode.agent(name)
+            info = infos.get(name, {"deciding": False, "acted": False})
+            is_present = _is_present(agent)
+            padded[0][name] = observations[name] if is_present else view._point(name).blank()
+            padded[1][name] = rewards.get(name, 0.0)
+            padded[2][name], padded[3][name] = episode.terminated, episode.truncated
+            padded[4][name] = _info(agent, info)
+        self.agents = [] if episode.over else list(view.possible_agents)
+        return padded
+
+
+class PaddedAECEnv(BaseWrapper[str, Any, Any]):
+    """An AEC environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``.
+
+    Agents that are not present are not selected before the end of the episode. A step takes time for each possible
+    agent.
+    """
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Reset the environment."""
+        super().reset(seed=seed, options=options)
+        self.agents = list(self.possible_agents)
+        self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
+        self._update()
+
+    def step(self, action: Any) -> None:
+        """Answer the decision of ``agent_selection``. None for an agent that has ended."""
+        selected = self.agent_selection
+        if self.agents and (self.terminations[selected] or self.truncations[selected]):
+            self._was_dead_step(action)
+            return
+        try:
+            super().step(action)
+        except BaseException:
+            if not cast("AgentsView", self.unwrapped).agents:  # an error has ended the episode
+                self.agents = []
+            raise
+        self._cumulative_rewards[selected] = 0.0
+        self._update()
+
+    def observe(self, agent: str) -> Any:
+        """Return the latest observation of an agent; zero, with all actions legal, if it is not present."""
+        view = cast("AgentsView", self.unwrapped)
+        found = view.episode.agent(agent)
+        if found is not None and not _is_present(found):
+            return view._point(agent).blank()
+        return super().observe(agent)
+
+    def _update(self) -> None:
+        """Read the rewards, infos and ends of a reset or a step."""
+        view, env = cast("AgentsView", self.unwrapped), self.env
+        episode, rewards = view.episode, env.rewards
+        infos = {name: env.infos.get(name, {}) for name in view.possible_agents}
+        self.rewards = {name: rewards.get(name, 0.0) for name in view.possible_agents}
+        while not episode.over and env.terminations[env.agent_selection]:
+            env.step(None)
+        for name, reward in self.rewards.items():
+            self._cumulative_rewards[name] += reward
+        self.infos = {name: _info(episode.agent(name), info) for name, info in infos.items()}
+        self.terminations = dict.fromkeys(view.possible_agents, episode.terminated)
+        self.truncations = dict.fromkeys(view.possible_agents, episode.truncated)
+        self.agent_selection = self.agents[0] if episode.over else env.agent_selection

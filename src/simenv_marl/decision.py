@@ -11,15 +11,15 @@ from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
 from types import FunctionType
 from typing import Any, Final
-from weakref import WeakSet, WeakValueDictionary
+from weakref import WeakValueDictionary
 
 import numpy as np
 from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, short_repr
-from .hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
-from .hooks.places import stays, unbind
+from .hooks.hook import Hook, beneath, hook_of, made_with
+from .hooks.places import make_permanent, split_binding
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
 Mapped = Callable[..., Any]
@@ -80,17 +80,13 @@ class Definition:
         Raises:
             PatchError: ``function`` is none of these.
         """
-        given, binding = unbind(function)
+        given, binding = split_binding(function)
         hook = hook_of(given)
         if hook is None:
             name = f"{given.__module__}.{given.__qualname__}"
             hook = Hook(given, name, bound=binding is not staticmethod)
-        elif not isinstance(hook.function, FunctionType):
-            raise PatchError(
-                f"{short_repr(hook.function)} cannot be a decision point: it is not a function written in Python"
-            )
         elif not hook.for_good:  # fetched while its hook was set temporarily
-            stays(hook)
+            make_permanent(hook)
         point = point_for(hook)
         wrapper = hook.stand_in(self)
         point.definition = self
@@ -300,42 +296,20 @@ class DecisionPoint:
         return self.hook.function
 
     @property
-    def kind(self) -> str:
-        """What a call returns: "function" (a value), "generator" or "coroutine"."""
-        return self.hook.kind
-
-    @property
-    def alone(self) -> bool:
-        """Whether every call has one argument, the object it is called on."""
-        return self.hook.alone
-
-    @property
-    def bound(self) -> bool:
-        """Whether its first argument is the object it is called on, which is never passed by keyword."""
-        return self.hook.bound
-
-    @property
-    def wrappers(self) -> WeakSet[FunctionType]:
-        """The decision functions of this point."""
-        return self.hook.stand_ins
-
-    @property
     def letters(self) -> str:
         """The letters of the function's name in lower case, for the default name of its agent."""
         name = self.name.rpartition(".")[2].lower()
         return "".join(letter for letter in name if "a" <= letter <= "z") or "agent"
 
-    def wrap(self, definition: Definition | None) -> FunctionType:
-        """Make a decision function of this point. Named as a point, it stands for the definition."""
-        return self.hook.stand_in(definition)
-
-    def family(self) -> "list[DecisionPoint]":
-        """Return the other points of the same rule."""
-        return [hook.point for hook in MADE_OF[self.rule] if hook.point is not None and hook is not self.hook]
-
 
 def point_for(hook: Hook) -> "DecisionPoint":
-    """Return the decision point of a hook, which may be new."""
+    """Return the decision point of a hook, which may be new.
+
+    Raises:
+        PatchError: The hook's function is not written in Python.
+    """
+    if not isinstance(hook.function, FunctionType):
+        raise PatchError(f"{hook.name} cannot be a decision point: it is not a function written in Python")
     if hook.point is None:
         hook.point = DecisionPoint(hook)
     point: DecisionPoint = hook.point

@@ -6,18 +6,19 @@ are iterable: for the whole process (``attach_handler``), for a block (``handler
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 from .decision import decision_points
-from .errors import HandlerError, SimEnvError, short_repr
-from .hooks.attached import Call, ChangedArgs, ChangedResult, title
-from .hooks.handlers import Target
+from .errors import HandlerError, name_of, short_repr
+from .hooks.finding import current_target, expose, exposed_functions, find_target
+from .hooks.handlers import ChangedArgs, ChangedResult, short_arguments
 from .hooks.hook import Hook
-from .hooks.places import Held
-from .hooks.plugins import Added, Entry, attachable
+from .hooks.plugins import Entry, make_handler
 from .hooks.stacks import LOCK
-from .hooks.targets import at_hand, expose, exposed_functions, find_target
+from .hooks.targets import Recorder, Target
 
 __all__ = [
     "Call",
@@ -49,7 +50,7 @@ def attached_handlers(env: Any = None) -> list[Entry]:
         entries: list[Entry] = env.unwrapped.plugins
         return entries
     targets = sorted(Target.all, key=lambda target: target.name)
-    return [(a.handler, target.name, a.position) for target in targets for a in target.attached]
+    return [(handler.function, target.name, handler.position) for target in targets for handler in target.handlers]
 
 
 def expose_to_plugins(function_or_iterable: Thing) -> Thing:
@@ -97,7 +98,7 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        attached = attachable((handler, target, position))
+        attached = make_handler((handler, target, position))
         attached.target.add(attached)
 
 
@@ -116,12 +117,13 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
     """
     with LOCK:
         found = find_target(target)
-        there = [a for a in found.attached if a.position == position and (handler is None or a.handler == handler)]
-        if not there:
-            what = "no handler is" if handler is None else f"{title(handler)} is not"
-            at = ", ".join(sorted({a.position for a in found.attached})) or "nowhere"
+        present = found.handlers
+        chosen = [a for a in present if a.position == position and (handler is None or a.function == handler)]
+        if not chosen:
+            what = "no handler is" if handler is None else f"{name_of(handler)} is not"
+            at = ", ".join(sorted({a.position for a in present})) or "nowhere"
             raise HandlerError(f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}")
-        for attached in there if handler is None else there[-1:]:
+        for attached in chosen if handler is None else chosen[-1:]:
             found.remove(attached)
 
 
@@ -136,15 +138,47 @@ def handlers(*entries: Entry) -> Iterator[None]:
         SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
-        attached = [attachable(entry) for entry in entries]
-        held = Held([Added([(own.target, own) for own in attached])])
-    try:
+        attached = [make_handler(entry) for entry in entries]
+    with _added([(handler.target, handler) for handler in attached]):
         yield
-    finally:
-        held.let_go()
+
+
+@contextmanager
+def _added(entries: list[tuple[Target, Any]]) -> Iterator[None]:
+    """Add handlers or recorders to targets for the duration of a ``with`` block; all of them or none."""
+    with ExitStack() as stack:
+        for target, handler in entries:
+            stack.callback(target.remove, handler)
+            target.add(handler)
+        yield
 
 
 # -- seeing what happens --------------------------------------------------------------------------
+
+
+@dataclass
+class Call:
+    """A call that ``trace`` recorded.
+
+    Attributes:
+        target: The dotted name of the function.
+        arguments: The arguments, as a short text.
+        result: The result, as a short text; "raised ..." after an error; None while the call runs.
+    """
+
+    target: str
+    arguments: str
+    result: str | None = None
+
+
+class _Calls(Recorder):
+    def __init__(self) -> None:
+        self.calls: list[Call] = []
+
+    def begin(self, target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[str], None]:
+        call = Call(target, short_arguments(args, kwargs))
+        self.calls.append(call)
+        return partial(setattr, call, "result")
 
 
 @contextmanager
@@ -162,25 +196,9 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     Raises:
         SimEnvError: As ``attach_handler``.
     """
-    calls: list[Call] = []
-
-    def record(target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
-        call = Call.of(target, args, kwargs)
-        calls.append(call)
-        return call
-
+    recorder = _Calls()
     with LOCK:
-        found = dict.fromkeys(map(find_target, targets) if targets else _everything())
-        held = Held([Added([(target, record) for target in found if isinstance(target, Hook)])])
-    try:
-        yield calls
-    finally:
-        held.let_go()
-
-
-def _everything() -> Iterator[Target]:
-    """Yield all targets that are exposed or have handlers, and all decorated decision points."""
-    for target in list(Target.all):
-        if isinstance(target, Hook) and (target.for_good or target.slot):
-            with suppress(SimEnvError, ImportError):
-                yield at_hand(target)
+        hooks = [target for target in list(Target.all) if isinstance(target, Hook) and (target.for_good or target.slot)]
+        found = [find_target(target) for target in targets] if targets else [current_target(hook) for hook in hooks]
+    with _added([(target, recorder) for target in dict.fromkeys(found) if isinstance(target, Hook)]):
+        yield recorder.calls

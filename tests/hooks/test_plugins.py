@@ -100,7 +100,7 @@ def local():
 
 
 def test_the_papers_first_listing(capsys):
-    import simenv_marl as se
+    import simenv_marl.plugins as se
 
     def my_func(input):  # noqa: A002
         return input + 1
@@ -1186,7 +1186,7 @@ def test_without_targets_everything_is_traced():
 
 def test_all_of_it_is_public():
     for name in ("expose_to_plugins", "attach_handler", "remove_handler", "ChangedArgs", "ChangedResult", "handlers"):
-        assert name in simenv_marl.__all__
+        assert name in simenv_marl.plugins.__all__
     assert repr(ChangedArgs(1, b=2)) == "ChangedArgs(1, b=2)"
     assert repr(ChangedResult("x")) == "ChangedResult('x')"
 

@@ -143,7 +143,7 @@ class BoundPoint:
         self.finite = spaces.finite_check(definition.observation_space)
         self.check = (actions.clipping_check if clips else actions.action_check)(definition.action_space)
         self.convert: Any = definition.action_space_mapping or _same
-        self.deliver = _delivery(definition, named.point.kind)
+        self.deliver = _delivery(definition, named.point.hook.kind)
         self.tells = definition.rule_action_mapping is not None
         self._rule_action = _rule_action(definition.rule_action_mapping)
         self._inverse = inverse(definition)

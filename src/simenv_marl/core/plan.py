@@ -35,6 +35,7 @@ from .events import Answered, Decision, Ended, Removed, Told
 from .options import Options
 from .points import (
     NamedPoint,
+    aliases,
     by_name,
     find_points,
     have_instances,
@@ -42,7 +43,6 @@ from .points import (
     own_points,
     owner_class,
     portable,
-    stand_ins,
 )
 from .roster import assign, call_the_roll, declared_agents, name_agents, names_agents
 
@@ -148,11 +148,11 @@ class Plan:
         for bound in self.points:
             self.events[bound.point] = bound
         for bound in self.points:
-            for other in stand_ins(bound.point):
+            for other in aliases(bound.point):
                 self.events.setdefault(other, bound)
         self._find_removals(warns=first)
         if self._ends_agents and self.points:
-            self._cross(locate(END_AGENT)[0], Ended())
+            self._cross(locate(END_AGENT), Ended())
         self.decisions = {point.hook: event for point, event in self.events.items()}
         if not self.active and not unanswered:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
@@ -285,14 +285,21 @@ class Plan:
     def _find_removals(self, *, warns: bool) -> None:
         for binding in self.points:
             for name, agent in (*binding.point.removed_by.items(), *binding.definition.removed_by.items()):
-                point, _ = locate(name, self._own)
+                point = locate(name, self._own)
                 removal = self._cross(point, Removed(point))
                 if not isinstance(removal, Removed):
                     raise DefinitionError(
                         f"{name} is a decision point, so removed_by= cannot name it as a function that ends an agent"
                     )
                 owner, remover = owner_class(binding.point), owner_class(point)
-                if agent is None and warns and point.bound and owner and remover and not have_instances(owner, remover):
+                if (
+                    agent is None
+                    and warns
+                    and point.hook.bound
+                    and owner
+                    and remover
+                    and not have_instances(owner, remover)
+                ):
                     warn_user(
                         f"{name}, in removed_by= of {binding.point.name}, is called on a {remover.__name__}, not on a"
                         f" {owner.__name__}, and so ends no agent; pass a dict from {name!r} to a callable of the"

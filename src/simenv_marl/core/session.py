@@ -18,7 +18,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
-from ..hooks.places import Held
+from ..hooks.patches import Installation
 from ..simulation import closer, make_simulation, resetter
 from .contexts import Claim, at_work
 from .draws import WatchedDriver, is_watched, watched
@@ -68,7 +68,7 @@ class Session:
         self._open = False  # whether the simulation was reset and not closed since
         self._worn = False  # whether it was given up: code that still uses it must not meet another episode
         self._bound: tuple[Any, Any, Plan] | None = None  # the plan whose mappings have the simulation they ask for
-        self._held: Held | None = None
+        self._held: Installation | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.claim = Claim() if plan.options.driver == "thread" else None
         self._driver: BaseDriver | None = None
@@ -409,13 +409,13 @@ class Session:
         return self._driver is not None and self._driver.reachable()
 
     def _hold_patches(self) -> None:
-        if self._held is None or not self._held.whole:
+        if self._held is None or not self._held.complete:
             self._let_go_of_patches()
-            self._held = Held(self.plan.patches)
+            self._held = Installation(self.plan.patches)
 
     def _let_go_of_patches(self) -> None:
         if self._held is not None:
-            self._held.let_go()
+            self._held.uninstall()
             self._held = None
 
 

@@ -7,18 +7,16 @@ are iterable: for the whole process (``attach_handler``), for a block (``handler
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, TypeVar
 
 from .decision import decision_points
 from .errors import HandlerError, name_of, short_repr
 from .hooks.finding import current_target, expose, exposed_functions, find_target
-from .hooks.handlers import ChangedArgs, ChangedResult, short_arguments
+from .hooks.handlers import ChangedArgs, ChangedResult
 from .hooks.hook import Hook
 from .hooks.plugins import Entry, make_handler
 from .hooks.stacks import LOCK
-from .hooks.targets import Recorder, Target
+from .hooks.targets import Call, Target, Trace
 
 __all__ = [
     "Call",
@@ -156,31 +154,6 @@ def _added(entries: list[tuple[Target, Any]]) -> Iterator[None]:
 # -- seeing what happens --------------------------------------------------------------------------
 
 
-@dataclass
-class Call:
-    """A call that ``trace`` recorded.
-
-    Attributes:
-        target: The dotted name of the function.
-        arguments: The arguments, as a short text.
-        result: The result, as a short text; "raised ..." after an error; None while the call runs.
-    """
-
-    target: str
-    arguments: str
-    result: str | None = None
-
-
-class _Calls(Recorder):
-    def __init__(self) -> None:
-        self.calls: list[Call] = []
-
-    def begin(self, target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[str], None]:
-        call = Call(target, short_arguments(args, kwargs))
-        self.calls.append(call)
-        return partial(setattr, call, "result")
-
-
 @contextmanager
 def trace(*targets: Any) -> Iterator[list[Call]]:
     """Record the calls of a model's functions, in the order in which they begin.
@@ -196,9 +169,9 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     Raises:
         SimEnvError: As ``attach_handler``.
     """
-    recorder = _Calls()
+    recording = Trace()
     with LOCK:
         hooks = [target for target in list(Target.all) if isinstance(target, Hook) and (target.for_good or target.slot)]
         found = [find_target(target) for target in targets] if targets else [current_target(hook) for hook in hooks]
-    with _added([(target, recorder) for target in dict.fromkeys(found) if isinstance(target, Hook)]):
-        yield recorder.calls
+    with _added([(target, recording) for target in dict.fromkeys(found) if isinstance(target, Hook)]):
+        yield recording.calls

@@ -26,12 +26,7 @@ POINT: Final = Purpose("decision point", UnknownPointError, decision_points)
 
 @dataclass(frozen=True)
 class NamedPoint:
-    """A decision point together with the definition that an environment uses for it.
-
-    Attributes:
-        point: The decision point.
-        definition: The definition.
-    """
+    """A decision point together with the definition that an environment uses for it."""
 
     point: DecisionPoint
     definition: Definition
@@ -48,14 +43,9 @@ class NamedPoint:
 
 
 def portable(key: Any, name: str | None = None) -> Any:
-    """Find a key that names a function in another process: its dotted name, if that surely leads to the function there.
+    """Return a key that names a function in another process: its dotted name, if that surely leads to it there.
 
-    Args:
-        key: A function, or another key that a user has given.
-        name: The function's dotted name, if it is known.
-
-    Returns:
-        The dotted name, a ``Member``, the function, or ``key`` itself if it is not a function.
+    Anything but a function is returned as it is.
     """
     function = unwrapped(key)
     if not isinstance(function, FunctionType):
@@ -104,39 +94,31 @@ def find_points(
     required: bool = True,
     empty: bool = False,
 ) -> list[NamedPoint]:
-    """Find all decision points that ``points=`` names.
+    """Find all decision points that ``points=`` names, in the order in which they are named.
 
     Args:
-        points: A dotted name, a function, a list of these, or a dict from these to definitions. None: the
-            simulation's attribute ``points``, or all decorated points if there is no such attribute. A point that is
-            named without a definition gets the definition in the simulation's ``points``, if there is one.
+        points: The argument ``points=``; None: the simulation's attribute ``points``, or all decorated points if there
+            is no such attribute.
         simulation: The simulation.
         own: The result of ``own_points``, if it is known.
         required: Whether all decorated points are used if none is named. If False, none is used.
         empty: Whether ``points`` may be empty.
-
-    Returns:
-        The points, in the order in which they were named.
 
     Raises:
         UnknownPointError: A name leads to nothing, or no point is named.
         DefinitionError: A function has no definition, or a value of the dict is not a definition.
         PatchError: A function that was named cannot become a decision point.
     """
-    if own is None:
-        own = own_points(simulation)
+    own = own_points(simulation) if own is None else own
     if points is None:
         points = getattr(simulation, "points", None)
     if points is None:
-        if not required:
-            return []
-        points = _all_registered()
-    if isinstance(points, Mapping):
-        found = [find_point(key, definition, own=own) for key, definition in points.items()]
-    else:
-        if isinstance(points, str) or not hasattr(points, "__iter__"):
-            points = [points]
-        found = [find_point(key, own=own) for key in points]
+        points = _all_registered() if required else []
+        empty = empty or not required
+    if isinstance(points, str) or not hasattr(points, "__iter__"):
+        points = [points]
+    entries = points.items() if isinstance(points, Mapping) else [(key, None) for key in points]
+    found = [find_point(key, definition, own=own) for key, definition in entries]
     if not found and not empty:
         raise UnknownPointError("no decision point was named: points is empty")
     for number, named in enumerate(found):
@@ -148,19 +130,7 @@ def find_points(
 def find_point(
     key: Any, definition: Any = None, *, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})
 ) -> NamedPoint:
-    """Find one decision point.
-
-    Args:
-        key: A dotted name, or a function.
-        definition: The definition to use. None: the simulation's own definition, or that of the point's decorator.
-        own: The definitions in the simulation's ``points``.
-
-    Returns:
-        The point with its definition.
-
-    Raises:
-        UnknownPointError, DefinitionError, PatchError: See ``find_points``.
-    """
+    """Find one decision point by a dotted name or function, and the definition to use for it, as ``find_points``."""
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(
             f"the definition of {name_of(key)} must come from make_step, not {short_repr(definition)}"
@@ -181,11 +151,7 @@ def by_name(own: Mapping[DecisionPoint, Definition]) -> dict[str, DecisionPoint]
 
 
 def locate(key: Any, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})) -> DecisionPoint:
-    """Find the point of a function, whether it has a definition or not.
-
-    Args:
-        key: A dotted name, or a function.
-        own: The simulation's own points.
+    """Return the point of a dotted name or function, whether it has a definition or not.
 
     Raises:
         UnknownPointError: The name leads to nothing.

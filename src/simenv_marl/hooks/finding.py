@@ -15,7 +15,7 @@ from .places import (
     extend_to_importers,
     find_hook,
     hook_at,
-    make_permanent,
+    permanent_hook,
     raw_attribute,
     resolve,
     split_binding,
@@ -160,32 +160,28 @@ def expose(thing: Any) -> Any:
 
 def _expose_function(thing: Any) -> Any:
     function, binding = split_binding(thing)
-    hook = hook_of(function)
-    if hook is None:
-        name = f"{function.__module__}.{function.__qualname__}"
-        present = _function_at(name)
-        hook = hook_of(present)
-        if hook is not None and hook.exposed and hook.function is function:
-            function = present  # already exposed
-        else:
-            hook = Hook(function, name, bound=binding is not staticmethod)
-            function = hook.stand_in()
-    elif not hook.for_good:  # fetched while its hook was installed temporarily
-        make_permanent(hook)
-        function = hook.stand_in()
+    wrapper = _permanent_wrapper(function)
+    hook = hook_of(wrapper) or permanent_hook(thing)[0]
+    if wrapper is None:
+        wrapper = hook.stand_in()
     hook.exposed = True
-    if isinstance(thing, (staticmethod, classmethod)) and thing.__func__ is function:
+    if isinstance(thing, (staticmethod, classmethod)) and thing.__func__ is wrapper:
         return thing
-    return function if binding is None else binding(function)
+    return wrapper if binding is None else binding(wrapper)
 
 
-def _function_at(name: str) -> Any:
-    """Return what is found under a dotted name; None if there is nothing."""
+def _permanent_wrapper(function: FunctionType) -> Any:
+    """Return the wrapper of a function that is decorated or exposed already; None if there is none."""
+    hook = hook_of(function)
+    if hook is not None:
+        return function if hook.for_good else None
     try:
-        owner, attribute = resolve(name, TARGET)
+        owner, attribute = resolve(f"{function.__module__}.{function.__qualname__}", TARGET)
     except (UnknownTargetError, PatchError, ImportError):
         return None
-    return unbind(vars(owner).get(attribute))
+    present = unbind(vars(owner).get(attribute))
+    hook = hook_of(present)
+    return present if hook is not None and hook.exposed and hook.function is function else None
 
 
 # -- finding --------------------------------------------------------------------------------------

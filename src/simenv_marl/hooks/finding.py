@@ -188,10 +188,7 @@ def _permanent_wrapper(function: FunctionType) -> Any:
 
 
 def find_target(target: Any) -> Target:
-    """Find the target for handlers.
-
-    Args:
-        target: A function, an iterable or a class, or its dotted name.
+    """Find the target for handlers: a function, an iterable or a class, or its dotted name.
 
     Raises:
         UnknownTargetError: The name does not exist.

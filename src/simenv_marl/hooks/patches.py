@@ -57,11 +57,7 @@ class Installation:
     __slots__ = ("_patches", "_user", "complete")
 
     def __init__(self, patches: Iterable[Patch]) -> None:
-        """Install the patches.
-
-        Raises:
-            PatchError: A place cannot be patched; then no patch stays installed.
-        """
+        """Install the patches; after an error, none of them stays installed."""
         self._user, self.complete = object(), True
         self._patches = list(patches)
         try:

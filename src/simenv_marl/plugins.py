@@ -6,7 +6,7 @@ are iterable: for the whole process (``attach_handler``), for a block (``handler
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from .decision import decision_points
@@ -14,7 +14,8 @@ from .errors import HandlerError, name_of, short_repr
 from .hooks.finding import current_target, expose, exposed_functions, find_target
 from .hooks.handlers import ChangedArgs, ChangedResult
 from .hooks.hook import Hook
-from .hooks.plugins import Entry, make_handler
+from .hooks.patches import Installation
+from .hooks.plugins import Attachment, Entry, make_handler
 from .hooks.stacks import LOCK
 from .hooks.targets import Call, Target, Trace
 
@@ -137,18 +138,11 @@ def handlers(*entries: Entry) -> Iterator[None]:
     """
     with LOCK:
         attached = [make_handler(entry) for entry in entries]
-    with _added([(handler.target, handler) for handler in attached]):
+        installation = Installation([Attachment((handler.target, handler) for handler in attached)])
+    try:
         yield
-
-
-@contextmanager
-def _added(entries: list[tuple[Target, Any]]) -> Iterator[None]:
-    """Add handlers or recorders to targets for the duration of a ``with`` block; all of them or none."""
-    with ExitStack() as stack:
-        for target, handler in entries:
-            stack.callback(target.remove, handler)
-            target.add(handler)
-        yield
+    finally:
+        installation.uninstall()
 
 
 # -- seeing what happens --------------------------------------------------------------------------
@@ -173,5 +167,9 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     with LOCK:
         hooks = [target for target in list(Target.all) if isinstance(target, Hook) and (target.for_good or target.slot)]
         found = [find_target(target) for target in targets] if targets else [current_target(hook) for hook in hooks]
-    with _added([(target, recording) for target in dict.fromkeys(found) if isinstance(target, Hook)]):
+        functions = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
+        installation = Installation([Attachment((function, recording) for function in functions)])
+    try:
         yield recording.calls
+    finally:
+        installation.uninstall()

@@ -1,12 +1,14 @@
 """Decision points on top of hooks, and how they are found."""
 
 import gc
+import sys
 import weakref
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
 from simenv_marl.core import processes
-from simenv_marl.core.points import aliases, find_point, find_points, locate, portable
+from simenv_marl.core.points import aliases, find_point, find_points, locate, own_points, portable
 from simenv_marl.core.processes import pack, unpack
 from simenv_marl.decision import point_of, registered, unwrapped
 from simenv_marl.errors import UnknownPointError
@@ -80,6 +82,20 @@ def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_
     finally:
         inherited.point.hook.uninstall(1)
     assert "decorated" not in vars(Sub)
+
+
+def test_a_simulations_own_definition_comes_before_the_inherited_one():
+    name, definition = f"{HERE}.Sub.decorated", define(agent="own_0")
+    own = own_points(SimpleNamespace(points={name: definition}))
+    assert find_point(name, own=own).definition is definition
+    assert find_point(name).definition is point_of(Base.decorated)[1]
+
+
+def test_a_function_is_a_point_by_what_its_module_calls_it(monkeypatch):
+    module = ModuleType("renaming_points")
+    exec("def first(): return 1\nsecond = first\ndel first", vars(module))
+    monkeypatch.setitem(sys.modules, "renaming_points", module)
+    assert locate(module.second) is locate("renaming_points.second")
 
 
 def test_two_definitions_of_one_function_are_one_point():

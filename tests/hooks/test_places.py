@@ -21,6 +21,7 @@ from simenv_marl.hooks.hook import hook_of
 from simenv_marl.hooks.patches import Installation
 from simenv_marl.hooks.places import Place, find_hook, hook_at, places_of, resolve, unbind
 from simenv_marl.plugins import (
+    ChangedResult,
     attach_handler,
     attached_handlers,
     expose_to_plugins,
@@ -274,6 +275,25 @@ def test_classes_of_undecorated_points_go_with_their_environments():
     gc.collect()
     gc.collect()
     assert [reference() for reference in references] == [None] * 20
+
+
+def test_exposed_classes_of_iterables_are_collected():
+    references = []
+    for _ in range(5):
+
+        class Pool:
+            def __iter__(self):
+                return iter([1, 2])
+
+        references.append(weakref.ref(Pool))
+        expose_to_plugins(Pool)
+        with handlers((lambda pool, _result: ChangedResult(_result + 1), Pool, "after_next")):
+            assert list(Pool()) == [2, 3]
+        assert list(Pool()) == [1, 2]
+        del Pool
+    gc.collect()
+    gc.collect()
+    assert [reference() for reference in references] == [None] * 5
 
 
 def test_a_handler_that_is_attached_by_name_after_a_redecoration_is_called():

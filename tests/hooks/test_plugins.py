@@ -214,6 +214,18 @@ def test_a_handlers_parameters_may_have_other_names():
     assert seen == [(1, 9), (1, 9), (1, 2), (1, 2)]
 
 
+def test_a_handler_with_other_names_gets_the_default_of_an_argument_that_was_left_out():
+    @expose_to_plugins
+    def function(value, more=2, most=3):
+        return value + more + most
+
+    seen = []
+    with handlers((lambda a, b=8, c=9: seen.append((a, b, c)), function, "before")):
+        assert function(1, most=5) == 8
+        assert function(value=1) == 6
+    assert seen == [(1, 2, 5), (1, 8, 9)]
+
+
 def test_a_wrong_call_is_the_functions_own_error_and_no_handler_runs():
     function, log = local(), []
     with handlers((lambda *args, **kwargs: log.append(1), function, "before")):

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable
-from functools import update_wrapper
+from functools import partial
 from sys import modules
 from types import FunctionType, MethodType
 from typing import Any, Final
@@ -21,7 +21,7 @@ from .places import (
     split_binding,
     unbind,
 )
-from .targets import Items, Target, next_item
+from .targets import Items, Slot, Target, next_item
 
 
 def exposed_functions() -> list[str]:
@@ -68,12 +68,11 @@ class ClassTarget(IterableTarget):
 
     def __init__(self, owner: type) -> None:
         name = f"{owner.__module__}.{owner.__qualname__}"
-        wrappers = {"__iter__": self._wrapped_iter, "__next__": self._wrapped_next}
-        self._hooks: list[tuple[Hook, Callable[[Any], Any]]] = [
-            (hook_at(f"{name}.{attribute}", owner, attribute, TARGET), wrap)
-            for attribute, wrap in wrappers.items()
+        self._hooks = {
+            attribute: hook_at(f"{name}.{attribute}", owner, attribute, TARGET)
+            for attribute in _RULES
             if hasattr(owner, attribute)
-        ]
+        }
         if not self._hooks:
             raise PatchError(
                 f"{name} is a class whose instances are not iterable; to extend its construction, name {name}.__init__"
@@ -84,36 +83,34 @@ class ClassTarget(IterableTarget):
     @property
     def stale(self) -> bool:
         """Whether another object has replaced it while nothing was set in its place."""
-        return any(hook.stale for hook, _ in self._hooks)
+        return any(hook.stale for hook in self._hooks.values())
 
     def _apply(self) -> None:
-        for hook, _ in self._hooks:
+        for hook in self._hooks.values():
             hook.install(self)
 
     def _revert(self) -> None:
-        for hook, _ in self._hooks:
+        for hook in self._hooks.values():
             hook.uninstall(self)
 
     def _changed(self) -> None:
-        for hook, wrap in self._hooks:
-            hook.replace_rule(wrap(hook.function) if self.slot or self.exposed else None)
+        for attribute, hook in self._hooks.items():
+            with_handlers = partial(_RULES[attribute], self.slot, hook.function)
+            hook.replace_rule(with_handlers if self.slot or self.exposed else None)
 
-    def _wrapped_iter(self, rule: Any) -> Any:
-        slot = self.slot
 
-        def __iter__(iterable: Any) -> Any:  # noqa: N807
-            iterator = rule(iterable)
-            return iterator if iterator is iterable else Items(iterator, slot, iterable)
+def _iter(slot: Slot, rule: Callable[[Any], Any], iterable: Any) -> Any:
+    """Run an ``__iter__``, whose items pass through handlers."""
+    iterator = rule(iterable)
+    return iterator if iterator is iterable else Items(iterator, slot, iterable)
 
-        return update_wrapper(__iter__, rule)
 
-    def _wrapped_next(self, rule: Any) -> Any:
-        slot = self.slot
+def _next(slot: Slot, rule: Callable[[Any], Any], iterable: Any) -> Any:
+    """Run a ``__next__``, whose item passes through handlers."""
+    return next_item(slot, partial(rule, iterable), iterable)
 
-        def __next__(iterable: Any) -> Any:  # noqa: N807
-            return next_item(slot, lambda: rule(iterable), iterable)
 
-        return update_wrapper(__next__, rule)
+_RULES: Final = {"__iter__": _iter, "__next__": _next}
 
 
 def _class_target(owner: type) -> ClassTarget:

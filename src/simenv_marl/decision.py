@@ -5,21 +5,22 @@ behaves like the function, whose body is the *rule*. But if the calling simulati
 environment for its decision. A ``DecisionPoint`` is what is asked: one for every rule, with any number of definitions.
 """
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import KW_ONLY, dataclass
 from functools import update_wrapper
 from types import FunctionType
 from typing import Any, Final
-from weakref import WeakSet, WeakValueDictionary
+from weakref import WeakValueDictionary
 
 import numpy as np
 from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, short_repr
-from .hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
-from .hooks.places import stays, unbind
+from .hooks.hook import Hook, beneath, hook_of, made_with
+from .hooks.places import permanent_hook
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
 Mapped = Callable[..., Any]
@@ -62,9 +63,10 @@ class Definition:
         """
         _check_kinds(self)
         _check_together(self)
-        answers = answers_of(self)
+        answers = _answers(self.action_space_mapping)
         if answers is not None:
-            object.__setattr__(self, "action_space_mapping", _look_up(answers, self.action_space))
+            _check_answers(answers, self.action_space)
+            object.__setattr__(self, "action_space_mapping", dict(answers).__getitem__)
         object.__setattr__(self, "removed_by", _removals(self.removed_by))
 
     def __call__(self, function: Any) -> Any:
@@ -80,17 +82,7 @@ class Definition:
         Raises:
             PatchError: ``function`` is none of these.
         """
-        given, binding = unbind(function)
-        hook = hook_of(given)
-        if hook is None:
-            name = f"{given.__module__}.{given.__qualname__}"
-            hook = Hook(given, name, bound=binding is not staticmethod)
-        elif not isinstance(hook.function, FunctionType):
-            raise PatchError(
-                f"{short_repr(hook.function)} cannot be a decision point: it is not a function written in Python"
-            )
-        elif not hook.for_good:  # fetched while its hook was set temporarily
-            stays(hook)
+        hook, binding = permanent_hook(function)
         point = point_for(hook)
         wrapper = hook.stand_in(self)
         point.definition = self
@@ -210,6 +202,7 @@ def _check_together(definition: Definition) -> None:
 
 
 def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
+    """Return ``removed_by`` as a dict from dotted names to callables."""
     if isinstance(removed_by, str):
         removed_by = [removed_by]
     named = removed_by if isinstance(removed_by, Mapping) else dict.fromkeys(removed_by)
@@ -222,7 +215,8 @@ def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
     return dict(named)
 
 
-def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[Any], Any]:
+def _check_answers(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> None:
+    """Check that a dict from action to decision fits the action space."""
     if not isinstance(space, spaces.Discrete):
         raise DefinitionError(f"make_step: a dict as action_space_mapping needs a Discrete action_space, not {space}")
     actions = range(int(space.start), int(space.start + space.n))
@@ -233,28 +227,24 @@ def _look_up(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> Callable[[
             f"make_step: the dict action_space_mapping must have just the actions of {space};"
             f" missing: {missing}, not in the space: {surplus}"
         )
-    return dict(answers).__getitem__
 
 
-def answers_of(definition: Definition) -> Mapping[Any, Any] | None:
+def _answers(mapping: Any) -> Mapping[Any, Any] | None:
     """Return the dict from action to decision that was given as ``action_space_mapping``; None for a callable."""
-    mapping: Any = definition.action_space_mapping
     if isinstance(mapping, Mapping):
         return mapping
-    held = getattr(mapping, "__self__", None)
-    return held if isinstance(held, dict) and mapping.__name__ == "__getitem__" else None
+    owner = getattr(mapping, "__self__", None)
+    return owner if isinstance(owner, dict) and mapping.__name__ == "__getitem__" else None
 
 
 def inverse(definition: Definition) -> dict[Any, Any] | None:
     """Return the dict from decision to action, if ``action_space_mapping`` is a dict that can be inverted."""
-    answers = answers_of(definition)
-    if answers is None:
-        return None
+    answers = _answers(definition.action_space_mapping) or {}
     try:
         actions = {decision: action for action, decision in answers.items()}
     except TypeError:  # unhashable decisions
         return None
-    return actions if len(actions) == len(answers) else None
+    return actions if actions and len(actions) == len(answers) else None
 
 
 # -- decision points ------------------------------------------------------------------------------
@@ -300,42 +290,19 @@ class DecisionPoint:
         return self.hook.function
 
     @property
-    def kind(self) -> str:
-        """What a call returns: "function" (a value), "generator" or "coroutine"."""
-        return self.hook.kind
-
-    @property
-    def alone(self) -> bool:
-        """Whether every call has one argument, the object it is called on."""
-        return self.hook.alone
-
-    @property
-    def bound(self) -> bool:
-        """Whether its first argument is the object it is called on, which is never passed by keyword."""
-        return self.hook.bound
-
-    @property
-    def wrappers(self) -> WeakSet[FunctionType]:
-        """The decision functions of this point."""
-        return self.hook.stand_ins
-
-    @property
     def letters(self) -> str:
         """The letters of the function's name in lower case, for the default name of its agent."""
-        name = self.name.rpartition(".")[2].lower()
-        return "".join(letter for letter in name if "a" <= letter <= "z") or "agent"
-
-    def wrap(self, definition: Definition | None) -> FunctionType:
-        """Make a decision function of this point. Named as a point, it stands for the definition."""
-        return self.hook.stand_in(definition)
-
-    def family(self) -> "list[DecisionPoint]":
-        """Return the other points of the same rule."""
-        return [hook.point for hook in MADE_OF[self.rule] if hook.point is not None and hook is not self.hook]
+        return re.sub("[^a-z]", "", self.name.rpartition(".")[2].lower()) or "agent"
 
 
 def point_for(hook: Hook) -> "DecisionPoint":
-    """Return the decision point of a hook, which may be new."""
+    """Return the decision point of a hook, which may be new.
+
+    Raises:
+        PatchError: The hook's function is not written in Python.
+    """
+    if not isinstance(hook.function, FunctionType):
+        raise PatchError(f"{hook.name} cannot be a decision point: it is not a function written in Python")
     if hook.point is None:
         hook.point = DecisionPoint(hook)
     point: DecisionPoint = hook.point

@@ -6,18 +6,18 @@ are iterable: for the whole process (``attach_handler``), for a block (``handler
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from .decision import decision_points
-from .errors import HandlerError, SimEnvError, short_repr
-from .hooks.attached import Call, ChangedArgs, ChangedResult, title
-from .hooks.handlers import Target
+from .errors import HandlerError, name_of, short_repr
+from .hooks.finding import current_target, expose, exposed_functions, find_target
+from .hooks.handlers import ChangedArgs, ChangedResult
 from .hooks.hook import Hook
-from .hooks.places import Held
-from .hooks.plugins import Added, Entry, attachable
+from .hooks.patches import Installation
+from .hooks.plugins import Attachment, Entry, make_handler
 from .hooks.stacks import LOCK
-from .hooks.targets import at_hand, expose, exposed_functions, find_target
+from .hooks.targets import Call, Target, Trace
 
 __all__ = [
     "Call",
@@ -49,7 +49,7 @@ def attached_handlers(env: Any = None) -> list[Entry]:
         entries: list[Entry] = env.unwrapped.plugins
         return entries
     targets = sorted(Target.all, key=lambda target: target.name)
-    return [(a.handler, target.name, a.position) for target in targets for a in target.attached]
+    return [(handler.function, target.name, handler.position) for target in targets for handler in target.handlers]
 
 
 def expose_to_plugins(function_or_iterable: Thing) -> Thing:
@@ -97,7 +97,7 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        attached = attachable((handler, target, position))
+        attached = make_handler((handler, target, position))
         attached.target.add(attached)
 
 
@@ -116,12 +116,13 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
     """
     with LOCK:
         found = find_target(target)
-        there = [a for a in found.attached if a.position == position and (handler is None or a.handler == handler)]
-        if not there:
-            what = "no handler is" if handler is None else f"{title(handler)} is not"
-            at = ", ".join(sorted({a.position for a in found.attached})) or "nowhere"
+        present = found.handlers
+        chosen = [a for a in present if a.position == position and (handler is None or a.function == handler)]
+        if not chosen:
+            what = "no handler is" if handler is None else f"{name_of(handler)} is not"
+            at = ", ".join(sorted({a.position for a in present})) or "nowhere"
             raise HandlerError(f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}")
-        for attached in there if handler is None else there[-1:]:
+        for attached in chosen if handler is None else chosen[-1:]:
             found.remove(attached)
 
 
@@ -136,12 +137,12 @@ def handlers(*entries: Entry) -> Iterator[None]:
         SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
-        attached = [attachable(entry) for entry in entries]
-        held = Held([Added([(own.target, own) for own in attached])])
+        attached = [make_handler(entry) for entry in entries]
+        installation = Installation([Attachment((handler.target, handler) for handler in attached)])
     try:
         yield
     finally:
-        held.let_go()
+        installation.uninstall()
 
 
 # -- seeing what happens --------------------------------------------------------------------------
@@ -162,25 +163,13 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     Raises:
         SimEnvError: As ``attach_handler``.
     """
-    calls: list[Call] = []
-
-    def record(target: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call:
-        call = Call.of(target, args, kwargs)
-        calls.append(call)
-        return call
-
+    recording = Trace()
     with LOCK:
-        found = dict.fromkeys(map(find_target, targets) if targets else _everything())
-        held = Held([Added([(target, record) for target in found if isinstance(target, Hook)])])
+        hooks = [target for target in list(Target.all) if isinstance(target, Hook) and (target.for_good or target.slot)]
+        found = [find_target(target) for target in targets] if targets else [current_target(hook) for hook in hooks]
+        functions = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
+        installation = Installation([Attachment((function, recording) for function in functions)])
     try:
-        yield calls
+        yield recording.calls
     finally:
-        held.let_go()
-
-
-def _everything() -> Iterator[Target]:
-    """Yield all targets that are exposed or have handlers, and all decorated decision points."""
-    for target in list(Target.all):
-        if isinstance(target, Hook) and (target.for_good or target.slot):
-            with suppress(SimEnvError, ImportError):
-                yield at_hand(target)
+        installation.uninstall()

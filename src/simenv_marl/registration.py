@@ -13,7 +13,7 @@ from gymnasium.wrappers import HumanRendering, RenderCollection
 from .core.options import ViewOptions
 from .core.plan import Plan
 from .core.points import Points
-from .envs.make import aec_env, parallel_env, vector_env, view_class
+from .envs.make import vector_env, view_class
 from .errors import OptionValueError, UnknownPointError, short_repr
 from .simulation import RULE
 
@@ -76,14 +76,14 @@ def register_simulation(
     named = [b.point.name for b in plan.active if b.agent is not None or plan.one_agent is not None]
     for point, title in zip(named, _titles(named), strict=True):
         made.append(f"{name}/{title}-v{version}")
-        _register_gymnasium(made[-1], "make_single", **where, point=point)
+        _register_gymnasium(made[-1], {**where, "view": "single", "point": point})
     made.append(f"{name}/Joint-v{version}")
-    _register_gymnasium(made[-1], "make_joint", **where)
+    _register_gymnasium(made[-1], {**where, "view": "joint"})
     register: Any = getattr(pettingzoo, "register", None)
     if register is not None:  # PettingZoo has a registry since 1.26
-        for kind in ("aec", "parallel"):
-            getattr(pettingzoo, f"{kind}_registry", {}).pop(f"{name}/coop-v{version}", None)
-            register(kind, f"{name}/coop_v{version}", f"{__name__}:make_{kind}", kwargs=where)
+        for view in ("aec", "parallel"):
+            getattr(pettingzoo, f"{view}_registry", {}).pop(f"{name}/coop-v{version}", None)
+            register(view, f"{name}/coop_v{version}", f"{__name__}:make_view", kwargs={**where, "view": view})
         made.append(f"{name}/coop_v{version}")
     return made
 
@@ -104,65 +104,27 @@ def _camel(point: str, parts: int) -> str:
     return "".join(word[:1].upper() + word[1:] for word in words)
 
 
-def _register_gymnasium(identity: str, maker: str, **kwargs: Any) -> None:
+def _register_gymnasium(identity: str, kwargs: dict[str, Any]) -> None:
     gymnasium.registry.pop(identity, None)  # it may be registered again, as when a notebook's cell is rerun
-    gymnasium.register(identity, f"{__name__}:{maker}", vector_entry_point=f"{__name__}:{maker}_vector", kwargs=kwargs)
+    gymnasium.register(
+        identity, f"{__name__}:make_view", vector_entry_point=f"{__name__}:make_vector_view", kwargs=kwargs
+    )
 
 
-def _recipe(recipe: str, module: str) -> _Recipe:
-    if recipe not in _RECIPES and module != "__main__":
-        importlib.import_module(module)  # as in a process that has only the spec
-    try:
-        return _RECIPES[recipe]
-    except KeyError:
-        raise UnknownPointError(
-            f"no simulation is registered as {recipe!r} in this process; import the module that registers it, or"
-            ' make the environment by "module:id"'
-        ) from None
+# -- entry points ---------------------------------------------------------------------------------
 
 
-def make_single(recipe: str, module: str, point: str, **options: Any) -> Any:
-    """Make a single view. All other points follow their rule, or their policy."""
-    known = _recipe(recipe, module)
-    return _make(known, "single", _single_options(known, point, options))
+def make_view(recipe: str, module: str, view: str, point: str | None = None, **options: Any) -> Any:
+    """Make an environment of a registered simulation.
 
-
-def make_single_vector(recipe: str, module: str, point: str, num_envs: int, **options: Any) -> Any:
-    """Make a vector view of single views."""
-    known = _recipe(recipe, module)
-    return _make_vector(known, "single", num_envs, _single_options(known, point, options))
-
-
-def _single_options(known: _Recipe, point: str, options: dict[str, Any]) -> dict[str, Any]:
-    merged = {**known.options, **options}
-    merged["policies"] = {other: RULE for other in known.active if other != point} | dict(merged.get("policies") or {})
-    if merged.get("agent") is None:
-        for name in ("possible_agents", "undeclared"):
-            merged.pop(name, None)
-    return merged
-
-
-def make_joint(recipe: str, module: str, **options: Any) -> Any:
-    """Make a joint view."""
-    known = _recipe(recipe, module)
-    return _make(known, "joint", {**known.options, "flatten": known.flatten, **options})
-
-
-def make_joint_vector(recipe: str, module: str, num_envs: int, **options: Any) -> Any:
-    """Make a vector view of joint views."""
-    known = _recipe(recipe, module)
-    return _make_vector(known, "joint", num_envs, {**known.options, "flatten": known.flatten, **options})
-
-
-def _make(known: _Recipe, view: str, options: dict[str, Any]) -> Any:
-    """Make a Gymnasium view; with a wrapper that supplies the render mode if the simulation lacks it.
-
-    Gymnasium itself reads render modes from the metadata of a class, which an entry point for many simulations lacks.
+    Gymnasium reads render modes from the metadata of a class, which an entry point for many simulations lacks.
+    Therefore this applies the wrapper by which Gymnasium supplies a render mode that the simulation lacks.
     """
+    known, options = _recipe(recipe, module, view, point, options)
     mode = options.pop("render_mode", None)
     plan = Plan.draw_up(known.simulation, known.points, options)
     wrapper: Any = None
-    if mode not in plan.model.render_modes and isinstance(mode, str):
+    if view in ("single", "joint") and isinstance(mode, str) and mode not in plan.model.render_modes:
         if mode.endswith("_list") and mode.removesuffix("_list") in plan.model.render_modes:
             mode, wrapper = mode.removesuffix("_list"), RenderCollection
         elif mode == "human" and "rgb_array" in plan.model.render_modes:
@@ -171,20 +133,33 @@ def _make(known: _Recipe, view: str, options: dict[str, Any]) -> Any:
     return env if wrapper is None else wrapper(env)
 
 
-def _make_vector(known: _Recipe, view: str, num_envs: int, options: dict[str, Any]) -> Any:
-    """Make a vector view; ``max_episode_steps``, which ``make_vec`` passes on, becomes ``max_steps``."""
+def make_vector_view(
+    recipe: str, module: str, view: str, num_envs: int, point: str | None = None, **options: Any
+) -> Any:
+    """Make a vector environment. ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``."""
+    known, options = _recipe(recipe, module, view, point, options)
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
     options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
     return vector_env(known.simulation, known.points, num_envs=num_envs, view=view, **options)
 
 
-def make_aec(recipe: str, module: str, **options: Any) -> Any:
-    """Make an AEC view."""
-    known = _recipe(recipe, module)
-    return aec_env(known.simulation, known.points, **{**known.options, **options})
-
-
-def make_parallel(recipe: str, module: str, **options: Any) -> Any:
-    """Make a parallel view."""
-    known = _recipe(recipe, module)
-    return parallel_env(known.simulation, known.points, **{**known.options, **options})
+def _recipe(
+    name: str, module: str, view: str, point: str | None, options: dict[str, Any]
+) -> tuple[_Recipe, dict[str, Any]]:
+    """Return a recipe, and its options for a view."""
+    if name not in _RECIPES and module != "__main__":
+        importlib.import_module(module)  # as in a process that has only the spec
+    known = _RECIPES.get(name)
+    if known is None:
+        raise UnknownPointError(
+            f"no simulation is registered as {name!r} in this process; import the module that registers it, or"
+            ' make the environment by "module:id"'
+        )
+    merged = {**known.options, **({"flatten": known.flatten} if view == "joint" else {}), **options}
+    if point is not None:
+        rules = {other: RULE for other in known.active if other != point}
+        merged["policies"] = rules | dict(merged.get("policies") or {})
+        if merged.get("agent") is None:
+            merged.pop("possible_agents", None)
+            merged.pop("undeclared", None)
+    return known, merged

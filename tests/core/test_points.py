@@ -1,12 +1,14 @@
 """Decision points on top of hooks, and how they are found."""
 
 import gc
+import sys
 import weakref
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
 from simenv_marl.core import processes
-from simenv_marl.core.points import find_point, find_points, locate, portable
+from simenv_marl.core.points import aliases, find_point, find_points, locate, own_points, portable
 from simenv_marl.core.processes import pack, unpack
 from simenv_marl.decision import point_of, registered, unwrapped
 from simenv_marl.errors import UnknownPointError
@@ -55,31 +57,45 @@ def test_an_undecorated_function_is_one_point_however_it_is_named():
 
 
 def test_it_is_found_while_it_is_set_and_while_it_has_handlers():
-    point, _ = locate(Base.plain)
-    point.hook.hold(1)
+    point = locate(Base.plain)
+    point.hook.install(1)
     try:
-        assert locate(Base.plain)[0] is locate(f"{HERE}.Base.plain")[0] is point
+        assert locate(Base.plain) is locate(f"{HERE}.Base.plain") is point
         assert unwrapped(Base.plain) is point.rule
     finally:
-        point.hook.let_go(1)
+        point.hook.uninstall(1)
     with handlers((lambda self: None, f"{HERE}.Base.plain", "before")):
-        assert locate(Base.plain)[0] is point
+        assert locate(Base.plain) is point
     fetched = Base.plain
-    assert locate(fetched)[0] is point
+    assert locate(fetched) is point
 
 
 def test_what_a_class_inherits_is_a_point_of_its_own_with_the_definition_of_the_base_class():
     inherited = find_point(f"{HERE}.Sub.decorated")
     assert inherited.point is not point_of(Base.decorated)[0]
     assert inherited.definition is point_of(Base.decorated)[1]
-    inherited.point.hook.hold(1)
+    inherited.point.hook.install(1)
     try:
         again = find_point(f"{HERE}.Sub.decorated")
         assert (again.point, again.definition) == (inherited.point, inherited.definition)
         assert Sub().decorated() == "decorated"
     finally:
-        inherited.point.hook.let_go(1)
+        inherited.point.hook.uninstall(1)
     assert "decorated" not in vars(Sub)
+
+
+def test_a_simulations_own_definition_comes_before_the_inherited_one():
+    name, definition = f"{HERE}.Sub.decorated", define(agent="own_0")
+    own = own_points(SimpleNamespace(points={name: definition}))
+    assert find_point(name, own=own).definition is definition
+    assert find_point(name).definition is point_of(Base.decorated)[1]
+
+
+def test_a_function_is_a_point_by_what_its_module_calls_it(monkeypatch):
+    module = ModuleType("renaming_points")
+    exec("def first(): return 1\nsecond = first\ndel first", vars(module))
+    monkeypatch.setitem(sys.modules, "renaming_points", module)
+    assert locate(module.second) is locate("renaming_points.second")
 
 
 def test_two_definitions_of_one_function_are_one_point():
@@ -95,7 +111,7 @@ def test_two_definitions_of_one_function_are_one_point():
     assert find_point(first).point.definition is two  # what the bare name means
     other = define()(function)
     assert point_of(other)[0] is not point_of(first)[0]
-    assert point_of(first)[0] in point_of(other)[0].family()
+    assert point_of(first)[0] in aliases(point_of(other)[0])
 
 
 def test_a_point_goes_with_its_model():

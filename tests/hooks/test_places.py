@@ -16,10 +16,12 @@ from greenlet import getcurrent
 
 from simenv_marl import aec_env
 from simenv_marl.errors import PatchError, UnknownTargetError
+from simenv_marl.hooks.finding import TARGET
 from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.places import Held, Place, hook_at, places_of, plain, resolve
-from simenv_marl.hooks.targets import TARGET
+from simenv_marl.hooks.patches import Installation
+from simenv_marl.hooks.places import Place, find_hook, hook_at, places_of, resolve, unbind
 from simenv_marl.plugins import (
+    ChangedResult,
     attach_handler,
     attached_handlers,
     expose_to_plugins,
@@ -69,7 +71,7 @@ def function():
 
 
 def hook_of_name(name):
-    return hook_at(name, *resolve(name, TARGET), TARGET)
+    return find_hook(name, TARGET)
 
 
 def taken(hook):
@@ -86,10 +88,10 @@ def test_private_names_are_found_as_they_are_written_and_as_they_are(owner, name
     name = f"{HERE}.{owner.__name__}.{name}"
     assert resolve(name, TARGET) == (owner, "_Base__hidden")
     hook = hook_of_name(name)
-    hook.hold(1)
+    hook.install(1)
     taken(hook)
     assert owner().look() == "taken"
-    hook.let_go(1)
+    hook.uninstall(1)
     assert owner().look() == "hidden"
 
 
@@ -121,24 +123,23 @@ def test_a_module_that_imports_what_is_not_there_says_so_itself(tmp_path, monkey
 
 
 @pytest.mark.parametrize("name", ["Base.method", "Base.static", "Base.of_class", "Sub.method", "Sub.of_class"])
-def test_what_is_set_goes_with_the_last_who_has_let_go(name):
+def test_what_is_set_stays_until_its_last_user_uninstalls_it(name):
     owner, attribute = resolve(f"{HERE}.{name}", TARGET)
     before = vars(owner).get(attribute)
     hook = hook_of_name(f"{HERE}.{name}")
-    hook.hold(1)
-    hook.hold(2)
+    hook.install(1)
+    hook.install(2)
     assert type(vars(owner)[attribute]) is type(vars(Base)[attribute])
     taken(hook)
     assert getattr(owner(), attribute)() == "taken"
-    hook.let_go(2)
+    hook.uninstall(2)
     assert hook_of_name(f"{HERE}.{name}") is hook
-    hook.let_go(1)
+    hook.uninstall(1)
     assert vars(owner).get(attribute) is before
 
 
 def set_and_put_back(hooks):
-    held = Held(hooks)
-    held.let_go()
+    Installation(hooks).uninstall()
 
 
 @pytest.mark.parametrize("again", [True, False])
@@ -153,17 +154,17 @@ def test_an_interrupt_while_something_is_set_or_put_back_leaves_nothing(name, ag
     before = vars(owner).get(attribute), other.alias
     hooks = [hook_of_name(f"{HERE}.{name}"), hook_of_name(f"{HERE}.Base.look")]
     for number in itertools.count(1):
-        kept = Held(hooks)
-        where, raised = interrupt_at(number, kept.let_go) if again else interrupt_at(number, set_and_put_back, hooks)
+        kept = Installation(hooks)
+        where, raised = interrupt_at(number, kept.uninstall) if again else interrupt_at(number, set_and_put_back, hooks)
         del raised
         gc.collect(0)
-        kept.let_go()
+        kept.uninstall()
         assert (vars(owner).get(attribute), other.alias) == before, where
         assert hook_of(vars(Base)["look"]) is None, where
-        assert not kept.whole
-        kept = Held(hooks)
-        assert hook_of(plain(vars(owner)[attribute])) is hooks[0], where
-        kept.let_go()
+        assert not kept.complete
+        kept = Installation(hooks)
+        assert hook_of(unbind(vars(owner)[attribute])) is hooks[0], where
+        kept.uninstall()
         if where is None:
             break
     assert number > 10
@@ -177,10 +178,10 @@ def test_a_function_of_a_module_is_set_under_all_its_names():
         hook = hook_of_name(f"{HERE}.function")
         assert hook_at("other_module.alias", other, "alias", TARGET) is hook
         original = function
-        hook.hold(1)
+        hook.install(1)
         assert hook_of(other.alias) is hook_of(function) is hook
         late = other.late = other.alias
-        hook.let_go(1)
+        hook.uninstall(1)
         assert other.alias is other.late is function is original
         assert late() == "rule"
         assert {owner.__name__ for owner, _ in places_of(function)} == {HERE, "other_module"}
@@ -210,19 +211,19 @@ def test_a_function_is_found_by_what_its_module_calls_it():
 def test_what_something_else_has_set_is_left_alone_and_usable_afterwards():
     before = vars(Base)["method"]
     hook = hook_of_name(f"{HERE}.Base.method")
-    hook.hold(1)
+    hook.install(1)
     with mock.patch.object(Base, "method", return_value="mocked"):
-        hook.let_go(1)
+        hook.uninstall(1)
         assert Base().method() == "mocked"
         assert hook.stale
         with pytest.raises(PatchError, match="has been replaced"):
-            hook.hold(1)
+            hook.install(1)
     assert Base().method() == "rule"  # what the mock has put back
     hook = hook_of_name(f"{HERE}.Base.method")
-    hook.hold(1)
+    hook.install(1)
     taken(hook)
     assert Base().method() == "taken"
-    hook.let_go(1)
+    hook.uninstall(1)
     hook.leave(getcurrent())
     assert vars(Base)["method"] is before
 
@@ -274,6 +275,25 @@ def test_classes_of_undecorated_points_go_with_their_environments():
     gc.collect()
     gc.collect()
     assert [reference() for reference in references] == [None] * 20
+
+
+def test_exposed_classes_of_iterables_are_collected():
+    references = []
+    for _ in range(5):
+
+        class Pool:
+            def __iter__(self):
+                return iter([1, 2])
+
+        references.append(weakref.ref(Pool))
+        expose_to_plugins(Pool)
+        with handlers((lambda pool, _result: ChangedResult(_result + 1), Pool, "after_next")):
+            assert list(Pool()) == [2, 3]
+        assert list(Pool()) == [1, 2]
+        del Pool
+    gc.collect()
+    gc.collect()
+    assert [reference() for reference in references] == [None] * 5
 
 
 def test_a_handler_that_is_attached_by_name_after_a_redecoration_is_called():

@@ -100,7 +100,7 @@ def local():
 
 
 def test_the_papers_first_listing(capsys):
-    import simenv_marl as se
+    import simenv_marl.plugins as se
 
     def my_func(input):  # noqa: A002
         return input + 1
@@ -212,6 +212,18 @@ def test_a_handlers_parameters_may_have_other_names():
         function(1, more=2)
         function(more=2, value=1)
     assert seen == [(1, 9), (1, 9), (1, 2), (1, 2)]
+
+
+def test_a_handler_with_other_names_gets_the_default_of_an_argument_that_was_left_out():
+    @expose_to_plugins
+    def function(value, more=2, most=3):
+        return value + more + most
+
+    seen = []
+    with handlers((lambda a, b=8, c=9: seen.append((a, b, c)), function, "before")):
+        assert function(1, most=5) == 8
+        assert function(value=1) == 6
+    assert seen == [(1, 2, 5), (1, 8, 9)]
 
 
 def test_a_wrong_call_is_the_functions_own_error_and_no_handler_runs():
@@ -1186,7 +1198,7 @@ def test_without_targets_everything_is_traced():
 
 def test_all_of_it_is_public():
     for name in ("expose_to_plugins", "attach_handler", "remove_handler", "ChangedArgs", "ChangedResult", "handlers"):
-        assert name in simenv_marl.__all__
+        assert name in simenv_marl.plugins.__all__
     assert repr(ChangedArgs(1, b=2)) == "ChangedArgs(1, b=2)"
     assert repr(ChangedResult("x")) == "ChangedResult('x')"
 

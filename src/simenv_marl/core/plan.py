@@ -31,13 +31,13 @@ from .options import Options
 from .point import EndAgent, Point, Removal, given_simulation
 from .points import (
     NamedPoint,
+    aliases,
     by_name,
     find_points,
     have_instances,
     locate,
     owner_class,
     portable,
-    stand_ins,
 )
 from .prototype import DRIVERS, Model, Prototype
 from .roster import agent_names, declared_agents, mentions_agents, resolve_policies, resolve_roster
@@ -185,11 +185,11 @@ class Plan:
                 self.unmatched_names.discard(agent)  # type: ignore[arg-type]
         events: dict[DecisionPoint, Any] = {point.point: point for point in self.points}
         for point in self.points:
-            for other in stand_ins(point.point):
+            for other in aliases(point.point):
                 events.setdefault(other, point)
         self._find_removals(events, warns=first)
         if self.points and self.model.ends_agents:
-            self._add_event(events, locate(END_AGENT)[0], EndAgent())
+            self._add_event(events, locate(END_AGENT), EndAgent())
         self.events = {point.hook: event for point, event in events.items()}
         if not self.active and not self.unattended:
             raise UnknownPointError("no decision point is left to the environment: policies answer all of them")
@@ -245,14 +245,14 @@ class Plan:
     def _find_removals(self, events: dict[DecisionPoint, Any], *, warns: bool) -> None:
         for point in self.points:
             for name, agent in (*point.point.removed_by.items(), *point.definition.removed_by.items()):
-                remover, _ = locate(name, self.model.points)
+                remover = locate(name, self.model.points)
                 removal = self._add_event(events, remover, Removal(remover))
                 if not isinstance(removal, Removal):
                     raise DefinitionError(
                         f"{name} is a decision point, so removed_by= cannot name it as a function that ends an agent"
                     )
                 owner, remover_owner = owner_class(point.point), owner_class(remover)
-                is_entity = agent is None and point.point.bound and owner and remover_owner
+                is_entity = agent is None and point.point.hook.bound and owner and remover_owner
                 if is_entity and warns and not have_instances(owner, remover_owner):  # type: ignore[arg-type]
                     warn_user(
                         f"{name}, in removed_by= of {point.point.name}, is called on a {remover_owner.__name__}, not on"  # type: ignore[union-attr]

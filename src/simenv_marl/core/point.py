@@ -128,7 +128,7 @@ class Point:
         self.finite = spaces.finite_check(definition.observation_space)
         self.check = (actions.clipping_check if clips else actions.action_check)(definition.action_space)
         self.convert: Any = definition.action_space_mapping or _same
-        self.deliver = _delivery(definition, named.point.kind)
+        self.deliver = _delivery(definition, named.point.hook.kind)
         self.legal = _legal(definition, named.point.name)
         self.masked_parts = _masked_parts(definition.observation_space)
         self.informs_rule_action = definition.rule_action_mapping is not None

@@ -14,21 +14,9 @@ from types import FunctionType, MappingProxyType
 from typing import Any, Final
 
 from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
-from ..errors import DefinitionError, PatchError, UnknownPointError, short_repr
-from ..hooks.attached import title
-from ..hooks.hook import Hook, beneath, hook_of
-from ..hooks.places import (
-    Purpose,
-    all_classes,
-    found_at,
-    held_at,
-    hook_at,
-    leads_there,
-    owner_at_hand,
-    plain,
-    resolve,
-    unbind,
-)
+from ..errors import DefinitionError, PatchError, UnknownPointError, name_of, short_repr
+from ..hooks.hook import MADE_OF
+from ..hooks.places import Purpose, all_classes, find_hook, is_importable, raw_attribute, resolve, unbind
 
 Points = str | Callable[..., Any] | Iterable[str | Callable[..., Any]] | Mapping[Any, Definition | None] | None
 """The ways to name decision points: see ``generate_env``."""
@@ -38,12 +26,7 @@ POINT: Final = Purpose("decision point", UnknownPointError, decision_points)
 
 @dataclass(frozen=True)
 class NamedPoint:
-    """A decision point together with the definition that an environment uses for it.
-
-    Attributes:
-        point: The decision point.
-        definition: The definition.
-    """
+    """A decision point together with the definition that an environment uses for it."""
 
     point: DecisionPoint
     definition: Definition
@@ -60,14 +43,9 @@ class NamedPoint:
 
 
 def portable(key: Any, name: str | None = None) -> Any:
-    """Find a key that names a function in another process: its dotted name, if that surely leads to the function there.
+    """Return a key that names a function in another process: its dotted name, if that surely leads to it there.
 
-    Args:
-        key: A function, or another key that a user has given.
-        name: The function's dotted name, if it is known.
-
-    Returns:
-        The dotted name, a ``Member``, the function, or ``key`` itself if it is not a function.
+    Anything but a function is returned as it is.
     """
     function = unwrapped(key)
     if not isinstance(function, FunctionType):
@@ -75,7 +53,7 @@ def portable(key: Any, name: str | None = None) -> Any:
     if hasattr(function, BY_NAME):
         return getattr(function, BY_NAME)
     name = name or f"{function.__module__}.{function.__qualname__}"
-    if leads_there(name):
+    if is_importable(name):
         return name
     owner, _, attribute = name.removeprefix("__main__.").rpartition(".")
     found = getattr(modules.get("__main__"), owner, None) if owner.isidentifier() else None
@@ -104,7 +82,7 @@ def own_points(simulation: Any) -> dict[DecisionPoint, Definition]:
     own: dict[DecisionPoint, Definition] = {}
     for key, definition in given.items() if isinstance(given, Mapping) else ():
         with suppress(UnknownPointError, PatchError):
-            own[locate(key)[0]] = definition
+            own[locate(key)] = definition
     return own
 
 
@@ -116,39 +94,31 @@ def find_points(
     required: bool = True,
     empty: bool = False,
 ) -> list[NamedPoint]:
-    """Find all decision points that ``points=`` names.
+    """Find all decision points that ``points=`` names, in the order in which they are named.
 
     Args:
-        points: A dotted name, a function, a list of these, or a dict from these to definitions. None: the
-            simulation's attribute ``points``, or all decorated points if there is no such attribute. A point that is
-            named without a definition gets the definition in the simulation's ``points``, if there is one.
+        points: The argument ``points=``; None: the simulation's attribute ``points``, or all decorated points if there
+            is no such attribute.
         simulation: The simulation.
         own: The result of ``own_points``, if it is known.
         required: Whether all decorated points are used if none is named. If False, none is used.
         empty: Whether ``points`` may be empty.
-
-    Returns:
-        The points, in the order in which they were named.
 
     Raises:
         UnknownPointError: A name leads to nothing, or no point is named.
         DefinitionError: A function has no definition, or a value of the dict is not a definition.
         PatchError: A function that was named cannot become a decision point.
     """
-    if own is None:
-        own = own_points(simulation)
+    own = own_points(simulation) if own is None else own
     if points is None:
         points = getattr(simulation, "points", None)
     if points is None:
-        if not required:
-            return []
-        points = _all_registered()
-    if isinstance(points, Mapping):
-        found = [find_point(key, definition, own=own) for key, definition in points.items()]
-    else:
-        if isinstance(points, str) or not hasattr(points, "__iter__"):
-            points = [points]
-        found = [find_point(key, own=own) for key in points]
+        points = _all_registered() if required else []
+        empty = empty or not required
+    if isinstance(points, str) or not hasattr(points, "__iter__"):
+        points = [points]
+    entries = points.items() if isinstance(points, Mapping) else [(key, None) for key in points]
+    found = [find_point(key, definition, own=own) for key, definition in entries]
     if not found and not empty:
         raise UnknownPointError("no decision point was named: points is empty")
     for number, named in enumerate(found):
@@ -160,23 +130,13 @@ def find_points(
 def find_point(
     key: Any, definition: Any = None, *, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})
 ) -> NamedPoint:
-    """Find one decision point.
-
-    Args:
-        key: A dotted name, or a function.
-        definition: The definition to use. None: the simulation's own definition, or that of the point's decorator.
-        own: The definitions in the simulation's ``points``.
-
-    Returns:
-        The point with its definition.
-
-    Raises:
-        UnknownPointError, DefinitionError, PatchError: See ``find_points``.
-    """
+    """Find one decision point by a dotted name or function, and the definition to use for it, as ``find_points``."""
     if definition is not None and not isinstance(definition, Definition):
-        raise DefinitionError(f"the definition of {title(key)} must come from make_step, not {short_repr(definition)}")
-    point, given = locate(key, own)
-    definition = definition or given or own.get(point) or point.definition
+        raise DefinitionError(
+            f"the definition of {name_of(key)} must come from make_step, not {short_repr(definition)}"
+        )
+    point = locate(key, own)
+    definition = definition or _decorated_with(key) or own.get(point) or point.definition or _inherited(point)
     if definition is None:
         raise DefinitionError(
             f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="
@@ -190,95 +150,63 @@ def by_name(own: Mapping[DecisionPoint, Definition]) -> dict[str, DecisionPoint]
     return {point.name: point for point in own if hasattr(point.rule, BY_NAME)}
 
 
-def locate(
-    key: Any, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})
-) -> tuple[DecisionPoint, Definition | None]:
-    """Find the point of a function, whether it has a definition or not.
-
-    Args:
-        key: A dotted name, or a function.
-        own: The simulation's own points.
-
-    Returns:
-        The point, and the definition of the function's own decorator, if there is one.
+def locate(key: Any, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})) -> DecisionPoint:
+    """Return the point of a dotted name or function, whether it has a definition or not.
 
     Raises:
         UnknownPointError: The name leads to nothing.
         PatchError: The name leads to something that cannot be patched.
     """
-    if isinstance(key, str):
-        point = by_name(own).get(key)
-        return _locate_name(key) if point is None else (point, None)
-    function, _ = unbind(key)
-    hook = hook_of(function)
-    if hook is not None:
-        if not hook.for_good and hook.stale:  # the user has kept a temporary decision function
-            return _locate_name(hook.name)
-        return point_of(function) or _point_at(hook)
-    name = f"{function.__module__}.{function.__qualname__}"
-    owner: Any
+    if not isinstance(key, str):
+        return point_for(find_hook(key, POINT))
+    named = by_name(own).get(key)
+    if named is not None:
+        return named
+    decorated = registered(key)
     try:
-        owner, attribute = resolve(name, POINT)
-        found = beneath(plain(held_at(owner, attribute))) is function
+        hook = find_hook(key, POINT)
     except (UnknownPointError, PatchError):
-        found = False
-    if not found:  # the function exists, but not under its own name
-        owner, attribute = owner_at_hand(function), function.__name__
-    return _look_at(name, owner, attribute)
-
-
-def _locate_name(name: str) -> tuple[DecisionPoint, Definition | None]:
-    point = registered(name)
-    try:
-        owner, attribute = resolve(name, POINT)
-    except (UnknownPointError, PatchError):
-        if point is None:
+        if decorated is None:
             raise
-        return point, None  # decorated inside a function, or not yet assigned to its name
-    if point is not None and point_of(plain(held_at(owner, attribute))) is None:
-        return point, None
-    found, own = _look_at(name, owner, attribute)
-    return (found, None) if found is point else (found, found.definition or own)
+        return decorated  # decorated inside a function
+    if decorated is not None and (hook.point is None or not hook.for_good):
+        return decorated  # not yet assigned to its name
+    return point_for(hook)
 
 
-def _look_at(name: str, owner: Any, attribute: str) -> tuple[DecisionPoint, Definition | None]:
-    known = point_of(plain(held_at(owner, attribute)))
-    if known is not None and attribute in vars(owner):
-        if not known[0].hook.for_good and known[0].hook.place.passes_on:
-            own = point_of(plain(found_at(owner, attribute)))
-            return known[0], (own[1] or own[0].definition) if own else None
-        return known
-    hook = hook_at(name, owner, attribute, POINT)
-    known = known or point_of(plain(found_at(owner, attribute)))
-    return _point_at(hook)[0], (known[1] or known[0].definition) if known else None  # decorated in a base class
+def _decorated_with(key: Any) -> Definition | None:
+    """Return the definition of a decision function. A name means the latest definition, so it has none here."""
+    known = None if isinstance(key, str) else point_of(getattr(key, "__func__", key))
+    return known and known[1]
 
 
-def _point_at(hook: Hook) -> tuple[DecisionPoint, None]:
-    if not isinstance(hook.function, FunctionType):
-        raise PatchError(f"{hook.name} cannot be a decision point: it is not a function written in Python")
-    return point_for(hook), None
+def _inherited(point: DecisionPoint) -> Definition | None:
+    """Return the definition that a class inherits, together with the decision function, from a base class."""
+    place = point.hook.place
+    if place is None or not place.inherited:
+        return None
+    known = point_of(unbind(raw_attribute(place.owner, place.attribute)))
+    return known and (known[1] or known[0].definition)
 
 
-def stand_ins(point: DecisionPoint) -> list[DecisionPoint]:
-    """The other decision points that stand for the same function in the same class or module.
+def aliases(point: DecisionPoint) -> list[DecisionPoint]:
+    """Return the other decision points that decide for the same function in the same class or module.
 
     A function that is decorated twice is one decision point with two definitions, whichever decision function the model
     calls. A method that two classes inherit, and that is decorated for each of them, is two decision points.
     """
-    family = point.family()
-    places = _decorated_places(point) if family else set()
-    return [
-        other
-        for other in family
-        if not places or not (others := _decorated_places(other)) or not places.isdisjoint(others)
-    ]
+    others = [hook.point for hook in MADE_OF[point.rule] if hook.point is not None and hook is not point.hook]
+    owners = _decorated_owners(point) if others else set()
+    if not owners:
+        return others
+    return [other for other in others if not owners.isdisjoint(_decorated_owners(other) or owners)]
 
 
-def _decorated_places(point: DecisionPoint) -> set[Any]:
-    """The classes and modules that contain a decision function of the point under the function's own name."""
-    name, wrappers = point.rule.__name__, point.wrappers
+def _decorated_owners(point: DecisionPoint) -> set[Any]:
+    """Return the classes and modules that have a decision function of the point under the function's own name."""
+    name, wrappers = point.rule.__name__, point.hook.stand_ins
     owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
-    found = ((owner, plain(vars(owner).get(name))) for owner in owners)
+    found = ((owner, unbind(vars(owner).get(name))) for owner in owners)
     return {owner for owner, function in found if isinstance(function, FunctionType) and function in wrappers}
 
 

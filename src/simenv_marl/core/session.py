@@ -23,7 +23,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
-from ..hooks.places import Held
+from ..hooks.patches import Installation
 from ..hooks.stacks import SIMULATION
 from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, environment_context
@@ -96,7 +96,7 @@ class Session:
         self._np_random: np.random.Generator | None = None
         self._was_reset = False  # and not closed since
         self._plan_of_simulation: tuple[Plan, Any, Plan] | None = None
-        self._installed: Held | None = None
+        self._installed: Installation | None = None
         self._driver: Driver | None = None
         self._rng = GlobalRandom() if plan.options.global_rng else None
         self.lock = ExclusiveLock() if plan.options.driver == "thread" else None
@@ -142,15 +142,15 @@ class Session:
         if self._driver is not None:
             self._driver.end()
         if self._installed is not None:
-            self._installed.let_go()
+            self._installed.uninstall()
             self._installed = None
 
     def _install(self) -> None:
         """Set the plan's decision functions in the model, unless they are set."""
-        if self._installed is None or not self._installed.whole:
+        if self._installed is None or not self._installed.complete:
             if self._installed is not None:
-                self._installed.let_go()
-            self._installed = Held(self.plan.patches)
+                self._installed.uninstall()
+            self._installed = Installation(self.plan.patches)
 
     def context(self) -> environment_context:
         """The context in which the environment's code must run."""

@@ -18,9 +18,9 @@ from weakref import WeakKeyDictionary, WeakSet
 from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
-from .attached import CALLS, ITEMS
-from .handlers import AROUND, Target
-from .stacks import EVALUATING, LOCK, STACKS, Taker, spawner_of, stack_of
+from .handlers import CALLS, ITEMS
+from .stacks import EVALUATING, STACKS, Taker, spawner_of, stack_of
+from .targets import AROUND, Target
 
 _ABSENT: Final = object()
 
@@ -269,7 +269,7 @@ class Hook(Target):
         takers: The takers of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
             other calls while an environment with these plugins, or without plugins, is evaluated.
         stand_ins: The functions that stand in front of the function.
-        place: The place of a stand-in while the hook is held; None if none is to be set.
+        place: The place of a stand-in while the hook is installed; None if none is to be set.
         for_good: Whether a stand-in was set permanently, as a decorated or exposed function.
         point: The object that the layer above makes of the hook.
     """
@@ -303,8 +303,6 @@ class Hook(Target):
         self.place = place
         self.for_good = place is None
         self.point: Any = None
-        self._holders: set[object] = set()
-        self._stands = False
         self._set: FunctionType | None = None  # the temporary stand-in
         iterates = self.kind == "generator"
         super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is not a generator function", signature)
@@ -342,35 +340,25 @@ class Hook(Target):
     @property
     def stale(self) -> bool:
         """Whether something else has replaced it while no stand-in was set in its place."""
-        return self.place is not None and not self._holders and not self.place.is_free(self)
+        return self.place is not None and not self._users and not self.place.is_free(self)
 
-    def hold(self, holder: object) -> None:
-        """Set a stand-in in its place until every holder has called ``let_go``.
+    def install(self, user: object) -> None:
+        """Set a stand-in in its place until every user has called ``uninstall``.
 
         Raises:
             PatchError: The place cannot be patched, or something else was set there meanwhile.
         """
-        with LOCK:
-            # Noted first: garbage collection may close another environment that holds it meanwhile.
-            self._holders.add(holder)
-            if self._stands or self.place is None:
-                return
-            try:
-                if self._set is None:
-                    self._set = self.stand_in()
-                self.place.put(self, self._set)
-                self._stands = True
-            except BaseException:
-                self.let_go(holder)
-                raise
+        if self.place is not None:
+            super().install(user)
 
-    def let_go(self, holder: object) -> None:
-        """Undo ``hold``; the last one restores the original. After an interrupt, call it again."""
-        with LOCK:
-            self._holders.discard(holder)
-            if not self._holders and self.place is not None and self._set is not None:
-                self._stands = False
-                self.place.put_back(self._set)
+    def _apply(self) -> None:
+        if self._set is None:
+            self._set = self.stand_in()
+        self.place.put(self, self._set)
+
+    def _revert(self) -> None:
+        if self.place is not None and self._set is not None:
+            self.place.put_back(self._set)
 
     # -- who takes part ---------------------------------------------------------------------------
 

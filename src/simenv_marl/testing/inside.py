@@ -16,7 +16,7 @@ from ..core.plan import Plan
 from ..core.rng import GlobalRandom
 from ..decision import DecisionPoint, Definition
 from ..envs.make import VIEWS, view_class
-from ..hooks.places import Held
+from ..hooks.patches import Installation
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import make_simulation, resetter
 
@@ -98,12 +98,12 @@ def plain_loop(plan: Plan, *, watched: bool) -> Iterator[tuple[Reset, Main]]:
         finally:
             _PLAIN_RUNS.pop()
 
-    held = Held(plan.patches if watched else ())
+    installation = Installation(plan.patches if watched else ())
     try:
         with environment_context(plan.plugins, rng):
             yield reset, main
     finally:
-        held.let_go()
+        installation.uninstall()
 
 
 @contextmanager
@@ -159,4 +159,4 @@ def _watched(point: DecisionPoint, begin: Callable[[str], Callable[[Any], None]]
         end(value)
         return value
 
-    return {"function": function, "generator": generator, "coroutine": coroutine}[point.kind]
+    return {"function": function, "generator": generator, "coroutine": coroutine}[point.hook.kind]

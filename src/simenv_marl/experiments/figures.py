@@ -38,14 +38,14 @@ LETTER: Final = 0.075
 """The average width of a letter, in inches."""
 
 
-def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: str, figure: Any) -> Any:
+def draw_evaluation(values: DataFrame, summary: DataFrame, baseline: str | None, metric: str, figure: Any) -> Any:
     """Draw the values of contenders seed by seed, and their differences from the baseline.
 
     Args:
         values: One row for each seed, one column for each contender.
         summary: The means and their intervals, by contender.
         baseline: The contender to compare with. None: no differences are drawn.
-        of: The name of the values.
+        metric: The name of the values.
         figure: The figure to draw in. None: a new figure.
     """
     names = list(values.columns)
@@ -57,7 +57,7 @@ def draw_pairs(values: DataFrame, summary: DataFrame, baseline: str | None, of: 
             figure = new_figure(min(width, WIDEST), 4.2)
         ratios = [len(names), len(others)][:panels]
         drawn = figure.subplots(1, panels, squeeze=False, width_ratios=ratios)[0]
-        _draw_values(drawn[0], values, summary, f"{of} of the team" if of in ("return", "length") else of)
+        _draw_values(drawn[0], values, summary, f"{metric} of the team" if metric in ("return", "length") else metric)
         if panels == 2:
             _draw_differences(drawn[1], values, summary, str(baseline), others)
     return figure
@@ -141,7 +141,7 @@ def draw_effects(effects: Any, figure: Any) -> Any:
             )
             _levels_below(axes, effects.levels[factor], factor)
         for axes in rows[:above, 0]:
-            axes.set_ylabel(f"{effects.of}, mean")
+            axes.set_ylabel(f"{effects.metric}, mean")
         for axes, (one, other) in zip(rows[-1], pairs, strict=False):
             table = effects.cells(one, other)
             for place, level in enumerate(effects.levels[other]):

@@ -322,11 +322,7 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
 
 
 def numbers(values: Any, metric: str) -> Any:
-    """Return a ``DataFrame`` or ``Series`` as floats; nan where a value is missing.
-
-    Raises:
-        OptionValueError: The values are not numbers.
-    """
+    """Return a ``DataFrame`` or ``Series`` as floats; nan where a value is missing."""
     try:
         return values.astype(np.float64)
     except (TypeError, ValueError):
@@ -336,12 +332,7 @@ def numbers(values: Any, metric: str) -> Any:
 def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:
     """Return a confidence interval of the mean, by SciPy's bootstrap (BCa, or percentile for very many values).
 
-    Args:
-        values: ``(n,)``, one for each seed.
-        confidence: The confidence level, such as 0.95.
-
-    Returns:
-        The bounds; nan if there are fewer than two values, or one that is not finite.
+    The bounds are nan if there are fewer than two values, or one that is not finite.
     """
     stats = import_extra("scipy.stats", "an interval")
     if len(values) < 2 or not np.isfinite(values).all():
@@ -365,14 +356,8 @@ def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, flo
 def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
     """Return the number of seeds that detects a mean difference, by the paired t-test.
 
-    Args:
-        differences: ``(n,)``, the differences on the present seeds, for their variance.
-        difference: The mean difference to detect.
-        confidence: One minus the probability of a false positive: 0.95 is one in 20.
-        power: The probability of detecting the difference.
-
-    Returns:
-        The number, at least 2; infinity if it is too large, nan if there are fewer than two differences.
+    The number is infinity if it is too large, and nan if there are fewer than two differences on present seeds, which
+    give the variance.
     """
     stats = import_extra("scipy.stats", "the number of seeds")
     if len(differences) < 2 or not np.isfinite(differences).all():
@@ -393,11 +378,7 @@ def _check_number(name: str, value: Any) -> None:
 
 
 def check_probability(name: str, value: Any, example: float) -> None:
-    """Check that an argument is a number between 0 and 1.
-
-    Raises:
-        OptionValueError: It is not.
-    """
+    """Check that an argument is a number between 0 and 1."""
     _check_number(name, value)
     if not 0 < value < 1:
         raise OptionValueError(f"{name} must lie between 0 and 1, such as {example}, not {short_repr(value)}")

@@ -18,15 +18,21 @@ LINES: Final = 200
 WIDEST: Final = 14.0
 """The largest width of a figure, in inches."""
 
+LETTER: Final = 0.075
+"""The average width of a letter, in inches."""
 
-def _bare(axes: Any, *, grid: str) -> None:
+PAIRS: Final = 4
+"""The largest number of interactions that are drawn."""
+
+ABREAST: Final = 5
+"""The largest number of factors side by side."""
+
+
+def _label_below(axes: Any, names: list[str]) -> None:
+    """Write names below the axes, slanted if they would overlap, and draw a grid."""
     axes.tick_params(labelsize=8, colors=INK, color=PALE)
-    axes.grid(axis=grid, color=ABSENT, linewidth=0.7)
+    axes.grid(axis="y", color=ABSENT, linewidth=0.7)
     axes.set_axisbelow(True)
-
-
-def _name_below(axes: Any, names: list[str]) -> None:
-    """Write names below the axes; slanted if they would overlap."""
     axes.set_xticks(range(len(names)), names)
     inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
     if sum(len(name) + 2 for name in names) * LETTER > inches:
@@ -34,20 +40,8 @@ def _name_below(axes: Any, names: list[str]) -> None:
             label.set(rotation=30, ha="right", rotation_mode="anchor")
 
 
-LETTER: Final = 0.075
-"""The average width of a letter, in inches."""
-
-
 def draw_evaluation(values: DataFrame, summary: DataFrame, baseline: str | None, metric: str, figure: Any) -> Any:
-    """Draw the values of contenders seed by seed, and their differences from the baseline.
-
-    Args:
-        values: One row for each seed, one column for each contender.
-        summary: The means and their intervals, by contender.
-        baseline: The contender to compare with. None: no differences are drawn.
-        metric: The name of the values.
-        figure: The figure to draw in. None: a new figure.
-    """
+    """Draw the values of contenders seed by seed and, with a baseline, their differences from it."""
     names = list(values.columns)
     others = [name for name in names if name != baseline]
     panels = 2 if baseline is not None and others else 1
@@ -56,74 +50,50 @@ def draw_evaluation(values: DataFrame, summary: DataFrame, baseline: str | None,
             width = 2.2 + 1.1 * len(names) + (1.2 + 1.1 * len(others)) * (panels - 1)
             figure = new_figure(min(width, WIDEST), 4.2)
         ratios = [len(names), len(others)][:panels]
-        drawn = figure.subplots(1, panels, squeeze=False, width_ratios=ratios)[0]
-        _draw_values(drawn[0], values, summary, f"{metric} of the team" if metric in ("return", "length") else metric)
+        axes = figure.subplots(1, panels, squeeze=False, width_ratios=ratios)[0]
+        for row in values.to_numpy()[:LINES]:
+            axes[0].plot(range(len(names)), row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
+        _draw_dots(axes[0], values, names, summary[["mean", "low", "high"]], 0.0)
+        axes[0].set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
+        each = "each a line" if len(values) <= LINES else f"lines for {LINES} of them"
+        each = "each a dot" if len(names) == 1 else each
+        axes[0].set_title(f"{len(values)} seeds, {each}" if len(values) > 1 else "1 seed")
         if panels == 2:
-            _draw_differences(drawn[1], values, summary, str(baseline), others)
+            axes[1].axhline(0.0, color=INK, linewidth=0.8, zorder=1)
+            differences = values.sub(values[baseline], axis=0)[others]
+            marks = summary.loc[others, ["difference", "difference_low", "difference_high"]]
+            _draw_dots(axes[1], differences, names, marks, 0.24)
+            axes[1].set_ylabel(f"difference from {baseline}, same seed")
+            axes[1].set_title("differences")
     return figure
 
 
-def _draw_values(axes: Any, values: DataFrame, summary: DataFrame, what: str) -> None:
-    """Draw a line for each seed, across the contenders."""
-    names, places = list(values.columns), np.arange(len(values.columns))
-    numbers = values.to_numpy(np.float64)
-    for row in numbers[:LINES]:
-        axes.plot(places, row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
-    for place, name in enumerate(names):
-        colour = COLOURS[place % len(COLOURS)]
-        axes.scatter(
-            np.full(len(numbers), place), numbers[:, place], 14, color=colour, alpha=0.5, linewidths=0, zorder=2
-        )
-        _mark(axes, place, *summary.loc[name, ["mean", "low", "high"]])
-    axes.set_xlim(-0.5, len(names) - 0.5)
-    axes.set_ylabel(what)
-    each = "each a dot" if len(names) == 1 else "each a line" if len(values) <= LINES else f"lines for {LINES} of them"
-    axes.set_title(f"{len(values)} seeds, {each}" if len(values) > 1 else "1 seed")
-    _bare(axes, grid="y")
-    _name_below(axes, names)
+def _draw_dots(axes: Any, values: DataFrame, names: list[str], marks: DataFrame, spread: float) -> None:
+    """Draw a dot for each seed in a column for each contender, and the mean with its interval.
 
-
-def _draw_differences(axes: Any, values: DataFrame, summary: DataFrame, baseline: str, others: list[str]) -> None:
-    """Draw a dot for each seed: the difference of a contender from the baseline."""
-    axes.axhline(0.0, color=INK, linewidth=0.8, zorder=1)
-    base, names = values[baseline].to_numpy(np.float64), list(values.columns)
-    for place, name in enumerate(others):
-        apart = values[name].to_numpy(np.float64) - base
-        across = place + 0.24 * (2 * (np.arange(len(apart)) * 0.618034 % 1) - 1)  # spread evenly, in irregular order
+    Args:
+        axes: The axes.
+        values: One row for each seed, one column for each contender.
+        names: All contenders, which determine the colours.
+        marks: By contender, the mean and the bounds of its interval.
+        spread: How far dots are from the middle of their column, at most.
+    """
+    for place, name in enumerate(values.columns):
+        across = place + spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)  # even, in irregular order
         colour = COLOURS[names.index(name) % len(COLOURS)]
-        axes.scatter(across, apart, 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
-        _mark(axes, place, *summary.loc[name, ["difference", "difference_low", "difference_high"]])
-    axes.set_xlim(-0.5, len(others) - 0.5)
-    axes.set_ylabel(f"difference from {baseline}, same seed")
-    axes.set_title("differences")
-    _bare(axes, grid="y")
-    _name_below(axes, others)
-
-
-def _mark(axes: Any, place: float, mean: float, low: float, high: float) -> None:
-    bars = None if np.isnan(low) else [[max(0.0, mean - low)], [max(0.0, high - mean)]]
-    axes.errorbar([place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5)
-    axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), textcoords="offset points", va="center", fontsize=8.5)
-
-
-# -- effects --------------------------------------------------------------------------------------
-
-DRAWN: Final = 4
-"""The largest number of interactions that are drawn."""
-
-ABREAST: Final = 5
-"""The largest number of factors side by side."""
+        axes.scatter(across, values[name], 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
+        mean, low, high = marks.loc[name]
+        bars = None if np.isnan(low) else [[max(0.0, mean - low)], [max(0.0, high - mean)]]
+        axes.errorbar([place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5)
+        axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), textcoords="offset points", va="center", fontsize=8.5)
+    axes.set_xlim(-0.5, len(values.columns) - 0.5)
+    _label_below(axes, list(values.columns))
 
 
 def draw_effects(effects: Any, figure: Any) -> Any:
-    """Draw main effects in rows and, below them, the strongest interactions.
-
-    Args:
-        effects: The effects.
-        figure: The figure to draw in. None: a new figure.
-    """
+    """Draw main effects in rows and, below them, the strongest interactions."""
     factors = list(effects.levels)
-    pairs = [pair for pair, strength in effects.interactions["strength"].items() if strength > 0][:DRAWN]
+    pairs = [pair for pair, strength in effects.interactions["strength"].items() if strength > 0][:PAIRS]
     columns = min(max(len(factors), len(pairs)), ABREAST)
     above = ceil(len(factors) / columns)
     with style("plot") as new_figure:
@@ -139,7 +109,7 @@ def draw_effects(effects: Any, figure: Any) -> Any:
             axes.errorbar(
                 range(len(own)), own["mean"], yerr=bars, fmt="o-", color=COLOURS[0], linewidth=1, markersize=4
             )
-            _levels_below(axes, effects.levels[factor], factor)
+            _label_levels(axes, effects.levels[factor], factor)
         for axes in rows[:above, 0]:
             axes.set_ylabel(f"{effects.metric}, mean")
         for axes, (one, other) in zip(rows[-1], pairs, strict=False):
@@ -149,18 +119,17 @@ def draw_effects(effects: Any, figure: Any) -> Any:
                 axes.plot(
                     range(len(table)), table.iloc[:, place], "o-", color=colour, markersize=4, label=_short(level)
                 )
-            _levels_below(axes, effects.levels[one], one)
+            _label_levels(axes, effects.levels[one], one)
             axes.legend(title=other, fontsize=7, title_fontsize=8, frameon=True, framealpha=0.8, edgecolor="none")
         for axes in [*main[len(factors) :], *(rows[-1][len(pairs) :] if pairs else ())]:
             axes.set_visible(False)
     return figure
 
 
-def _levels_below(axes: Any, levels: list[Any], factor: str) -> None:
+def _label_levels(axes: Any, levels: list[Any], factor: str) -> None:
     axes.set_xlim(-0.4, len(levels) - 0.6)
     axes.set_xlabel(factor)
-    _bare(axes, grid="y")
-    _name_below(axes, [_short(level) for level in levels])
+    _label_below(axes, [_short(level) for level in levels])
 
 
 def _short(level: Any) -> str:

@@ -40,13 +40,7 @@ Policies = Mapping[Any, Any]
 
 
 class Outcome(NamedTuple):
-    """The results of one episode.
-
-    Attributes:
-        returns: The undiscounted return of each agent, in the order of the agents' first decisions.
-        lengths: The number of decisions of each agent.
-        metrics: The metrics of the simulation, by name.
-    """
+    """The results of one episode: each agent's undiscounted return and number of decisions, and the metrics."""
 
     returns: dict[str, float]
     lengths: dict[str, int]
@@ -99,11 +93,7 @@ def noting(note: str) -> Iterator[None]:
 
 
 def checked_contenders(contenders: Any, *, batched: bool) -> dict[str, Policies]:
-    """Return contenders by name.
-
-    Raises:
-        OptionValueError: These are not contenders, or one has policies for many decisions at once without ``batched``.
-    """
+    """Return contenders by name. Policies that answer many decisions at once need ``batched``."""
     if not isinstance(contenders, Mapping):
         raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
     for name, policies in contenders.items():
@@ -130,11 +120,7 @@ def checked_contenders(contenders: Any, *, batched: bool) -> dict[str, Policies]
 
 
 def distinct_seeds(seeds: Iterable[int]) -> list[int]:
-    """Return the seeds as a list; there is at least one, and all are different.
-
-    Raises:
-        OptionValueError: There are none, or one of them is repeated.
-    """
+    """Return the seeds as a list: at least one, and all different."""
     checked = checked_seeds(seeds)
     if not checked:
         raise OptionValueError("seeds must be integers, such as range(32), but there are none")
@@ -171,11 +157,7 @@ def make_runner(
     workers: int,
     factors: Sequence[str] = (),
 ) -> Runner:
-    """Make a runner of contenders from other arguments of ``evaluate`` and ``run_experiment``, which it checks.
-
-    Raises:
-        OptionValueError: An argument has an invalid value, or a metric has the name of a factor.
-    """
+    """Make a runner from arguments of ``evaluate`` and ``run_experiment``, and check them."""
     check_numbers(batch_size, workers)
     if team is not None and not callable(team):
         raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
@@ -220,11 +202,7 @@ class Runner:
     batch_size: int
 
     def plan(self, simulation: Any, contender: str) -> Plan:
-        """Return the plan of a contender's episodes. All agents whose rewards count decide in it.
-
-        Raises:
-            SimEnvError: Something in it cannot work.
-        """
+        """Return the plan of a contender's episodes. All agents whose rewards count decide in it."""
         with noting(f"of the contender {contender!r}"):
             try:
                 return self._plan(simulation, contender, self.points, all_points=True)
@@ -245,16 +223,7 @@ class Runner:
         return learners_plan(simulation, self.contenders[contender], points, self.options, all_points=all_points)[0]
 
     def run(self, plan: Plan, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
-        """Run one episode for each seed.
-
-        Args:
-            plan: The plan of the episodes.
-            seeds: The seeds of the simulations, all different.
-            report: Called with a seed and its results when the simulation is closed.
-
-        Raises:
-            BaseException: Any exception of a model, a mapping, a policy, a metric or ``report``.
-        """
+        """Run one episode for each seed. ``report`` gets the seed and its results when the simulation is closed."""
         tally = Tally()
 
         def finish(place: int, simulation: Any) -> Callable[[], None]:
@@ -269,12 +238,7 @@ class Runner:
             _run_alone(session, seed, place, finish, tally)
 
     def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
-        """Return agent, return, length and metrics for each agent and for the team.
-
-        Raises:
-            OptionValueError: The team's value is not a number.
-            BaseException: Any exception of ``team``.
-        """
+        """Return agent, return, length and metrics for each agent and for the team."""
         metrics = [outcome.metrics.get(name) for name in self.metrics]
         rows = [(agent, value, outcome.lengths[agent], *metrics) for agent, value in outcome.returns.items()]
         value: Any = sum(outcome.returns.values()) if self.team is None else self.team(Returns(outcome.returns))
@@ -353,12 +317,7 @@ class Tally:
             account[0] += agent.reward
 
     def outcome(self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]) -> Outcome:
-        """Return the results of an episode that is over.
-
-        Raises:
-            AgentError: The name of an agent is that of the team's row.
-            BaseException: Any exception of a metric.
-        """
+        """Return the results of an episode that is over."""
         accounts = self._accounts.pop(place, {})
         if TEAM in accounts:
             raise AgentError(f"an agent is called {TEAM!r}, as is the row of all agents together; rename the agent")
@@ -372,11 +331,7 @@ class Tally:
 
 
 def plain_value(what: str, value: Any, advice: str = "") -> Any:
-    """Return a number, a string, a bool or None as an object of Python.
-
-    Raises:
-        OptionValueError: The value is something else.
-    """
+    """Return a number, a string, a bool or None as an object of Python; refuse any other value."""
     if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
         value = value.item()
     if value is not None and type(value) not in (bool, int, float, str):

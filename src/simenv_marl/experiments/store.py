@@ -18,7 +18,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from uuid import uuid4
@@ -84,12 +84,7 @@ def is_store(folder: Path, factors: Sequence[str], metrics: Sequence[str]) -> bo
 
 
 def create(folder: Path, factors: Sequence[str], metrics: Sequence[str]) -> None:
-    """Make the store of an experiment, unless it exists.
-
-    Raises:
-        OptionValueError: The folder belongs to something else.
-        StoreError: The folder cannot be read or written.
-    """
+    """Make the store of an experiment, unless it exists. Errors are those of ``is_store``."""
     if is_store(folder, factors, metrics):
         return
     fresh = folder / f"{HEADER}.{uuid4().hex}"  # renamed as a whole: readers never see half of it
@@ -126,15 +121,7 @@ class Writer:
     """Appends lines to the file of one process."""
 
     def __init__(self, folder: Path, session: str) -> None:
-        """Open the file of this process.
-
-        Args:
-            folder: The folder.
-            session: The id that all participating processes share.
-
-        Raises:
-            StoreError: The file cannot be opened.
-        """
+        """Open the file of this process in a session, whose id all participating processes share."""
         if not (folder / HEADER).exists():
             raise StoreError(
                 f"the process that must write to the store {folder} cannot see it; pass a folder that all machines"
@@ -149,11 +136,7 @@ class Writer:
             raise self._unwritable(error) from error
 
     def write(self, run: Run, result: Result, provenance: Provenance, trace: str | None = None) -> None:
-        """Append the line of a run. A traceback is for people who read the file.
-
-        Raises:
-            StoreError: The line cannot be written. Earlier lines are unchanged.
-        """
+        """Append the line of a run. ``trace`` is the traceback of an error, for people who read the file."""
         row, contender, seed = run
         entry = {"factors": json.loads(row), "contender": contender, "seed": seed}
         if isinstance(result, str):
@@ -187,45 +170,34 @@ class Stored(NamedTuple):
     """The contents of a store.
 
     Attributes:
-        runs: The result of each run.
-        rows: All rows with stored runs, as JSON.
+        runs: The result of each run. If a run is stored more than once, a success counts, else the latest error.
         versions: Pairs of a package and a version with which runs were done.
-        sample: A row of the design of which a run has succeeded; empty if there is none.
-        provenances: The provenances of the runs of that row, by contender.
+        sample: A row of the design, as JSON, of which a run has succeeded; empty if there is none.
+        provenances: By contender, the provenance of the first of these runs.
     """
 
     runs: dict[Run, Result]
-    rows: set[str]
     versions: set[tuple[str, Any]]
     sample: str
-    provenances: dict[str, list[Provenance]]
+    provenances: dict[str, Provenance]
 
 
-def read(folder: Path, factors: Sequence[str], keys: Collection[str]) -> Stored:
-    """Read a store. If a run is stored more than once, a success counts, else the latest error.
-
-    Args:
-        folder: The folder. If it is missing, nothing is stored.
-        factors: The names of the factors, in the order of the design.
-        keys: The rows of the design, as JSON.
-
-    Raises:
-        StoreError: A file cannot be read.
-    """
+def read(folder: Path, factors: Sequence[str], keys: Sequence[str]) -> Stored:
+    """Read a store, with the factors in the order of the design, whose rows as JSON are ``keys``."""
     runs: dict[Run, Result] = {}
-    rows: dict[str, str] = {}  # each row's text is in memory once, for all of its runs
     versions: set[tuple[str, Any]] = set()
-    sample, provenances, design = "", dict[str, list[Provenance]](), set(keys)
+    provenances: dict[str, Provenance] = {}
+    sample, texts = "", {key: key for key in keys}  # each text is in memory once, for all runs of its row
     for (row, contender, seed), result, provenance in _lines(folder, factors):
-        run = rows.setdefault(row, row), contender, seed
+        if not sample and row in texts and not isinstance(result, str):
+            sample = row
+        if row == sample and not isinstance(result, str):
+            provenances.setdefault(contender, provenance)
+        run = texts.setdefault(row, row), contender, seed
         if isinstance(runs.get(run, ""), str):
             runs[run] = result
-        if not sample and row in design and not isinstance(result, str):
-            sample = row
-        if row == sample:
-            provenances.setdefault(contender, []).append(provenance)
         versions.update(_versions_in(provenance).items())
-    return Stored(runs, set(rows), versions, sample, provenances)
+    return Stored(runs, versions, sample, provenances)
 
 
 def _lines(folder: Path, factors: Sequence[str]) -> Iterator[tuple[Run, Result, Provenance]]:
@@ -263,13 +235,10 @@ def _versions_in(provenance: Provenance) -> dict[str, Any]:
 
 
 def check_rows(folder: Path, stored: Stored, keys: Sequence[str]) -> None:
-    """Warn of stored rows that are not in the design.
-
-    Raises:
-        OptionValueError: None of them is: the store belongs to another experiment.
-    """
-    strange = stored.rows - set(keys)
-    if strange and strange == stored.rows:
+    """Warn of stored rows that are not in the design. If none is, the store belongs to another experiment."""
+    rows = {row for row, *_ in stored.runs}
+    strange = rows - set(keys)
+    if strange and strange == rows:
         raise OptionValueError(
             f"the store {folder} holds runs of {len(strange)} rows, such as {min(strange)}, but this design has none"
             f" of them: its first is {keys[0]}; pass another folder, or a design that includes them"
@@ -282,36 +251,37 @@ def check_rows(folder: Path, stored: Stored, keys: Sequence[str]) -> None:
 
 
 def warn_of_changes(folder: Path, stored: Stored, row: str, provenances: Mapping[str, Provenance]) -> None:
-    """Warn if runs of a row would now be made of something else than the stored runs of the sample were.
+    """Warn if runs are now made of something else than the stored ones.
 
     Args:
         folder: The folder.
         stored: Its contents.
         row: A row, as JSON.
-        provenances: By contender, the provenance of runs of that row.
+        provenances: By contender, what runs of that row would now be made of.
     """
     now = _versions_in(next(iter(provenances.values()), {}))
-    old = sorted(
+    changes = [
         f"{name} {version} then, {now[name]} now"
-        for name, version in stored.versions
-        if name in now and version != now[name]
-    )
-    if old:
-        warn_user(f"the store {folder} holds runs that were made with other versions: {'; '.join(old)}")
-    for contender, provenance in provenances.items() if row == stored.sample else ():
-        parts = _parts_of(provenance)
-        for then in map(_parts_of, stored.provenances.get(contender, ())):
-            changes = [
-                f"{part} {then[part][:LONGEST]} then, {text[:LONGEST]} now"
-                for part, text in parts.items()
-                if then.get(part, text) != text  # unknown for runs whose simulation could not be made
-            ]
-            if changes:
-                warn_user(
-                    f"the store {folder} holds runs of {contender!r} that were made differently: {'; '.join(changes)};"
-                    " they are kept, so pass another folder if all must be made alike"
-                )
-                return
+        for name, version in sorted(stored.versions, key=str)
+        if version != now.get(name, version)
+    ]
+    if changes:
+        warn_user(f"the store {folder} holds runs that were made with other versions: {'; '.join(changes)}")
+    if row != stored.sample:
+        return
+    for contender, provenance in provenances.items():
+        parts, then = _parts_of(provenance), _parts_of(stored.provenances.get(contender, {}))
+        changes = [
+            f"{part} {then[part][:LONGEST]} then, {text[:LONGEST]} now"
+            for part, text in parts.items()
+            if text != then.get(part, text)
+        ]
+        if changes:
+            warn_user(
+                f"the store {folder} holds runs of {contender!r} that were made differently: {'; '.join(changes)};"
+                " they are kept, so pass another folder if all must be made alike"
+            )
+            return
 
 
 def _parts_of(provenance: Provenance) -> dict[str, str]:

@@ -52,7 +52,7 @@ def provenance(
 
 def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     """Return the provenance of an environment of a plan, as ``provenance`` does."""
-    name = _dotted_name(plan.maker)
+    name = source_name(plan.source)
     options = {
         option.name: as_json(getattr(plan.options, option.name))
         for option in fields(Options)
@@ -76,6 +76,13 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
         "python": platform.python_version(),
         "dependencies": {package: _version_of_distribution(package) for package in DEPENDENCIES},
     }
+
+
+def source_name(source: Any) -> str:
+    """Return the dotted name of a class or factory, or of the class of an object."""
+    while isinstance(source, partial):
+        source = source.func
+    return _dotted_name(source if hasattr(source, "__qualname__") else type(source))
 
 
 def _dotted_name(thing: Any) -> str:

@@ -16,7 +16,7 @@ from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
 from ..core.processes import pack
-from ..core.provenance import as_json, describe
+from ..core.provenance import as_json, describe, source_name
 from ..core.reuse import processes_kept
 from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
 from ..many.spread import import_extra, progress_bar, spread
@@ -33,19 +33,7 @@ from .runner import (
     make_table,
     plain_value,
 )
-from .store import (
-    Provenance,
-    Result,
-    Run,
-    Writer,
-    check_rows,
-    create,
-    is_store,
-    new_session,
-    read,
-    to_json,
-    warn_of_changes,
-)
+from .store import Provenance, Result, Run, Store, Writer, check_rows, new_session, to_json, warn_of_changes
 from .variants import Variant, check_call
 
 if TYPE_CHECKING:
@@ -126,41 +114,33 @@ def run_experiment(
         )
     checked = {BY_RULE: {}, **checked}
     table, rows = _checked_design(design)
-    factors, keys, places = list(table.columns), [to_json(row) for row in rows], distinct_seeds(seeds)
+    keys, distinct = [to_json(row) for row in rows], distinct_seeds(seeds)
     runner = make_runner(
         checked, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
-        factors=factors,
+        factors=list(table.columns),
     )  # fmt: skip
     _check_make(make, rows[0])
-    folder = _checked_folder(store)
-    header = folder, factors, list(runner.metrics)
-    is_store(*header)
-    stored = read(folder, factors, keys)
-    check_rows(folder, stored, keys)
-    work = make, runner, folder, new_session()
+    place = Store(_checked_folder(store), list(table.columns), list(runner.metrics))
+    place.exists()
+    stored = place.read(keys)
+    check_rows(place, stored, keys)
+    work = make, runner, place.folder, new_session()
     if workers:
         pack(work)  # errors of pickling come before any run, and so do those of contenders
     row, provenances = _try_contenders(make, runner, sorted(keys, key=lambda key: key != stored.sample))
-    create(*header)
-    warn_of_changes(folder, stored, row, provenances)
-    runs = list(product(dict.fromkeys(keys), checked, places))  # a row that occurs twice has the same results
-    missing = [run for run in runs if _is_missing(stored.runs.get(run), retry_errors=retry_errors)]
+    place.create()
+    warn_of_changes(place, stored, row, provenances)
+    known = {run for run, result in stored.runs.items() if not (retry_errors and isinstance(result, str))}
+    runs = list(product(dict.fromkeys(keys), checked, distinct))  # a row that occurs twice has the same results
+    missing = [run for run in runs if run not in known]
     with progress_bar(len(runs), "run", len(runs) - len(missing)) if progress else nullcontext() as bar:
-        done = _ignore if bar is None else bar.update
         if workers and missing:
-            for number, _ in spread(_run_part, work, missing, int(workers), len(places) if batched else 1, SHARE):
-                done(number)
-        else:
-            _run_part(*work, missing, done)
-    return _make_frame(table, keys, places, read(folder, factors, keys).runs, runner)
-
-
-def _is_missing(result: Result | None, *, retry_errors: bool) -> bool:
-    return result is None or (retry_errors and isinstance(result, str))
-
-
-def _ignore(number: int) -> None:
-    """Do nothing with the number of runs that were done."""
+            for number, _ in spread(_run_part, work, missing, int(workers), len(distinct) if batched else 1, SHARE):
+                if bar is not None:
+                    bar.update(number)
+        elif missing:
+            _run_part(*work, missing, bar)
+    return _make_frame(table, keys, distinct, place.read(keys).runs, runner)
 
 
 # -- what is checked before anything runs ---------------------------------------------------------
@@ -186,8 +166,8 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
     if not len(table):
         raise OptionValueError("the design has no rows")
     advice = "; other values cannot be stored: use a name as the value, and look it up in make"
-    columns = [[plain_value(f"the factor {name!r}", level, advice) for level in table[name].tolist()] for name in names]
-    return table, [dict(zip(names, levels, strict=True)) for levels in zip(*columns, strict=True)]
+    levels = {name: [plain_value(f"the factor {name!r}", value, advice) for value in table[name]] for name in names}
+    return table, [{name: levels[name][place] for name in names} for place in range(len(table))]
 
 
 def _checked_folder(store: Any) -> Path:
@@ -207,13 +187,9 @@ def _check_make(make: Any, row: Mapping[str, Any]) -> None:
 
 
 def _try_contenders(make: Any, runner: Runner, keys: Sequence[str]) -> tuple[str, dict[str, Provenance]]:
-    """Check that all contenders can be set up.
+    """Check that all contenders can be set up; return a row, as JSON, and the provenance of its runs by contender.
 
-    Returns:
-        A row, as JSON, and the provenance of its runs by contender; empty if no row's simulation can be made.
-
-    Raises:
-        SimEnvError: A contender cannot be set up.
+    Both are empty if no row's simulation can be made.
     """
     for key in keys[:TRIED]:
         try:
@@ -250,31 +226,20 @@ def _prepare(make: Any, runner: Runner, key: str, contender: str) -> tuple[Plan,
     """Return the plan of runs of a row with a contender, and their provenance."""
     source = _source(make, json.loads(key))
     plan = runner.plan(source, contender)
+    name = make.name if isinstance(make, Variant) else source_name(make)
     policies = {**(source.policies if isinstance(source, Variant) else {}), **runner.contenders[contender]}
-    return plan, describe(plan, None) | {"make": _make_name(make), "policies": as_json(policies)}
+    return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
 
 
-def _make_name(make: Any) -> str:
-    """Return the dotted name of ``make``, or the name of a variant."""
-    if isinstance(make, Variant):
-        return make.name
-    while isinstance(make, partial):
-        make = make.func
-    named = make if hasattr(make, "__qualname__") else type(make)
-    return f"{named.__module__}.{named.__qualname__}"
-
-
-def _run_part(
-    make: Any, runner: Runner, folder: Path, session: str, runs: Sequence[Run], done: Callable[[int], Any] = _ignore
-) -> None:
+def _run_part(make: Any, runner: Runner, folder: Path, session: str, runs: Sequence[Run], bar: Any = None) -> None:
     """Do runs and store their results."""
     with closing(Writer(folder, session)) as writer, processes_kept():
         for (key, contender), group in groupby(runs, lambda run: run[:2]):
-            _run_seeds(make, runner, writer, key, contender, [seed for *_, seed in group], done)
+            _run_seeds(make, runner, writer, key, contender, [seed for *_, seed in group], bar)
 
 
 def _run_seeds(
-    make: Any, runner: Runner, writer: Writer, key: str, contender: str, seeds: list[int], done: Callable[[int], Any]
+    make: Any, runner: Runner, writer: Writer, key: str, contender: str, seeds: Sequence[int], bar: Any
 ) -> None:
     """Run seeds of a row with a contender, and store the result of each. An error is a result, too."""
     remaining = dict.fromkeys(seeds)
@@ -282,7 +247,8 @@ def _run_seeds(
     def report(seed: int, result: Result, trace: str | None = None) -> None:
         writer.write((key, contender, seed), result, {**provenance, "seed": seed}, trace)
         del remaining[seed]
-        done(1)
+        if bar is not None:
+            bar.update()
 
     while remaining:
         provenance: dict[str, Any] = {}  # unknown if the simulation cannot be made
@@ -294,7 +260,7 @@ def _run_seeds(
         except BaseException as error:
             if runner.batch_size > 1 and len(remaining) > 1:  # running them one by one shows which of them failed
                 for seed in list(remaining):
-                    _run_seeds(make, runner, writer, key, contender, [seed], done)
+                    _run_seeds(make, runner, writer, key, contender, [seed], bar)
                 return
             trace = "".join(traceback.format_exception(error))[-LONGEST_TRACE:]
             report(next(iter(remaining)), describe_error(error), trace)

@@ -19,6 +19,7 @@ import re
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from uuid import uuid4
@@ -49,60 +50,120 @@ def to_json(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"))
 
 
-# -- the folder -----------------------------------------------------------------------------------
+class Stored(NamedTuple):
+    """The contents of a store.
 
-
-def is_store(folder: Path, factors: Sequence[str], metrics: Sequence[str]) -> bool:
-    """Return whether a folder is the store of this experiment; False if it is empty or missing.
-
-    Raises:
-        OptionValueError: The folder belongs to something else.
-        StoreError: The folder cannot be read.
+    Attributes:
+        runs: The result of each run. If a run is stored more than once, a success counts, else the latest error.
+        versions: Pairs of a package and a version with which runs were done.
+        sample: A row of the design, as JSON, of which a run has succeeded; empty if there is none.
+        provenances: By contender, the provenance of the first of these runs.
     """
-    header = folder / HEADER
-    try:
-        if not header.exists():
-            strange = folder.exists() and any(not path.name.startswith((HEADER, ".")) for path in folder.iterdir())
-            if not header.exists():  # another process may have written it meanwhile
-                if strange:
-                    raise OptionValueError(f"the folder {folder} is not empty, and not the store of an experiment")
-                return False
-        found = json.loads(header.read_bytes())
-    except OSError as error:
-        raise _unusable(folder, error) from error
-    except json.JSONDecodeError as error:
-        raise StoreError(f"{header} cannot be read: {error}") from error
-    if not isinstance(found, dict) or found.get("simenv_marl") != VERSION:
-        raise OptionValueError(f"{header} was not written by this version of simenv_marl")
-    for what, names in (("factors", factors), ("metrics", metrics)):
-        if found.get(what) != sorted(names):
-            raise OptionValueError(
-                f"the store {folder} belongs to another experiment: its {what} are {found.get(what)}, not"
-                f" {sorted(names)}; pass another folder"
-            )
-    return True
+
+    runs: dict[Run, Result]
+    versions: set[tuple[str, Any]]
+    sample: str
+    provenances: dict[str, Provenance]
 
 
-def create(folder: Path, factors: Sequence[str], metrics: Sequence[str]) -> None:
-    """Make the store of an experiment, unless it exists. Errors are those of ``is_store``."""
-    if is_store(folder, factors, metrics):
-        return
-    fresh = folder / f"{HEADER}.{uuid4().hex}"  # renamed as a whole: readers never see half of it
-    header = {"simenv_marl": VERSION, "factors": sorted(factors), "metrics": sorted(metrics)}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+@dataclass(frozen=True)
+class Store:
+    """The folder of an experiment, whose runs all have these factors (in the order of the design) and metrics."""
+
+    folder: Path
+    factors: Sequence[str]
+    metrics: Sequence[str]
+
+    def exists(self) -> bool:
+        """Return whether the folder is the store of this experiment; False if it is empty or missing.
+
+        Raises:
+            OptionValueError: The folder belongs to something else.
+            StoreError: The folder cannot be read.
+        """
+        header = self.folder / HEADER
         try:
-            fresh.write_text(json.dumps(header) + "\n", encoding="ascii")
-            os.replace(fresh, folder / HEADER)
-        finally:
-            fresh.unlink(missing_ok=True)
-    except OSError as error:
-        raise _unusable(folder, error) from error
+            if not header.exists():
+                others = self.folder.iterdir() if self.folder.exists() else ()
+                strange = any(not path.name.startswith((HEADER, ".")) for path in others)
+                if strange and not header.exists():  # another process may have written it meanwhile
+                    raise OptionValueError(f"the folder {self.folder} is not empty, and not the store of an experiment")
+            found = json.loads(header.read_bytes()) if header.exists() else None
+        except OSError as error:
+            raise self._unusable(error) from error
+        except json.JSONDecodeError as error:
+            raise StoreError(f"{header} cannot be read: {error}") from error
+        if found is None:
+            return False
+        if not isinstance(found, dict) or found.get("simenv_marl") != VERSION:
+            raise OptionValueError(f"{header} was not written by this version of simenv_marl")
+        for what, names in (("factors", self.factors), ("metrics", self.metrics)):
+            if found.get(what) != sorted(names):
+                raise OptionValueError(
+                    f"the store {self.folder} belongs to another experiment: its {what} are {found.get(what)}, not"
+                    f" {sorted(names)}; pass another folder"
+                )
+        return True
 
+    def create(self) -> None:
+        """Make the store, unless it exists. Errors are those of ``exists``."""
+        if self.exists():
+            return
+        header = {"simenv_marl": VERSION, "factors": sorted(self.factors), "metrics": sorted(self.metrics)}
+        fresh = self.folder / f"{HEADER}.{uuid4().hex}"  # renamed as a whole: readers never see half of it
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            try:
+                fresh.write_text(json.dumps(header) + "\n", encoding="ascii")
+                os.replace(fresh, self.folder / HEADER)
+            finally:
+                fresh.unlink(missing_ok=True)
+        except OSError as error:
+            raise self._unusable(error) from error
 
-def _unusable(folder: Path, error: OSError) -> StoreError:
-    reason = error.strerror or error
-    return StoreError(f"{folder} cannot be made or read as the folder of an experiment: {reason}")
+    def _unusable(self, error: OSError) -> StoreError:
+        reason = error.strerror or error
+        return StoreError(f"{self.folder} cannot be made or read as the folder of an experiment: {reason}")
+
+    def read(self, keys: Sequence[str]) -> Stored:
+        """Read all runs. ``keys`` are the rows of the design, as JSON."""
+        runs: dict[Run, Result] = {}
+        versions: set[tuple[str, Any]] = set()
+        provenances: dict[str, Provenance] = {}
+        sample, texts = "", {key: key for key in keys}  # each text is in memory once, for all runs of its row
+        for (row, contender, seed), result, provenance in self._lines():
+            if not sample and row in texts and not isinstance(result, str):
+                sample = row
+            if row == sample and not isinstance(result, str):
+                provenances.setdefault(contender, provenance)
+            run = texts.setdefault(row, row), contender, seed
+            if isinstance(runs.get(run, ""), str):
+                runs[run] = result
+            versions.update(_versions_in(provenance).items())
+        return Stored(runs, versions, sample, provenances)
+
+    def _lines(self) -> Iterator[tuple[Run, Result, Provenance]]:
+        """Yield all runs, in the order in which their files were begun."""
+        for path in sorted(self.folder.glob("runs-*.jsonl")):
+            try:
+                with path.open("rb") as file:
+                    for number, line in enumerate(file, 1):
+                        if not line.endswith(b"\n"):
+                            break  # its process was killed, or is still writing
+                        try:
+                            yield self._parsed(json.loads(line))
+                        except (ValueError, TypeError, LookupError, AttributeError):  # not JSON, or not a run
+                            warn_user(f"line {number} of {path} cannot be read, so its run counts as missing")
+            except OSError as error:
+                raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+
+    def _parsed(self, entry: Any) -> tuple[Run, Result, Provenance]:
+        """Return the contents of a line. If that is not a run, it raises TypeError, LookupError or AttributeError."""
+        run = to_json({name: entry["factors"][name] for name in self.factors}), entry["contender"], entry["seed"]
+        result: Result = str(entry["error"])
+        if entry["status"] == "ok":
+            result = Outcome(*(dict(entry[part].items()) for part in Outcome._fields))
+        return run, result, dict(entry["provenance"].items())
 
 
 # -- writing --------------------------------------------------------------------------------------
@@ -163,66 +224,7 @@ class Writer:
         return StoreError(f"cannot write to {self._path}: {reason}; what was stored before is still there")
 
 
-# -- reading --------------------------------------------------------------------------------------
-
-
-class Stored(NamedTuple):
-    """The contents of a store.
-
-    Attributes:
-        runs: The result of each run. If a run is stored more than once, a success counts, else the latest error.
-        versions: Pairs of a package and a version with which runs were done.
-        sample: A row of the design, as JSON, of which a run has succeeded; empty if there is none.
-        provenances: By contender, the provenance of the first of these runs.
-    """
-
-    runs: dict[Run, Result]
-    versions: set[tuple[str, Any]]
-    sample: str
-    provenances: dict[str, Provenance]
-
-
-def read(folder: Path, factors: Sequence[str], keys: Sequence[str]) -> Stored:
-    """Read a store, with the factors in the order of the design, whose rows as JSON are ``keys``."""
-    runs: dict[Run, Result] = {}
-    versions: set[tuple[str, Any]] = set()
-    provenances: dict[str, Provenance] = {}
-    sample, texts = "", {key: key for key in keys}  # each text is in memory once, for all runs of its row
-    for (row, contender, seed), result, provenance in _lines(folder, factors):
-        if not sample and row in texts and not isinstance(result, str):
-            sample = row
-        if row == sample and not isinstance(result, str):
-            provenances.setdefault(contender, provenance)
-        run = texts.setdefault(row, row), contender, seed
-        if isinstance(runs.get(run, ""), str):
-            runs[run] = result
-        versions.update(_versions_in(provenance).items())
-    return Stored(runs, versions, sample, provenances)
-
-
-def _lines(folder: Path, factors: Sequence[str]) -> Iterator[tuple[Run, Result, Provenance]]:
-    """Yield all stored runs, in the order in which their files were begun."""
-    for path in sorted(folder.glob("runs-*.jsonl")):
-        try:
-            with path.open("rb") as file:
-                for number, line in enumerate(file, 1):
-                    if not line.endswith(b"\n"):
-                        break  # its process was killed, or is still writing
-                    try:
-                        yield _parsed(json.loads(line), factors)
-                    except (ValueError, TypeError, LookupError, AttributeError):  # not JSON, or not a run
-                        warn_user(f"line {number} of {path} cannot be read, so its run counts as missing")
-        except OSError as error:
-            raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
-
-
-def _parsed(entry: Any, factors: Sequence[str]) -> tuple[Run, Result, Provenance]:
-    """Return the contents of a line, or raise TypeError, LookupError or AttributeError if it is not a run."""
-    run = to_json({name: entry["factors"][name] for name in factors}), entry["contender"], entry["seed"]
-    result: Result = str(entry["error"])
-    if entry["status"] == "ok":
-        result = Outcome(*(dict(entry[part].items()) for part in Outcome._fields))
-    return run, result, dict(entry["provenance"].items())
+# -- what has changed since the runs were stored --------------------------------------------------
 
 
 def _versions_in(provenance: Provenance) -> dict[str, Any]:
@@ -231,30 +233,27 @@ def _versions_in(provenance: Provenance) -> dict[str, Any]:
     return {**python, **(provenance.get("packages") or {}), **(provenance.get("dependencies") or {})}
 
 
-# -- what has changed since -----------------------------------------------------------------------
-
-
-def check_rows(folder: Path, stored: Stored, keys: Sequence[str]) -> None:
+def check_rows(store: Store, stored: Stored, keys: Sequence[str]) -> None:
     """Warn of stored rows that are not in the design. If none is, the store belongs to another experiment."""
     rows = {row for row, *_ in stored.runs}
     strange = rows - set(keys)
     if strange and strange == rows:
         raise OptionValueError(
-            f"the store {folder} holds runs of {len(strange)} rows, such as {min(strange)}, but this design has none"
-            f" of them: its first is {keys[0]}; pass another folder, or a design that includes them"
+            f"the store {store.folder} holds runs of {len(strange)} rows, such as {min(strange)}, but this design has"
+            f" none of them: its first is {keys[0]}; pass another folder, or a design that includes them"
         )
     if strange:
         warn_user(
-            f"the store {folder} holds runs of {len(strange)} rows that this design does not have, such as"
+            f"the store {store.folder} holds runs of {len(strange)} rows that this design does not have, such as"
             f" {min(strange)}; they stay in the store, but are not in the table"
         )
 
 
-def warn_of_changes(folder: Path, stored: Stored, row: str, provenances: Mapping[str, Provenance]) -> None:
+def warn_of_changes(store: Store, stored: Stored, row: str, provenances: Mapping[str, Provenance]) -> None:
     """Warn if runs are now made of something else than the stored ones.
 
     Args:
-        folder: The folder.
+        store: The store.
         stored: Its contents.
         row: A row, as JSON.
         provenances: By contender, what runs of that row would now be made of.
@@ -266,7 +265,7 @@ def warn_of_changes(folder: Path, stored: Stored, row: str, provenances: Mapping
         if version != now.get(name, version)
     ]
     if changes:
-        warn_user(f"the store {folder} holds runs that were made with other versions: {'; '.join(changes)}")
+        warn_user(f"the store {store.folder} holds runs that were made with other versions: {'; '.join(changes)}")
     if row != stored.sample:
         return
     for contender, provenance in provenances.items():
@@ -278,8 +277,8 @@ def warn_of_changes(folder: Path, stored: Stored, row: str, provenances: Mapping
         ]
         if changes:
             warn_user(
-                f"the store {folder} holds runs of {contender!r} that were made differently: {'; '.join(changes)};"
-                " they are kept, so pass another folder if all must be made alike"
+                f"the store {store.folder} holds runs of {contender!r} that were made differently:"
+                f" {'; '.join(changes)}; they are kept, so pass another folder if all must be made alike"
             )
             return
 

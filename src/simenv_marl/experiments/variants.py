@@ -86,15 +86,7 @@ class Variant:
         ), ()
 
     def environment_arguments(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
-        """Return the arguments of an environment of this variant.
-
-        Args:
-            points: The decision points that are given with it. None: the variant's own.
-            options: The options that are given with it.
-
-        Returns:
-            The source of its simulation, the decision points, and the options.
-        """
+        """Return simulation, points and options of an environment of this variant, with those that are given to it."""
         source = partial(self.simulation, **self.parameters) if self.parameters else self.simulation
         merged = {**self.options, **options}
         policies = {**self.policies, **(options.get("policies") or {})}
@@ -109,15 +101,7 @@ class Variant:
 def check_call(
     source: Any, arguments: Mapping[str, Any], error: type[SimEnvError], requirement: str, described: str
 ) -> None:
-    """Check that something is a class or a factory, and takes keyword arguments.
-
-    Args:
-        source: The class or factory.
-        arguments: The arguments.
-        error: The class of the errors.
-        requirement: The message if it is neither.
-        described: The arguments, for the message if it does not take them.
-    """
+    """Check that something is a class or a factory, as ``requirement`` says, and takes the described arguments."""
     if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
         raise error(f"{requirement}, not {short_repr(source)}")
     try:

@@ -329,13 +329,9 @@ def _spread(factors: Sequence[Factor], points: Any) -> Columns:
 
 
 METHODS: Final[Mapping[str, Callable[[Sequence[Factor], int | None, int], Columns]]] = {
-    "full_factorial": _full_factorial,
-    "fractional_factorial": _fractional_factorial,
-    "latin_hypercube": _latin_hypercube,
-    "sobol": _sobol,
-    "halton": _halton,
-    "plackett_burman": _plackett_burman,
-    "central_composite": _central_composite,
-    "one_at_a_time": _one_at_a_time,
-    "saltelli": _saltelli,
-}
+    method.__name__[1:]: method
+    for method in (
+        _full_factorial, _fractional_factorial, _latin_hypercube, _sobol, _halton, _plackett_burman,
+        _central_composite, _one_at_a_time, _saltelli,
+    )
+}  # fmt: skip

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.spread import import_extra
-from .evaluation import check_probability, interval, numbers
+from .evaluation import check_metric, check_probability, interval, numbers
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -50,12 +50,10 @@ class Effects:
         Raises:
             OptionValueError: One of them is not a factor.
         """
-        for pair, table in self._cells.items():
-            if pair == (one, other):
-                return table
-            if pair == (other, one):
-                return table.T
-        raise OptionValueError(f"{short_repr(one)} and {short_repr(other)} are not two factors of {list(self.levels)}")
+        if (one, other) not in self._cells:
+            names = f"{short_repr(one)} and {short_repr(other)}"
+            raise OptionValueError(f"{names} are not two factors of {list(self.levels)}")
+        return self._cells[one, other]
 
     def plot(self, *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw the main effects of all factors and, below them, the strongest interactions.
@@ -124,15 +122,14 @@ def effects(
         [(name, level) for name, own in levels.items() for level in own], names=["factor", "level"]
     )
     rows = pandas.DataFrame(main, index, columns=["mean", "low", "high", "effect", "count"]).astype({"count": int})
-    cells = {}
+    cells: dict[tuple[str, str], DataFrame] = {}
+    strengths = []
     for one, other in combinations(levels, 2):
         means = values.groupby([coded[one][0], coded[other][0]]).mean().unstack()
-        cells[one, other] = (
-            means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
-            .set_axis(pandas.Index(levels[one], name=one), axis=0)
-            .set_axis(pandas.Index(levels[other], name=other), axis=1)
-        )
-    strengths = [(*pair, _strength(own.to_numpy(np.float64))) for pair, own in cells.items()]
+        means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
+        means.index, means.columns = pandas.Index(levels[one], name=one), pandas.Index(levels[other], name=other)
+        cells |= {(one, other): means, (other, one): means.T}
+        strengths.append([one, other, _strength(means.to_numpy(np.float64))])
     interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(["factor", "other"])
     return Effects(rows, interactions.sort_values("strength", ascending=False), metric, levels, cells)
 
@@ -142,11 +139,7 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
     columns = list(getattr(frame, "columns", ()))
     if not {*RUN_COLUMNS, "status"} <= set(columns):
         raise OptionValueError("frame must be the DataFrame that run_experiment returned")
-    values = columns[columns.index("return") : columns.index("status")]
-    if metric not in values:
-        raise OptionValueError(
-            f"metric={short_repr(metric)} is not a column of numbers; these are: {values}{did_you_mean(metric, values)}"
-        )
+    check_metric(metric, columns[columns.index("return") : columns.index("status")])
     chosen = frame["status"] == "ok"
     for what, value in (("contender", contender), ("agent", agent)):
         if value is None:
@@ -182,8 +175,8 @@ def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
 
 def _strength(means: NDArray[np.float64]) -> float:
     """Return how far the means of combinations are from the sum of both main effects; nan if some are missing."""
-    apart = means - means.mean(axis=1, keepdims=True) - means.mean(axis=0, keepdims=True) + means.mean()
-    return float(np.sqrt((apart**2).mean()))
+    rest = means - means.mean(axis=1, keepdims=True) - means.mean(axis=0, keepdims=True) + means.mean()
+    return float(np.sqrt((rest**2).mean()))
 
 
 # -- shares of the variance -----------------------------------------------------------------------

@@ -80,12 +80,7 @@ class Evaluation:
 
     def values(self, metric: str = "return") -> "DataFrame":
         """Return the team's values: one row for each seed, one column for each contender."""
-        if metric not in self.frame.columns or metric in RUN_COLUMNS[:3]:
-            known = list(self.frame.columns[3:])
-            raise OptionValueError(
-                f"metric={short_repr(metric)} is not a column of numbers; these are: {known}"
-                f"{did_you_mean(metric, known)}"
-            )
+        check_metric(metric, list(self.frame.columns[3:]))
         team = self.frame[self.frame["agent"] == TEAM]
         return team.pivot(index="seed", columns="contender", values=metric).loc[
             team["seed"].unique(), team["contender"].unique()
@@ -319,6 +314,14 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
 
 
 # -- statistics -----------------------------------------------------------------------------------
+
+
+def check_metric(metric: Any, known: list[str]) -> None:
+    """Check that a metric is a column of a table."""
+    if metric not in known:
+        raise OptionValueError(
+            f"metric={short_repr(metric)} is not a column of numbers; these are: {known}{did_you_mean(metric, known)}"
+        )
 
 
 def numbers(values: Any, metric: str) -> Any:

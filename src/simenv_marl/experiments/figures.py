@@ -69,14 +69,9 @@ def draw_evaluation(values: DataFrame, summary: DataFrame, baseline: str | None,
 
 
 def _draw_dots(axes: Any, values: DataFrame, names: list[str], marks: DataFrame, spread: float) -> None:
-    """Draw a dot for each seed in a column for each contender, and the mean with its interval.
+    """Draw a column of dots for each contender, one for each seed, and the mean with its interval from ``marks``.
 
-    Args:
-        axes: The axes.
-        values: One row for each seed, one column for each contender.
-        names: All contenders, which determine the colours.
-        marks: By contender, the mean and the bounds of its interval.
-        spread: How far dots are from the middle of their column, at most.
+    The dots are at most ``spread`` from the middle of their column. All ``names`` together determine the colours.
     """
     for place, name in enumerate(values.columns):
         across = place + spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)  # even, in irregular order

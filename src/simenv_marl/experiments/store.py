@@ -250,14 +250,7 @@ def check_rows(store: Store, stored: Stored, keys: Sequence[str]) -> None:
 
 
 def warn_of_changes(store: Store, stored: Stored, row: str, provenances: Mapping[str, Provenance]) -> None:
-    """Warn if runs are now made of something else than the stored ones.
-
-    Args:
-        store: The store.
-        stored: Its contents.
-        row: A row, as JSON.
-        provenances: By contender, what runs of that row would now be made of.
-    """
+    """Warn if runs are now made of something else than the stored ones. ``provenances`` tell of what, for a row."""
     now = _versions_in(next(iter(provenances.values()), {}))
     changes = [
         f"{name} {version} then, {now[name]} now"

@@ -139,7 +139,8 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
     columns = list(getattr(frame, "columns", ()))
     if not {*RUN_COLUMNS, "status"} <= set(columns):
         raise OptionValueError("frame must be the DataFrame that run_experiment returned")
-    check_metric(metric, columns[columns.index("return") : columns.index("status")])
+    factors = columns[: columns.index("contender")]
+    check_metric(metric, columns[len(factors) :])
     chosen = frame["status"] == "ok"
     for what, value in (("contender", contender), ("agent", agent)):
         if value is None:
@@ -152,7 +153,7 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
         chosen &= frame[what] == value
     if not chosen.any():
         raise OptionValueError("no run has come to its end")
-    return frame[chosen], columns[: columns.index("contender")]
+    return frame[chosen], factors
 
 
 def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:

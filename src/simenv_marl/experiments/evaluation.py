@@ -20,6 +20,7 @@ from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.spread import import_extra, progress_bar, spread
 from .runner import (
     RUN_COLUMNS,
+    STATUS_COLUMNS,
     TEAM,
     Outcome,
     Policies,
@@ -80,7 +81,7 @@ class Evaluation:
 
     def values(self, metric: str = "return") -> "DataFrame":
         """Return the team's values: one row for each seed, one column for each contender."""
-        check_metric(metric, list(self.frame.columns[3:]))
+        check_metric(metric, self.frame.columns)
         team = self.frame[self.frame["agent"] == TEAM]
         return team.pivot(index="seed", columns="contender", values=metric).loc[
             team["seed"].unique(), team["contender"].unique()
@@ -316,8 +317,9 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
 # -- statistics -----------------------------------------------------------------------------------
 
 
-def check_metric(metric: Any, known: list[str]) -> None:
-    """Check that a metric is a column of a table."""
+def check_metric(metric: Any, columns: Iterable[str]) -> None:
+    """Check that a metric is one of the columns of a table, and does not say which run it is."""
+    known = [name for name in columns if name not in (*RUN_COLUMNS[:3], *STATUS_COLUMNS)]
     if metric not in known:
         raise OptionValueError(
             f"metric={short_repr(metric)} is not a column of numbers; these are: {known}{did_you_mean(metric, known)}"

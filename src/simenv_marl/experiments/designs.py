@@ -101,7 +101,7 @@ def design(
         MissingExtraError: pandas, pyDOE or SALib is missing.
     """
     pandas = import_extra("pandas", "design")
-    found = _checked(factors)
+    parsed = _checked(factors)
     if method not in list(METHODS):
         raise OptionValueError(
             f"method must be one of {', '.join(METHODS)}, not {short_repr(method)}{did_you_mean(method, METHODS)}"
@@ -110,9 +110,9 @@ def design(
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     if seed is not None and not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
-    columns = METHODS[method](found, None if n is None else int(n), int(seed or 0))
+    columns = METHODS[method](parsed, None if n is None else int(n), int(seed or 0))
     series = {
-        factor.name: pandas.Series(values, dtype=_dtype(factor)) for factor, values in zip(found, columns, strict=True)
+        factor.name: pandas.Series(values, dtype=_dtype(factor)) for factor, values in zip(parsed, columns, strict=True)
     }
     table: DataFrame = pandas.DataFrame(series)
     return table
@@ -123,33 +123,35 @@ def _checked(factors: Any) -> list[Factor]:
         raise OptionValueError(
             f"factors must be a dict from names to ranges or lists of levels, not {short_repr(factors)}"
         )
-    return [_factor(name, given) for name, given in factors.items()]
+    return [_factor(name, values) for name, values in factors.items()]
 
 
-def _factor(name: Any, given: Any) -> Factor:
+def _factor(name: Any, values: Any) -> Factor:
     if not isinstance(name, str) or not name:
         raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
-    if isinstance(given, tuple):
-        numbers = [value.item() if isinstance(value, np.generic) else value for value in given]
+    if isinstance(values, tuple):
+        numbers = [value.item() if isinstance(value, np.generic) else value for value in values]
         if len(numbers) != 2 or not all(type(value) in (int, float) and isfinite(value) for value in numbers):
             raise OptionValueError(
-                f"the factor {name!r} is {short_repr(given)}: a tuple is a range (low, high) of two finite numbers;"
+                f"the factor {name!r} is {short_repr(values)}: a tuple is a range (low, high) of two finite numbers;"
                 " levels come as a list"
             )
         low, high = numbers
         if not low < high:
             raise OptionValueError(
-                f"the range of {name!r} is empty: in {short_repr(given)}, low must be less than high"
+                f"the range of {name!r} is empty: in {short_repr(values)}, low must be less than high"
             )
         kind = int if type(low) is type(high) is int else float
         return Factor(name, low=kind(low), high=kind(high))
-    if isinstance(given, (set, frozenset)):
-        raise OptionValueError(f"the levels of {name!r} must have an order, as in a list: {short_repr(given)} has none")
-    if isinstance(given, (str, bytes, Mapping)) or not isinstance(given, Iterable):
+    if isinstance(values, (set, frozenset)):
         raise OptionValueError(
-            f"the factor {name!r} must be a range (low, high) or a list of levels, not {short_repr(given)}"
+            f"the levels of {name!r} must have an order, as in a list: {short_repr(values)} has none"
         )
-    levels = tuple(value.item() if isinstance(value, np.generic) else value for value in given)
+    if isinstance(values, (str, bytes, Mapping)) or not isinstance(values, Iterable):
+        raise OptionValueError(
+            f"the factor {name!r} must be a range (low, high) or a list of levels, not {short_repr(values)}"
+        )
+    levels = tuple(value.item() if isinstance(value, np.generic) else value for value in values)
     if not levels:
         raise OptionValueError(f"the factor {name!r} has no levels")
     for place, level in enumerate(levels):

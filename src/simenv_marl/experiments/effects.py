@@ -69,8 +69,8 @@ class Effects:
         """
         from .figures import draw_effects
 
-        drawn: Figure | SubFigure = draw_effects(self, figure)
-        return drawn
+        result: Figure | SubFigure = draw_effects(self, figure)
+        return result
 
 
 def effects(
@@ -141,19 +141,19 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
         raise OptionValueError("frame must be the DataFrame that run_experiment returned")
     factors = columns[: columns.index("contender")]
     check_metric(metric, columns[len(factors) :])
-    chosen = frame["status"] == "ok"
+    selection = frame["status"] == "ok"
     for what, value in (("contender", contender), ("agent", agent)):
         if value is None:
             continue
-        known = sorted(set(frame[what]))
-        if value not in known:
+        names = sorted(set(frame[what]))
+        if value not in names:
             raise OptionValueError(
-                f"there is no {what} {short_repr(value)}; there are {known}{did_you_mean(value, known)}"
+                f"there is no {what} {short_repr(value)}; there are {names}{did_you_mean(value, names)}"
             )
-        chosen &= frame[what] == value
-    if not chosen.any():
+        selection &= frame[what] == value
+    if not selection.any():
         raise OptionValueError("no run has come to its end")
-    return frame[chosen], factors
+    return frame[selection], factors
 
 
 def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
@@ -164,14 +164,14 @@ def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     pandas = import_extra("pandas", "effects")
     if column.nunique() > MANY and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
         column = pandas.qcut(column, GROUPS, duplicates="drop")
-    found = column.tolist()
-    levels = [level for level in dict.fromkeys(found) if level == level]
+    values = column.tolist()
+    levels = [level for level in dict.fromkeys(values) if level == level]
     if all(type(level) in (int, float, pandas.Interval) for level in levels):
         levels.sort()
     places = {level: place for place, level in enumerate(levels)}
-    if any(level != level for level in found):  # nan
+    if any(level != level for level in values):  # nan
         levels.append(nan)
-    return np.array([places.get(level, len(levels) - 1) for level in found]), levels
+    return np.array([places.get(level, len(levels) - 1) for level in values]), levels
 
 
 def _strength(means: NDArray[np.float64]) -> float:
@@ -226,9 +226,9 @@ def sobol_indices(
     if (means == means[0]).all():
         raise OptionValueError(f"{metric!r} is {means[0]:g} in all rows, so it has no variance")
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
-    found = analyze(problem, means, conf_level=confidence, seed=0)
+    indices = analyze(problem, means, conf_level=confidence, seed=0)
     columns = {"first": "S1", "first_error": "S1_conf", "total": "ST", "total_error": "ST_conf"}
-    return pandas.DataFrame({name: found[key] for name, key in columns.items()}, pandas.Index(names, name="factor"))
+    return pandas.DataFrame({name: indices[key] for name, key in columns.items()}, pandas.Index(names, name="factor"))
 
 
 def _is_saltelli(rows: NDArray[Any]) -> bool:

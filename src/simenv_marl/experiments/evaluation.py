@@ -162,10 +162,10 @@ class Evaluation:
         """
         from .figures import draw_evaluation
 
-        drawn: Figure | SubFigure = draw_evaluation(
+        result: Figure | SubFigure = draw_evaluation(
             numbers(self.values(metric), metric), self.summary(metric), self.baseline, metric, figure
         )
-        return drawn
+        return result
 
     def _numbers(self, metric: str) -> dict[str, NDArray[np.float64]]:
         """Return the team's values by contender, in the order of the seeds."""
@@ -245,30 +245,30 @@ def evaluate(
             contender and the seed.
     """
     import_extra("pandas", "evaluate"), import_extra("scipy.stats", "evaluate")
-    checked = checked_contenders(contenders, batched=bool(batched))
-    _check(checked, baseline, confidence, width)
-    places = distinct_seeds(seeds)
+    by_name = checked_contenders(contenders, batched=bool(batched))
+    _check(by_name, baseline, confidence, width)
+    all_seeds = distinct_seeds(seeds)
     runner = make_runner(
-        checked, points, options, metric, team, batch_size=batch_size, batched=bool(batched), workers=workers
+        by_name, points, options, metric, team, batch_size=batch_size, batched=bool(batched), workers=workers
     )
     # Plans are made and pickled here even if workers do the work, so that errors come first.
-    plans = {name: runner.plan(simulation, name) for name in checked}
+    plans = {name: runner.plan(simulation, name) for name in by_name}
     if workers:
         pack((simulation, runner))
-    columns, rows = (*RUN_COLUMNS, *runner.metrics), {name: list[Any]() for name in checked}
+    columns, rows = (*RUN_COLUMNS, *runner.metrics), {name: list[Any]() for name in by_name}
     done = 0
-    with progress_bar(len(plans) * len(places), "episode") if progress else nullcontext() as bar, processes_kept():
+    with progress_bar(len(plans) * len(all_seeds), "episode") if progress else nullcontext() as bar, processes_kept():
         while True:
-            lot = places[done : _next_check(done, len(places), width)]
+            batch = all_seeds[done : _next_check(done, len(all_seeds), width)]
             for name, plan in plans.items():
                 with noting(f"of the contender {name!r}"):
-                    rows[name] += _run(simulation, runner, name, plan, lot, int(workers))
+                    rows[name] += _run(simulation, runner, name, plan, batch, int(workers))
                 if bar is not None:
-                    bar.update(len(lot))
-            done += len(lot)
+                    bar.update(len(batch))
+            done += len(batch)
             table = make_table(columns, [row for own in rows.values() for row in own])
             evaluation = Evaluation(table, baseline, float(confidence))
-            if done == len(places) or (width is not None and done >= FIRST and evaluation._widest() <= width):
+            if done == len(all_seeds) or (width is not None and done >= FIRST and evaluation._widest() <= width):
                 return evaluation
 
 
@@ -319,10 +319,10 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
 
 def check_metric(metric: Any, columns: Iterable[str]) -> None:
     """Check that a metric is one of the columns of a table, and does not say which run it is."""
-    known = [name for name in columns if name not in (*RUN_COLUMNS[:3], *STATUS_COLUMNS)]
-    if metric not in known:
+    names = [name for name in columns if name not in (*RUN_COLUMNS[:3], *STATUS_COLUMNS)]
+    if metric not in names:
         raise OptionValueError(
-            f"metric={short_repr(metric)} is not a column of numbers; these are: {known}{did_you_mean(metric, known)}"
+            f"metric={short_repr(metric)} is not a column of numbers; these are: {names}{did_you_mean(metric, names)}"
         )
 
 
@@ -348,11 +348,11 @@ def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, flo
     for method in ("BCa", "percentile")[len(values) > CORRECTED :]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about degenerate samples, which the other method handles
-            found = stats.bootstrap(
+            bounds = stats.bootstrap(
                 (values,), np.mean, confidence_level=confidence, n_resamples=RESAMPLES, batch=batch, method=method,
                 vectorized=True, rng=np.random.default_rng(0),
             ).confidence_interval  # fmt: skip
-        low, high = float(found.low), float(found.high)
+        low, high = float(bounds.low), float(bounds.high)
         if isfinite(low) and isfinite(high):
             break
     return low, high

@@ -58,9 +58,9 @@ class Returns(tuple[float, ...]):
 
     def __new__(cls, returns: Mapping[str, float]) -> Returns:
         """Make the returns from a dict."""
-        made = super().__new__(cls, returns.values())
-        made._by_agent = dict(returns)
-        return made
+        instance = super().__new__(cls, returns.values())
+        instance._by_agent = dict(returns)
+        return instance
 
     def __getitem__(self, key: Any) -> Any:
         if not isinstance(key, str):

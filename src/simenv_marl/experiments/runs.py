@@ -107,43 +107,42 @@ def run_experiment(
         SimEnvError: Something else cannot work. The subclass tells what.
     """
     import_extra("pandas", "run_experiment")
-    checked = checked_contenders(contenders or {}, batched=bool(batched))
-    if checked.pop(BY_RULE, {}):
+    by_name = checked_contenders(contenders or {}, batched=bool(batched))
+    if by_name.pop(BY_RULE, {}):
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another name"
         )
-    checked = {BY_RULE: {}, **checked}
+    by_name = {BY_RULE: {}, **by_name}
     table, rows = _checked_design(design)
-    keys, distinct = [to_json(row) for row in rows], distinct_seeds(seeds)
+    keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
     runner = make_runner(
-        checked, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
+        by_name, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
         factors=list(table.columns),
     )  # fmt: skip
     _check_make(make, rows[0])
-    place = Store(_checked_folder(store), list(table.columns), list(runner.metrics))
-    place.exists()
-    stored = place.read(keys)
-    check_rows(place, stored, keys)
-    work = make, runner, place.folder, new_session()
+    storage = Store(_checked_folder(store), list(table.columns), list(runner.metrics))
+    stored = storage.read(keys)
+    check_rows(storage, stored, keys)
+    work = make, runner, storage.folder, new_session()
     if workers:
         pack(work)  # errors of pickling come before any run, and so do those of contenders
     row, provenances = _try_contenders(make, runner, sorted(keys, key=lambda key: key != stored.sample))
-    place.create()
-    warn_of_changes(place, stored, row, provenances)
-    known = {run for run, result in stored.runs.items() if not (retry_errors and isinstance(result, str))}
-    runs = list(product(dict.fromkeys(keys), checked, distinct))  # a row that occurs twice has the same results
-    missing = [run for run in runs if run not in known]
+    storage.create()
+    warn_of_changes(storage, stored, row, provenances)
+    finished = {run for run, result in stored.runs.items() if not (retry_errors and isinstance(result, str))}
+    runs = list(product(dict.fromkeys(keys), by_name, all_seeds))  # a row that occurs twice has the same results
+    missing = [run for run in runs if run not in finished]
     with progress_bar(len(runs), "run", len(runs) - len(missing)) if progress else nullcontext() as bar:
         if workers and missing:
-            for number, _ in spread(_run_part, work, missing, int(workers), len(distinct) if batched else 1, SHARE):
+            for number, _ in spread(_run_part, work, missing, int(workers), len(all_seeds) if batched else 1, SHARE):
                 if bar is not None:
                     bar.update(number)
         elif missing:
             _run_part(*work, missing, bar)
-    return _make_frame(table, keys, distinct, place.read(keys).runs, runner)
+    return _make_frame(table, keys, all_seeds, storage.read(keys).runs, runner)
 
 
-# -- what is checked before anything runs ---------------------------------------------------------
+# -- checks before anything runs ------------------------------------------------------------------
 
 
 def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":

@@ -88,19 +88,19 @@ class Store:
                 strange = any(not path.name.startswith((HEADER, ".")) for path in others)
                 if strange and not header.exists():  # another process may have written it meanwhile
                     raise OptionValueError(f"the folder {self.folder} is not empty, and not the store of an experiment")
-            found = json.loads(header.read_bytes()) if header.exists() else None
+            content = json.loads(header.read_bytes()) if header.exists() else None
         except OSError as error:
             raise self._unusable(error) from error
         except json.JSONDecodeError as error:
             raise StoreError(f"{header} cannot be read: {error}") from error
-        if found is None:
+        if content is None:
             return False
-        if not isinstance(found, dict) or found.get("simenv_marl") != VERSION:
+        if not isinstance(content, dict) or content.get("simenv_marl") != VERSION:
             raise OptionValueError(f"{header} was not written by this version of simenv_marl")
         for what, names in (("factors", self.factors), ("metrics", self.metrics)):
-            if found.get(what) != sorted(names):
+            if content.get(what) != sorted(names):
                 raise OptionValueError(
-                    f"the store {self.folder} belongs to another experiment: its {what} are {found.get(what)}, not"
+                    f"the store {self.folder} belongs to another experiment: its {what} are {content.get(what)}, not"
                     f" {sorted(names)}; pass another folder"
                 )
         return True
@@ -126,7 +126,8 @@ class Store:
         return StoreError(f"{self.folder} cannot be made or read as the folder of an experiment: {reason}")
 
     def read(self, keys: Sequence[str]) -> Stored:
-        """Read all runs. ``keys`` are the rows of the design, as JSON."""
+        """Read all runs, after a check with ``exists``. ``keys`` are the rows of the design, as JSON."""
+        self.exists()
         runs: dict[Run, Result] = {}
         versions: set[tuple[str, Any]] = set()
         provenances: dict[str, Provenance] = {}
@@ -279,5 +280,5 @@ def warn_of_changes(store: Store, stored: Stored, row: str, provenances: Mapping
 def _parts_of(provenance: Provenance) -> dict[str, str]:
     """Return the parts of a provenance that affect results, as text without addresses in memory."""
     options = {name: value for name, value in (provenance.get("options") or {}).items() if name != "driver"}
-    known = {**provenance, "options": options}
-    return {part: ADDRESS.sub("", json.dumps(known[part], sort_keys=True)) for part in MADE_OF if part in known}
+    parts = {**provenance, "options": options}
+    return {part: ADDRESS.sub("", json.dumps(parts[part], sort_keys=True)) for part in MADE_OF if part in parts}

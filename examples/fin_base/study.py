@@ -222,7 +222,7 @@ def run(folder: Path, rows: Any, contenders: Mapping[str, Policies], seeds: int,
     table = run_experiment(
         world,
         rows,
-        policies=contenders,
+        contenders=contenders,
         seeds=range(HELD_OUT, HELD_OUT + seeds),
         points=POINTS,
         metric=METRICS,

@@ -73,7 +73,7 @@ def moved(table: Any) -> str:
     """Tabulate the effect of each factor on the mean welfare of each contender."""
     rows = []
     for name in dict.fromkeys(table.contender):
-        found = effects(table, of="welfare", contender=name).main["mean"].groupby("factor", sort=False)
+        found = effects(table, metric="welfare", contender=name).main["mean"].groupby("factor", sort=False)
         rows.append((name, *(f"{own.iloc[1] - own.iloc[0]:+.0f}" for _, own in found)))
     return markdown(("policy", *(f"{factor}: {levels[1]}" for factor, levels in FACTORS.items())), rows)
 

@@ -132,7 +132,7 @@ def run(folder: Path, levels: Levels, waterers: Mapping[str, Any], seeds: int, w
     return run_experiment(
         greenhouse,
         rows_of(levels),
-        policies={name: {WATERER: policy} for name, policy in waterers.items()},
+        contenders={name: {WATERER: policy} for name, policy in waterers.items()},
         seeds=range(HELD_OUT, HELD_OUT + seeds),
         metric={"alive": share_alive, "litres": litres_a_pot},
         store=folder,

@@ -109,7 +109,7 @@ def check_experiment():
     with tempfile.TemporaryDirectory() as folder:
         tables = [
             run_experiment(
-                Model, {"bonus": [0, 3, 5]}, policies=policies, seeds=range(9), points=[Model.decide], batched=True,
+                Model, {"bonus": [0, 3, 5]}, contenders=policies, seeds=range(9), points=[Model.decide], batched=True,
                 metric=lambda model: model.level, store=Path(folder) / str(workers), workers=workers,
             )
             for workers in (0, 2)

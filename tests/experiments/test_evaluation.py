@@ -15,7 +15,7 @@ from simenv_marl import RULE, aec_env, evaluate, make_step, simulate
 from simenv_marl.data import Mixture
 from simenv_marl.errors import AgentError, MissingExtraError, OptionValueError, UnknownPointError
 from simenv_marl.experiments import Variant
-from simenv_marl.experiments.statistics import interval, seeds_needed
+from simenv_marl.experiments.evaluation import interval, seeds_needed
 from simenv_marl.planning import RolloutPolicy, TreeSearchPolicy
 from simenv_marl.plugins import ChangedResult
 from tests.conftest import DRIVERS
@@ -261,9 +261,9 @@ def test_what_is_no_number_has_no_mean():
     given = {"day": lambda shop: "monday", "some": lambda shop: shop.level if shop.seed else None}
     found = evaluate(Shop, CONTENDERS, seeds=[0, 1], points=POINTS, metric=given, baseline="rule")
     assert set(found.values("day")["rule"]) == {"monday"}
-    for look in (found.summary, found.improvement, found.plot, lambda of: found.seeds_needed(1, of=of)):
+    for look in (found.summary, found.improvement, found.plot, lambda metric: found.seeds_needed(1, metric=metric)):
         with pytest.raises(OptionValueError, match="'day' is not a column of numbers"):
-            look(of="day")
+            look(metric="day")
     assert np.isnan(found.summary("some")["mean"]).all()
 
 

@@ -25,7 +25,7 @@ from simenv_marl.data import Mixture
 from simenv_marl.errors import OptionValueError, StoreError, UnknownPointError
 from simenv_marl.experiments import Variant, run_experiment
 from simenv_marl.experiments import store as stores
-from simenv_marl.experiments.playing import Outcome
+from simenv_marl.experiments.runner import Outcome
 from simenv_marl.planning import RolloutPolicy
 from simenv_marl.plugins import ChangedResult
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
@@ -37,8 +37,8 @@ ROOT = Path(__file__).parents[2]
 
 
 def run(store, design=DESIGN, make=Shop, **arguments):
-    policies = {"much": {"keeper": much}, "some": {"keeper": some}}
-    given = {"policies": policies, "seeds": range(4), "points": POINTS, "metric": {"level": level}, **arguments}
+    contenders = {"much": {"keeper": much}, "some": {"keeper": some}}
+    given = {"contenders": contenders, "seeds": range(4), "points": POINTS, "metric": {"level": level}, **arguments}
     return run_experiment(make, design, store=store, **given)
 
 
@@ -85,8 +85,8 @@ def test_the_table_is_the_same_whoever_is_born_and_dies(tmp_path):
     def make(ticks):
         return Colony(Design(initial=3, most=8, ticks=ticks))
 
-    policies = {"one": {"creature_4": lambda observation: 5}, "all": {Creature.act: lambda observation: 3}}
-    given = {"policies": policies, "seeds": range(5), "points": colony_points(overseen=False)}
+    contenders = {"one": {"creature_4": lambda observation: 5}, "all": {Creature.act: lambda observation: 3}}
+    given = {"contenders": contenders, "seeds": range(5), "points": colony_points(overseen=False)}
     frames = [
         run_experiment(make, {"ticks": [1, 5]}, store=tmp_path / str(workers), workers=workers, **given)
         for workers in (0, 1, 2)
@@ -99,8 +99,8 @@ def test_the_table_is_the_same_whoever_is_born_and_dies(tmp_path):
 
 @pytest.mark.parametrize("arguments", [{}, {"workers": 2}, {"batch_size": 2}], ids=str)
 def test_batched_policies_bring_the_same(arguments, tmp_path):
-    policies = {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}}
-    assert run(tmp_path / "b", policies=policies, batched=True, **arguments).equals(run(tmp_path / "a"))
+    contenders = {"much": {"keeper": much_of_many}, "some": {"keeper": some_of_many}}
+    assert run(tmp_path / "b", contenders=contenders, batched=True, **arguments).equals(run(tmp_path / "a"))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_run_that_cannot_be_closed_has_failed(arguments, tmp_path):
             if self.seed % 2:
                 raise OSError("stuck")
 
-    frame = run(tmp_path, {"days": [1]}, make=Stuck, policies=None, **arguments)
+    frame = run(tmp_path, {"days": [1]}, make=Stuck, contenders=None, **arguments)
     assert [frame[frame.seed == seed]["status"].tolist() for seed in range(4)] == [["ok"] * 3, ["error"]] * 2
     assert len(lines(tmp_path)) == 4
 
@@ -138,7 +138,7 @@ def test_whatever_ends_a_run_is_an_error_of_that_run(error, batched, tmp_path):
             if self.seed == 1:
                 raise error("enough")
 
-    frame = run(tmp_path, {"days": [1]}, make=Ending, policies=None, batched=batched)
+    frame = run(tmp_path, {"days": [1]}, make=Ending, contenders=None, batched=batched)
     assert frame["status"].tolist() == ["ok"] * 3 + ["error"] + ["ok"] * 6
     assert frame["error"][3] == f"{error.__name__}: enough"
 
@@ -152,7 +152,7 @@ def test_an_interrupt_ends_the_experiment(batched, tmp_path):
             super().run()
 
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, {"days": [1]}, make=Interrupted, policies=None, batched=batched, batch_size=1)
+        run(tmp_path, {"days": [1]}, make=Interrupted, contenders=None, batched=batched, batch_size=1)
     assert [line["seed"] for line in lines(tmp_path)] == [0, 1]
 
 
@@ -160,13 +160,13 @@ def test_points_and_options_that_can_be_asked_for_once_serve_all(tmp_path):
     def twice(shop, _result):
         return ChangedResult(2 * _result)
 
-    plugins, policies = [(twice, "tests.worlds.shops.Shop.sell", "after")], {"much": {"keeper": much}}
+    plugins, contenders = [(twice, "tests.worlds.shops.Shop.sell", "after")], {"much": {"keeper": much}}
 
     class Own(Shop):
         points = POINTS
 
-    expected = run(tmp_path / "a", make=Own, policies=policies, points=[Shop.order], plugins=plugins)
-    again = run(tmp_path / "b", make=Own, policies=policies, points=iter([Shop.order]), plugins=iter(plugins))
+    expected = run(tmp_path / "a", make=Own, contenders=contenders, points=[Shop.order], plugins=plugins)
+    again = run(tmp_path / "b", make=Own, contenders=contenders, points=iter([Shop.order]), plugins=iter(plugins))
     assert again.equals(expected)
 
 
@@ -204,9 +204,9 @@ def test_what_is_known_is_not_run_again(tmp_path):
         calls.append(days)
         return Shop(days)
 
-    def again(days, seeds=range(3), policies=None):
+    def again(days, seeds=range(3), contenders=None):
         calls.clear()
-        return run_experiment(make, {"days": days}, policies=policies, seeds=seeds, points=POINTS, store=tmp_path)
+        return run_experiment(make, {"days": days}, contenders=contenders, seeds=seeds, points=POINTS, store=tmp_path)
 
     first = again([1, 2])
     assert again([1, 2]).equals(first)
@@ -221,13 +221,13 @@ def test_what_is_known_is_not_run_again(tmp_path):
 @pytest.mark.parametrize("workers", [0, 2])
 def test_planners_are_contenders(workers, tmp_path):
     planner = RolloutPolicy([0, 1, 2], futures=2, horizon=1)
-    policies = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
-    frame = run(tmp_path, DESIGN[::2], policies=policies, points=NEAR, seeds=range(2), workers=workers)
+    contenders = {"one": {"helper": planner}, "both": {"keeper": planner, "helper": planner}}
+    frame = run(tmp_path, DESIGN[::2], contenders=contenders, points=NEAR, seeds=range(2), workers=workers)
     runs = frame[(frame["agent"] == "team") & (frame["contender"] != "rule")]
     expected = [
         simulate(Shop(days, price), own, points=NEAR, seed=seed).level
         for days, price in ((1, 0.5), (2, 2.0))
-        for own in policies.values()
+        for own in contenders.values()
         for seed in range(2)
     ]
     assert runs["level"].tolist() == expected
@@ -247,7 +247,7 @@ def test_variants_may_have_any_parameters(tmp_path):
     def make(days):
         return Variant("v", lambda table: Shop(table[1]), parameters={"table": {1: days, (2, 3): np.float32(1)}})
 
-    frame = run(tmp_path, {"days": [1, 2]}, make=make, policies={"same": {}})
+    frame = run(tmp_path, {"days": [1, 2]}, make=make, contenders={"same": {}})
     assert set(frame["status"]) == {"ok"}
     assert lines(tmp_path)[0]["provenance"]["parameters"] == {"table": {"1": 1, "[2, 3]": 1.0}}
 
@@ -276,7 +276,7 @@ def test_a_torn_last_line_is_a_run_that_is_not_known(tmp_path):
 )  # fmt: skip
 def test_a_line_that_is_no_run_is_told_and_all_others_can_be_read(line, tmp_path):
     def again():
-        return run(tmp_path, {"days": [1]}, policies=None)
+        return run(tmp_path, {"days": [1]}, contenders=None)
 
     first = again()
     (path,) = tmp_path.glob("*.jsonl")
@@ -338,14 +338,15 @@ def test_values_come_back_as_they_were(row, values, tmp_path_factory):
     row = {name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()}
     outcome = Outcome({"a": 0.1}, {"a": 1}, dict(zip("abcd", plain, strict=False)))
     folder = tmp_path_factory.mktemp("store")
-    stores.prepare(folder, list(row), [])
+    place = stores.Store(folder, list(row), [])
+    place.create()
     writer = stores.Writer(folder, "s")
-    writer.write(stores.line_of(row, "rule", 3, stores.Known(outcome, None), '{"seed":3}'))
+    writer.write((stores.to_json(row), "rule", 3), outcome, {"seed": 3})
     writer.close()
-    (((key, contender, seed), known),) = stores.read(folder, list(row)).runs.items()
+    (((key, contender, seed), known),) = place.read([]).runs.items()
     assert (contender, seed) == ("rule", 3)
     assert same(json.loads(key), row)
-    assert same(known.outcome.metrics, outcome.metrics)
+    assert same(known.metrics, outcome.metrics)
 
 
 def same(one, other):
@@ -398,11 +399,12 @@ def one_argument(days):
         ("cannot be stored", {"design": {"days": [object()]}}),
         ("must be a DataFrame", {"design": 3}),
         ("there are none", {"seeds": []}),
-        ("'rule' is always the model as it is", {"policies": {"rule": {"keeper": much}}}),
-        ("stranger", {"policies": {"a": {"stranger": much}}}),
+        ("'rule' is always the model as it is", {"contenders": {"rule": {"keeper": much}}}),
+        ("stranger", {"contenders": {"a": {"stranger": much}}}),
         ("unknown|no option", {"nonsense": 3}),
+        ("no option policies here; .* in contenders=", {"policies": {"a": {"keeper": much}}}),
         ("team", {"team": 3}),
-        ("'a', .* batched=True", {"policies": {"a": {"keeper": Mixture({much_of_many: 1})}}}),
+        ("'a', .* batched=True", {"contenders": {"a": {"keeper": Mixture({much_of_many: 1})}}}),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, tmp_path):
@@ -413,7 +415,7 @@ def test_what_cannot_be_is_refused_before_anything_is_stored(match, arguments, t
 
 def test_a_policy_that_cannot_be_is_told_with_its_contender(tmp_path):
     with pytest.raises(UnknownPointError, match="stranger") as caught:
-        run(tmp_path, policies={"good": {"keeper": much}, "bad": {"stranger": much}})
+        run(tmp_path, contenders={"good": {"keeper": much}, "bad": {"stranger": much}})
     assert "of the contender 'bad'" in notes(caught.value)
 
 
@@ -461,19 +463,19 @@ def test_a_store_that_another_process_is_making_is_joined(tmp_path, monkeypatch)
     ("told", "arguments"),
     [
         (r'options {} then, {"max_steps": 2} now', {"max_steps": 2}),
-        (r"'much' .*policies .*shops.much.* then, .*shops.some", {"policies": {"much": {"keeper": some}}}),
+        (r"'much' .*policies .*shops.much.* then, .*shops.some", {"contenders": {"much": {"keeper": some}}}),
         (r"make .*Shop.* then, .*Other.* now", {"make": type("Other", (Shop,), {})}),
         (r"plugins \[\] then", {"plugins": [(lambda shop: None, "tests.worlds.shops.Shop.sell", "before")]}),
         (r"points .*helper.* then", {"points": {Shop.order: POINTS[Shop.order]}}),
     ],
 )
 def test_what_was_made_otherwise_is_warned_of(told, arguments, tmp_path):
-    first = run(tmp_path, policies={"much": {"keeper": much}})
+    first = run(tmp_path, contenders={"much": {"keeper": much}})
     with pytest.warns(UserWarning, match=told):
-        assert run(tmp_path, **{"policies": {"much": {"keeper": much}}} | arguments).equals(first)
+        assert run(tmp_path, **{"contenders": {"much": {"keeper": much}}} | arguments).equals(first)
     more = pd.concat([DESIGN[:1].assign(days=7), DESIGN])  # of whose first row nothing is stored
     with pytest.warns(UserWarning, match=told):
-        frame = run(tmp_path, more, **{"policies": {"much": {"keeper": much}}} | arguments)
+        frame = run(tmp_path, more, **{"contenders": {"much": {"keeper": much}}} | arguments)
     assert frame[frame["days"] != 7].reset_index(drop=True).equals(first)
 
 
@@ -481,10 +483,10 @@ def test_a_row_that_is_known_to_fail_does_not_keep_others_from_being_run(tmp_pat
     def make(days):
         return Variant("v", Shop, parameters={"days": days} if days != 2 else {"nights": days})
 
-    frame = run(tmp_path, {"days": [1, 2]}, make=make, policies=None)
+    frame = run(tmp_path, {"days": [1, 2]}, make=make, contenders=None)
     assert set(frame[frame["days"] == 2]["status"]) == {"error"}
     with pytest.warns(UserWarning, match="rows that this design does not have"):
-        frame = run(tmp_path, {"days": [3, 2]}, make=make, policies=None)
+        frame = run(tmp_path, {"days": [3, 2]}, make=make, contenders=None)
     assert frame.groupby("days")["status"].first().to_dict() == {2: "error", 3: "ok"}
 
 
@@ -493,10 +495,10 @@ def test_what_was_made_alike_is_not_warned_of(tmp_path):
         def __call__(self, observation):
             return 1
 
-    first = run(tmp_path, policies={"a": {"keeper": Policy()}}, driver="thread")
+    first = run(tmp_path, contenders={"a": {"keeper": Policy()}}, driver="thread")
     kept = [Policy() for _ in range(3)]
     turned = dict(reversed(POINTS.items()))
-    assert run(tmp_path, policies={"a": {"keeper": kept[-1]}}, points=turned, driver="greenlet").equals(first)
+    assert run(tmp_path, contenders={"a": {"keeper": kept[-1]}}, points=turned, driver="greenlet").equals(first)
 
 
 def test_another_version_of_a_package_is_warned_of(tmp_path):
@@ -522,9 +524,9 @@ def test_a_full_disk_is_told_and_what_is_stored_stays(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(stores.os, "write", write)
             with pytest.raises(StoreError, match="No space left"):
-                run(tmp_path / str(batched), policies=None, batched=batched)
+                run(tmp_path / str(batched), contenders=None, batched=batched)
         assert len(lines(tmp_path / str(batched))) == 5
-        assert run(tmp_path / str(batched), policies=None).equals(run(tmp_path / "whole", policies=None))
+        assert run(tmp_path / str(batched), contenders=None).equals(run(tmp_path / "whole", contenders=None))
 
 
 def test_a_store_that_cannot_be_written_is_told(tmp_path):
@@ -569,7 +571,7 @@ SCRIPT = """
 
     if __name__ == "__main__":
         design = pd.DataFrame({"days": range(1, 9), "price": 0.5, "kind": ["slow"] * 7 + ["faulty"]})
-        frame = run_experiment(Shop, design, policies={"some": {"keeper": some}}, seeds=range(6), points=POINTS,
+        frame = run_experiment(Shop, design, contenders={"some": {"keeper": some}}, seeds=range(6), points=POINTS,
                                metric=level, store=sys.argv[1], workers=int(sys.argv[2]))
         frame.to_pickle(sys.argv[1] + ".table")
 """
@@ -645,7 +647,7 @@ NAMED = """
             for key in ("a", "__main__.Sum.decide"):
                 contenders = {"four": {key: lambda observation: 4}}
                 print(evaluate(make, contenders, points=points, **given).values()["four"].tolist())
-                frame = run_experiment(make, {"a": [1, 2]}, policies=contenders, points=points,
+                frame = run_experiment(make, {"a": [1, 2]}, contenders=contenders, points=points,
                                        store=f"{sys.argv[1]}/{make.__name__}-{key}", **given)
                 print(frame[frame["agent"] == "team"]["return"].tolist())
 """

@@ -52,26 +52,25 @@ def provenance(
 
 def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     """Return the provenance of an environment of a plan, as ``provenance`` does."""
-    name = _dotted_name(plan.maker)
+    name = source_name(plan.source)
     options = {
-        option.name: written_plainly(getattr(plan.options, option.name))
+        option.name: as_json(getattr(plan.options, option.name))
         for option in fields(Options)
         if option.name not in ("plugins", "policies") and getattr(plan.options, option.name) != option.default
     }
-    policies = plan.options.policies or {}
     points = {point.point.name: point.agent for point in plan.active}
     packages = sorted({dotted.partition(".")[0] for dotted in (name, *points)})
     return {
         "simulation": name,
         "packages": {package: _version(package) for package in packages},
         "variant": None if plan.variant is None else plan.variant.name,
-        "parameters": {} if plan.variant is None else written_plainly(plan.variant.parameters),
+        "parameters": {} if plan.variant is None else as_json(plan.variant.parameters),
         "points": points,
         "plugins": [
-            {"handler": written_plainly(handler), "target": target, "position": position}
+            {"handler": as_json(handler), "target": target, "position": position}
             for handler, target, position in ([] if plan.plugins is None else plan.plugins.entries)
         ],
-        "policies": {_key(key): written_plainly(policy) for key, policy in policies.items()},
+        "policies": as_json(plan.options.policies or {}),
         "options": options,
         "seed": seed,
         "python": platform.python_version(),
@@ -79,35 +78,32 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     }
 
 
+def source_name(source: Any) -> str:
+    """Return the dotted name of a class or factory, or of the class of an object."""
+    while isinstance(source, partial):
+        source = source.func
+    return _dotted_name(source if hasattr(source, "__qualname__") else type(source))
+
+
 def _dotted_name(thing: Any) -> str:
     return f"{thing.__module__}.{thing.__qualname__}"
 
 
-def _key(key: Any) -> str:
-    return key if isinstance(key, str) else str(written_plainly(key))
-
-
-def written_plainly(value: Any) -> Any:
+def as_json(value: Any) -> Any:
     """Return a value as JSON data."""
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
-    if isinstance(value, np.generic):
-        plain = value.item()
-        return repr(plain) if isinstance(plain, np.generic) else written_plainly(plain)
+    if isinstance(value, (np.generic, np.ndarray)):
+        plain = value.tolist()
+        return repr(plain) if isinstance(plain, np.generic) else as_json(plain)
     if isinstance(value, Mapping):
-        return {_key(key): written_plainly(part) for key, part in value.items()}
+        return {key if isinstance(key, str) else str(as_json(key)): as_json(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [written_plainly(part) for part in value]
+        return [as_json(part) for part in value]
     if isinstance(value, (set, frozenset)):
         return sorted(map(repr, value))
-    if isinstance(value, np.ndarray):
-        return written_plainly(value.tolist())
     if isinstance(value, partial):
-        return {
-            "partial": written_plainly(value.func),
-            "args": written_plainly(value.args),
-            "keywords": written_plainly(value.keywords),
-        }
+        return {"partial": as_json(value.func), "args": as_json(value.args), "keywords": as_json(value.keywords)}
     return _dotted_name(value) if hasattr(value, "__qualname__") else repr(value)
 
 

@@ -1,7 +1,9 @@
 """Designs of experiments: which combinations of factors to run."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from math import ceil, floor, isfinite, prod
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Final
@@ -24,56 +26,47 @@ MOST_ROWS: Final = 10_000_000
 
 @dataclass(frozen=True)
 class Factor:
-    """A factor of an experiment.
-
-    Attributes:
-        name: Its name.
-        levels: The values that it can have; None for a range.
-        low, high: The bounds of a range, inclusive.
-        whole: Whether it is a range of integers.
-    """
+    """A factor of an experiment: a list of levels or a range, whose bounds are inclusive."""
 
     name: str
     levels: tuple[Any, ...] | None = None
     low: Any = None
     high: Any = None
-    whole: bool = False
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is a range of integers."""
+        return self.levels is None and isinstance(self.low, int)
 
     def spread(self, unit: NDArray[np.float64]) -> list[Any]:
         """Map numbers in [0, 1) to values of the factor, uniformly."""
-        if self.levels is not None:
-            return [self.levels[min(floor(u * len(self.levels)), len(self.levels) - 1)] for u in unit.tolist()]
-        if self.whole:
-            number = self.high - self.low + 1
-            return [self.low + min(floor(u * number), number - 1) for u in unit.tolist()]
-        return [self._between(u) for u in unit.tolist()]
+        if self.levels is None and not self.is_whole:
+            return self.scale(unit)
+        number = self.high - self.low + 1 if self.levels is None else len(self.levels)
+        places = [min(floor(u * number), number - 1) for u in unit.tolist()]
+        return [self.low + place if self.levels is None else self.levels[place] for place in places]
 
-    def _between(self, u: float) -> float:
-        value = self.low * (1 - u) + self.high * u  # this form cannot overflow
-        return float(min(max(value, self.low), self.high))
-
-    def placed(self, unit: NDArray[np.float64]) -> list[Any]:
+    def scale(self, unit: NDArray[np.float64]) -> list[Any]:
         """Map numbers in [0, 1], inclusive, to values of a range."""
-        return [round(self._between(u)) if self.whole else self._between(u) for u in unit.tolist()]
+        values = [self.low * (1 - u) + self.high * u for u in unit.tolist()]  # this form cannot overflow
+        values = [float(min(max(value, self.low), self.high)) for value in values]
+        return [round(value) for value in values] if self.is_whole else values
 
     def steps(self, number: int) -> list[Any]:
         """Return ``number`` values of a range from bound to bound, or all levels of a list."""
         if self.levels is not None:
             return list(self.levels)
-        return list(dict.fromkeys(self.placed(np.linspace(0.0, 1.0, number))))
+        return list(dict.fromkeys(self.scale(np.linspace(0.0, 1.0, number))))
 
-    def ends(self) -> list[Any]:
-        """Return the two values for a two-level design.
-
-        Raises:
-            OptionValueError: There are not two levels.
-        """
-        if self.levels is not None and len(self.levels) != 2:
+    def ends(self) -> tuple[Any, ...]:
+        """Return the two values for a two-level design."""
+        values = (self.low, self.high) if self.levels is None else self.levels
+        if len(values) != 2:
             raise OptionValueError(
-                f"this method needs two levels of each factor, but {self.name!r} has {len(self.levels)}; give it two,"
+                f"this method needs two levels of each factor, but {self.name!r} has {len(values)}; give it two,"
                 " or a range (low, high)"
             )
-        return [self.low, self.high] if self.levels is None else list(self.levels)
+        return values
 
 
 def design(
@@ -108,7 +101,7 @@ def design(
         MissingExtraError: pandas, pyDOE or SALib is missing.
     """
     pandas = import_extra("pandas", "design")
-    found = _checked(factors)
+    parsed = _checked(factors)
     if method not in list(METHODS):
         raise OptionValueError(
             f"method must be one of {', '.join(METHODS)}, not {short_repr(method)}{did_you_mean(method, METHODS)}"
@@ -117,9 +110,9 @@ def design(
         raise OptionValueError(f"n must be a positive integer, not {short_repr(n)}")
     if seed is not None and not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
-    columns = METHODS[method](found, None if n is None else int(n), int(seed or 0))
+    columns = METHODS[method](parsed, None if n is None else int(n), int(seed or 0))
     series = {
-        factor.name: pandas.Series(values, dtype=_dtype(factor)) for factor, values in zip(found, columns, strict=True)
+        factor.name: pandas.Series(values, dtype=_dtype(factor)) for factor, values in zip(parsed, columns, strict=True)
     }
     table: DataFrame = pandas.DataFrame(series)
     return table
@@ -130,63 +123,62 @@ def _checked(factors: Any) -> list[Factor]:
         raise OptionValueError(
             f"factors must be a dict from names to ranges or lists of levels, not {short_repr(factors)}"
         )
-    return [_factor(name, given) for name, given in factors.items()]
+    return [_factor(name, values) for name, values in factors.items()]
 
 
-def _factor(name: Any, given: Any) -> Factor:
+def _factor(name: Any, values: Any) -> Factor:
     if not isinstance(name, str) or not name:
         raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
-    if isinstance(given, tuple):
-        numbers = [value.item() if isinstance(value, np.generic) else value for value in given]
+    if isinstance(values, tuple):
+        numbers = [value.item() if isinstance(value, np.generic) else value for value in values]
         if len(numbers) != 2 or not all(type(value) in (int, float) and isfinite(value) for value in numbers):
             raise OptionValueError(
-                f"the factor {name!r} is {short_repr(given)}: a tuple is a range (low, high) of two"
-                " finite numbers; levels"
-                " come as a list"
+                f"the factor {name!r} is {short_repr(values)}: a tuple is a range (low, high) of two finite numbers;"
+                " levels come as a list"
             )
         low, high = numbers
         if not low < high:
             raise OptionValueError(
-                f"the range of {name!r} is empty: in {short_repr(given)}, low must be less than high"
+                f"the range of {name!r} is empty: in {short_repr(values)}, low must be less than high"
             )
-        whole = type(low) is type(high) is int
-        return Factor(name, low=low if whole else float(low), high=high if whole else float(high), whole=whole)
-    if isinstance(given, (set, frozenset)):
-        raise OptionValueError(f"the levels of {name!r} must have an order, as in a list: {short_repr(given)} has none")
-    if isinstance(given, (str, bytes, Mapping)) or not isinstance(given, Iterable):
+        kind = int if type(low) is type(high) is int else float
+        return Factor(name, low=kind(low), high=kind(high))
+    if isinstance(values, (set, frozenset)):
         raise OptionValueError(
-            f"the factor {name!r} must be a range (low, high) or a list of levels, not {short_repr(given)}"
+            f"the levels of {name!r} must have an order, as in a list: {short_repr(values)} has none"
         )
-    levels = tuple(value.item() if isinstance(value, np.generic) else value for value in given)
+    if isinstance(values, (str, bytes, Mapping)) or not isinstance(values, Iterable):
+        raise OptionValueError(
+            f"the factor {name!r} must be a range (low, high) or a list of levels, not {short_repr(values)}"
+        )
+    levels = tuple(value.item() if isinstance(value, np.generic) else value for value in values)
     if not levels:
         raise OptionValueError(f"the factor {name!r} has no levels")
     for place, level in enumerate(levels):
-        if any(level is other or (type(level) is type(other) and _same(level, other)) for other in levels[:place]):
+        if any(_is_same(level, other) for other in levels[:place]):
             raise OptionValueError(f"the factor {name!r} has the level {short_repr(level)} twice")
     return Factor(name, levels)
 
 
-def _same(one: Any, other: Any) -> bool:
+def _is_same(one: Any, other: Any) -> bool:
     try:
-        return bool(one == other)
+        return one is other or (type(one) is type(other) and bool(one == other))
     except Exception:  # for example of arrays
         return False
 
 
 def _dtype(factor: Factor) -> Any:
     """Return the dtype of a factor's column."""
-    kinds = {int if factor.whole else float} if factor.levels is None else set(map(type, factor.levels))
-    if kinds == {str}:
-        return "str"
+    values = factor.levels or (factor.low, factor.high)
+    kinds = set(map(type, values))
     if kinds == {int}:
-        bounds = factor.levels or (factor.low, factor.high)
-        return np.int64 if all(-(2**63) <= value < 2**63 for value in bounds) else object
-    return np.float64 if kinds == {float} else np.bool_ if kinds == {bool} else object
+        return np.int64 if all(-(2**63) <= value < 2**63 for value in values) else object
+    return {str: "str", float: np.float64, bool: np.bool_}.get(kinds.pop(), object) if len(kinds) == 1 else object
 
 
 # -- methods: the columns of a design -------------------------------------------------------------
 
-Columns = list[list[Any]]
+Columns = Sequence[Sequence[Any]]
 
 
 def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
@@ -194,8 +186,7 @@ def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Colu
         raise OptionValueError("a full factorial design takes n values of each range; n must be at least 2")
     steps = [factor.steps(n or 2) for factor in factors]
     _checked_rows(prod(map(len, steps)))
-    places = import_extra("pydoe", "design").fullfact([len(own) for own in reversed(steps)])[:, ::-1].astype(int)
-    return [[own[place] for place in column] for own, column in zip(steps, places.T.tolist(), strict=True)]
+    return list(zip(*product(*steps), strict=True))
 
 
 def _of_two_levels(factors: Sequence[Factor], matrix: Any) -> Columns:
@@ -208,8 +199,6 @@ def _of_two_levels(factors: Sequence[Factor], matrix: Any) -> Columns:
 
 def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     pydoe, number = import_extra("pydoe", "design"), len(factors)
-    for factor in factors:
-        factor.ends()
     least = 2 ** ceil(np.log2(number + 1))
     if n is None:
         n = least
@@ -226,9 +215,8 @@ def _fractional_factorial(factors: Sequence[Factor], n: int | None, seed: int) -
 def _generators(basic: int, number: int) -> str:
     """Return the generators of a fractional design, chosen so that low-order effects are confounded least.
 
-    Args:
-        basic: The number of factors that have all their combinations.
-        number: The number of factors. Columns are bits: the product of two columns is their exclusive or.
+    ``basic`` of the ``number`` factors have all their combinations. Columns are bits: the product of two columns is
+    their exclusive or.
     """
     columns: list[int] = []
     for resolution in range(min(basic + 1, 8), 2, -1):
@@ -255,16 +243,11 @@ def _extend(sums: list[set[int]], column: int) -> None:
 
 def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     pydoe, number = import_extra("pydoe", "design"), len(factors)
-    for factor in factors:
-        factor.ends()
-    matrix = None
     for columns in range(number, number + 8):  # pyDOE lacks some sizes; the next one may exist
-        try:
+        with suppress(ValueError):
             matrix = pydoe.pbdesign(columns)[:, :number]
-        except ValueError:
-            continue
-        break
-    if matrix is None:
+            break
+    else:
         raise OptionValueError(f"no Plackett-Burman design of {number} factors is known")
     if n is not None and n != len(matrix):
         raise OptionValueError(f"a Plackett-Burman design of {number} factors has {len(matrix)} runs, not {n}")
@@ -283,10 +266,10 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
         raise OptionValueError(f"a central composite design of these {len(factors)} factors has {rows} runs, not {n}")
     # The centre occurs once: a simulation with the same seed would have the same result.
     matrix = iter(pydoe.ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T)
-    columns: Columns = []
+    columns = []
     for place, factor in enumerate(factors):
         if factor.levels is None:
-            columns.append(factor.placed((next(matrix) + 1) / 2) * (rows // number))
+            columns.append(factor.scale((next(matrix) + 1) / 2) * (rows // number))
         else:
             each = [level for level in factor.levels for _ in range(number * prod(sizes[place + 1 :]))]
             columns.append(each * prod(sizes[:place]))
@@ -320,11 +303,11 @@ def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
 def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     if n == 1:
         raise OptionValueError("a design of one factor at a time takes n values of each range; n must be at least 2")
-    middle = [f.levels[0] if f.levels is not None else f.placed(np.array([0.5]))[0] for f in factors]
+    middle = [f.levels[0] if f.levels is not None else f.scale(np.array([0.5]))[0] for f in factors]
     rows = [middle]
     for place, factor in enumerate(factors):
         for value in factor.steps(n or 2):
-            if value is not middle[place] and not (type(value) is type(middle[place]) and _same(value, middle[place])):
+            if not _is_same(value, middle[place]):
                 rows.append([*middle[:place], value, *middle[place + 1 :]])
     return [list(column) for column in zip(*rows, strict=True)]
 
@@ -348,13 +331,9 @@ def _spread(factors: Sequence[Factor], points: Any) -> Columns:
 
 
 METHODS: Final[Mapping[str, Callable[[Sequence[Factor], int | None, int], Columns]]] = {
-    "full_factorial": _full_factorial,
-    "fractional_factorial": _fractional_factorial,
-    "latin_hypercube": _latin_hypercube,
-    "sobol": _sobol,
-    "halton": _halton,
-    "plackett_burman": _plackett_burman,
-    "central_composite": _central_composite,
-    "one_at_a_time": _one_at_a_time,
-    "saltelli": _saltelli,
-}
+    method.__name__[1:]: method
+    for method in (
+        _full_factorial, _fractional_factorial, _latin_hypercube, _sobol, _halton, _plackett_burman,
+        _central_composite, _one_at_a_time, _saltelli,
+    )
+}  # fmt: skip

@@ -1,8 +1,11 @@
 """Compares contenders on the same seeds, with confidence intervals."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import warnings
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf, isfinite, nan
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
 import numpy as np
@@ -14,26 +17,21 @@ from ..core.points import Points
 from ..core.processes import pack
 from ..core.reuse import processes_kept
 from ..errors import OptionValueError, did_you_mean, short_repr
-from ..many.simulate import check_numbers, checked_seeds
 from ..many.spread import import_extra, progress_bar, spread
-from .playing import (
+from .runner import (
+    RUN_COLUMNS,
+    STATUS_COLUMNS,
     TEAM,
-    Metrics,
     Outcome,
     Policies,
     Returns,
+    Runner,
     checked_contenders,
-    checked_metrics,
-    checked_options,
-    checked_team,
-    contender_plan,
-    play,
-    play_many,
-    points_of,
-    team_value,
-    telling,
+    distinct_seeds,
+    make_runner,
+    make_table,
+    noting,
 )
-from .statistics import check_confidence, check_number, improvement, interval, numbers, seeds_needed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -43,6 +41,18 @@ __all__ = ["Evaluation", "evaluate"]
 
 FIRST: Final = 16
 """The number of seeds before the first check of the intervals' width: intervals of fewer seeds are unreliable."""
+
+RESAMPLES: Final = 5_000
+"""The number of bootstrap samples for an interval; always the same samples, for reproducible intervals."""
+
+CORRECTED: Final = 10_000
+"""The largest number of values with bias correction: it needs one mean per value, and has no effect on more values."""
+
+AT_ONCE: Final = 4_000_000
+"""The number of values that are drawn at once."""
+
+MOST_SEEDS: Final = 10_000_000
+"""A difference that needs more seeds than this counts as none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +66,9 @@ class Evaluation:
             rows of an episode.
         baseline: The contender that all others are compared with, or None.
         confidence: The confidence level of the intervals.
+
+    In all methods, ``metric`` is ``"return"``, ``"length"`` or the name of a metric; another one is an
+    ``OptionValueError``.
     """
 
     frame: "DataFrame"
@@ -66,71 +79,48 @@ class Evaluation:
         values = self.values()
         return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
 
-    def values(self, of: str = "return") -> "DataFrame":
-        """Return the team's values: one row for each seed, one column for each contender.
-
-        Args:
-            of: ``"return"``, ``"length"`` or the name of a metric.
-
-        Raises:
-            OptionValueError: There is no such column.
-        """
-        if of not in self.frame.columns or of in ("contender", "seed", "agent"):
-            known = list(self.frame.columns[3:])
-            raise OptionValueError(
-                f"of={short_repr(of)} is not a column of numbers; these are: {known}{did_you_mean(of, known)}"
-            )
+    def values(self, metric: str = "return") -> "DataFrame":
+        """Return the team's values: one row for each seed, one column for each contender."""
+        check_metric(metric, self.frame.columns)
         team = self.frame[self.frame["agent"] == TEAM]
-        names = list(dict.fromkeys(team["contender"]))
-        seeds = list(dict.fromkeys(team["seed"]))
-        return team.pivot(index="seed", columns="contender", values=of).loc[seeds, names]
+        return team.pivot(index="seed", columns="contender", values=metric).loc[
+            team["seed"].unique(), team["contender"].unique()
+        ]
 
-    def summary(self, of: str = "return") -> "DataFrame":
+    def summary(self, metric: str = "return") -> "DataFrame":
         """Return the mean of the team's values for each contender, with its confidence interval.
-
-        Args:
-            of: ``"return"``, ``"length"`` or the name of a metric.
 
         Returns:
             A table indexed by contender, with the columns ``mean``, ``low`` and ``high``. With a baseline also
             ``difference``, ``difference_low`` and ``difference_high``: the mean paired difference from the baseline on
             the same seeds.
-
-        Raises:
-            OptionValueError: There is no such column.
         """
-        pandas, values, rows = import_extra("pandas", "summary"), numbers(self.values(of), of), {}
-        for name in values.columns:
-            own = values[name].to_numpy()
-            rows[name] = [own.mean(), *interval(own, self.confidence)]
-            if self.baseline is not None:
-                apart = own - values[self.baseline].to_numpy()
-                rows[name] += [apart.mean(), *interval(apart, self.confidence)]
+        values = self._numbers(metric)
         columns = ["mean", "low", "high"]
+        rows = {name: [own.mean(), *interval(own, self.confidence)] for name, own in values.items()}
         if self.baseline is not None:
             columns += ["difference", "difference_low", "difference_high"]
-        table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=columns)
-        return table.rename_axis("contender")
+            for name, own in values.items():
+                difference = own - values[self.baseline]
+                rows[name] += [difference.mean(), *interval(difference, self.confidence)]
+        return _by_contender(rows, columns)
 
-    def improvement(self, of: str = "return") -> "DataFrame":
+    def improvement(self, metric: str = "return") -> "DataFrame":
         """Estimate the probability that a contender has a higher value than the baseline on a seed. Ties count half.
-
-        Args:
-            of: ``"return"``, ``"length"`` or the name of a metric.
 
         Returns:
             A table indexed by contender, with the columns ``probability``, ``low`` and ``high``.
 
         Raises:
-            OptionValueError: There is no baseline, or no such column.
+            OptionValueError: There is no baseline.
         """
-        pandas, rows = import_extra("pandas", "improvement"), {}
-        for name, apart in self._differences(of).items():
-            rows[name] = improvement(apart, self.confidence)
-        table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=["probability", "low", "high"])
-        return table.rename_axis("contender")
+        rows = {}
+        for name, difference in self._differences(metric).items():
+            better = np.where(np.isnan(difference), nan, (np.sign(difference) + 1) / 2)
+            rows[name] = [better.mean(), *interval(better, self.confidence)]
+        return _by_contender(rows, ["probability", "low", "high"])
 
-    def seeds_needed(self, difference: float, *, power: float = 0.8, of: str = "return") -> "Series[float]":
+    def seeds_needed(self, difference: float, *, power: float = 0.8, metric: str = "return") -> "Series[float]":
         """Estimate the number of seeds that would detect a difference from the baseline.
 
         The estimate uses the variance on the present seeds.
@@ -138,53 +128,68 @@ class Evaluation:
         Args:
             difference: The mean difference to detect.
             power: The probability of detecting it. 0.8 is four times out of five.
-            of: ``"return"``, ``"length"`` or the name of a metric.
+            metric: The name of the value.
 
         Returns:
             The number of seeds by contender (by the paired t-test, at ``confidence``); infinity if no number of seeds
             is large enough.
 
         Raises:
-            OptionValueError: There is no baseline or no such column, or an argument has an invalid value.
+            OptionValueError: There is no baseline, or an argument has an invalid value.
         """
-        check_number("difference", difference)
-        check_number("power", power)
+        _check_number("difference", difference)
+        check_probability("power", power, 0.8)
         if difference == 0:
             raise OptionValueError("difference must not be 0: no number of seeds is enough to detect that")
-        if not 0 < power < 1:
-            raise OptionValueError(f"power must lie between 0 and 1, such as 0.8, not {short_repr(power)}")
-        apart = self._differences(of)
-        found = {name: seeds_needed(own, difference, self.confidence, power) for name, own in apart.items()}
-        counts: Series[float] = import_extra("pandas", "seeds_needed").Series(found, name="seeds", dtype=float)
-        return counts.rename_axis("contender")
+        rows = {
+            name: [seeds_needed(own, difference, self.confidence, power)]
+            for name, own in self._differences(metric).items()
+        }
+        return _by_contender(rows, ["seeds"])["seeds"]
 
-    def _differences(self, of: str) -> dict[str, NDArray[np.float64]]:
-        if self.baseline is None:
-            raise OptionValueError("there is no baseline to compare with; give evaluate a baseline=")
-        values = numbers(self.values(of), of)
-        base = values[self.baseline].to_numpy()
-        return {name: values[name].to_numpy() - base for name in values.columns if name != self.baseline}
-
-    def plot(self, of: str = "return", *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
+    def plot(self, metric: str = "return", *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw each seed as a line across the contenders and, with a baseline, the difference on each seed.
 
         Args:
-            of: ``"return"``, ``"length"`` or the name of a metric.
+            metric: The name of the value.
             figure: The figure to draw in. None: a new figure.
 
         Returns:
             The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
 
         Raises:
-            OptionValueError: There is no such column.
             MissingExtraError: Matplotlib is missing.
         """
-        from .pictures import draw_pairs
+        from .figures import draw_evaluation
 
-        drawn: Figure | SubFigure = draw_pairs(
-            numbers(self.values(of), of), self.summary(of), self.baseline, of, figure
+        result: Figure | SubFigure = draw_evaluation(
+            numbers(self.values(metric), metric), self.summary(metric), self.baseline, metric, figure
         )
-        return drawn
+        return result
+
+    def _numbers(self, metric: str) -> dict[str, NDArray[np.float64]]:
+        """Return the team's values by contender, in the order of the seeds."""
+        return {name: own.to_numpy() for name, own in numbers(self.values(metric), metric).items()}
+
+    def _differences(self, metric: str) -> dict[str, NDArray[np.float64]]:
+        """Return the differences from the baseline, by other contender."""
+        if self.baseline is None:
+            raise OptionValueError("there is no baseline to compare with; give evaluate a baseline=")
+        values = self._numbers(metric)
+        base = values.pop(self.baseline)
+        return {name: own - base for name, own in values.items()}
+
+    def _widest(self) -> float:
+        """Return the width of the widest interval of a difference or, without a baseline, of a mean; nan if unknown."""
+        samples = self._numbers("return") if self.baseline is None else self._differences("return")
+        bounds = [interval(own, self.confidence) for own in samples.values()]
+        return float(np.max([high - low for low, high in bounds], initial=0.0))
+
+
+def _by_contender(rows: Mapping[str, Iterable[float]], columns: list[str]) -> "DataFrame":
+    pandas = import_extra("pandas", "a table")
+    table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=columns, dtype=float)
+    return table.rename_axis("contender")
 
 
 def evaluate(
@@ -240,170 +245,61 @@ def evaluate(
             contender and the seed.
     """
     import_extra("pandas", "evaluate"), import_extra("scipy.stats", "evaluate")
-    found = checked_contenders(contenders, batched=bool(batched))
-    _check(found, baseline, confidence, width, team)
-    places = distinct_seeds(seeds)
-    check_numbers(batch_size, workers)
-    chosen = checked_options(options)
-    metrics, size = checked_metrics(metric), int(batch_size) if batched else 0
-    points = list(points) if isinstance(points, Iterator) else points
-    common = (simulation, points, chosen, points_of(found), metrics, size, team)
-    plans = _plans(found, *common[:4])  # made here even if workers do the work, so that errors come first
+    by_name = checked_contenders(contenders, batched=bool(batched))
+    _check(by_name, baseline, confidence, width)
+    all_seeds = distinct_seeds(seeds)
+    runner = make_runner(
+        by_name, points, options, metric, team, batch_size=batch_size, batched=bool(batched), workers=workers
+    )
+    # Plans are made and pickled here even if workers do the work, so that errors come first.
+    plans = {name: runner.plan(simulation, name) for name in by_name}
     if workers:
-        pack((found, common))  # so do errors of pickling
-
-    def play(name: str, lot: list[int]) -> list[Outcome]:
-        if workers:
-            return _spread(({name: found[name]}, *common), lot, int(workers), size)
-        return _play(plans[name], lot, metrics, size, team)
-
-    def is_narrow(outcomes: Mapping[str, Sequence[Outcome]]) -> bool:
-        return width is not None and _widest(outcomes, team, baseline, confidence) <= width
-
-    with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar, processes_kept():
-        outcomes = _play_all(list(found), places, width, play, is_narrow, bar)
-    done = len(next(iter(outcomes.values())))
-    return Evaluation(_frame(places[:done], outcomes, tuple(metrics), team), baseline, float(confidence))
-
-
-def _play_all(
-    names: list[str],
-    places: list[int],
-    width: float | None,
-    play: Callable[[str, list[int]], list[Outcome]],
-    is_narrow: Callable[[Mapping[str, Sequence[Outcome]]], bool],
-    bar: Any,
-) -> dict[str, list[Outcome]]:
-    """Have these contenders play, one lot of seeds after the other, until the intervals are narrow enough."""
-    outcomes: dict[str, list[Outcome]] = {name: [] for name in names}
+        pack((simulation, runner))
+    columns, rows = (*RUN_COLUMNS, *runner.metrics), {name: list[Any]() for name in by_name}
     done = 0
-    while done < len(places):
-        lot = places[done : _next(done, len(places), width)]
-        for name, known in outcomes.items():
-            with telling(name):
-                known += play(name, lot)
-            if bar is not None:
-                bar.update(len(lot))
-        done += len(lot)
-        if done >= FIRST and is_narrow(outcomes):
-            break
-    return outcomes
+    with progress_bar(len(plans) * len(all_seeds), "episode") if progress else nullcontext() as bar, processes_kept():
+        while True:
+            batch = all_seeds[done : _next_check(done, len(all_seeds), width)]
+            for name, plan in plans.items():
+                with noting(f"of the contender {name!r}"):
+                    rows[name] += _run(simulation, runner, name, plan, batch, int(workers))
+                if bar is not None:
+                    bar.update(len(batch))
+            done += len(batch)
+            table = make_table(columns, [row for own in rows.values() for row in own])
+            evaluation = Evaluation(table, baseline, float(confidence))
+            if done == len(all_seeds) or (width is not None and done >= FIRST and evaluation._widest() <= width):
+                return evaluation
 
 
-def _next(done: int, number: int, width: float | None) -> int:
+def _next_check(done: int, number: int, width: float | None) -> int:
     """Return the number of seeds before the next check of the intervals; each check takes time, too."""
     return number if width is None else min(number, max(FIRST, done + max(4, done // 8)))
 
 
-def _widest(outcomes: Mapping[str, Sequence[Outcome]], team: Any, baseline: str | None, confidence: float) -> float:
-    values = {
-        name: np.array([team_value(team, outcome.returns) for outcome in known]) for name, known in outcomes.items()
-    }
-    if baseline is not None:
-        base = values.pop(baseline)
-        values = {name: own - base for name, own in values.items()}
-    bounds = [interval(own, confidence) for own in values.values()]
-    return float(np.max([high - low for low, high in bounds], initial=0.0))  # nan if one of them is nan
+def _run(simulation: Any, runner: Runner, name: str, plan: Plan, seeds: list[int], workers: int) -> list[Any]:
+    """Run a contender's episodes, here or in workers, and return the rows of the table."""
+    if not workers:
+        return _run_part(simulation, runner, name, seeds, plan)
+    only = replace(runner, contenders={name: runner.contenders[name]})
+    parts = spread(_run_part, (simulation, only, name), seeds, workers, runner.batch_size)
+    return [row for _, part in parts for row in part]
 
 
-def _plans(
-    contenders: Mapping[str, Policies], simulation: Any, points: Any, options: Mapping[str, Any], named: Sequence[Any]
-) -> dict[str, Plan]:
-    plans = {}
-    for name, policies in contenders.items():
-        with telling(name):
-            plans[name] = contender_plan(simulation, policies, points, options, named)
-    return plans
+def _run_part(simulation: Any, runner: Runner, name: str, seeds: list[int], plan: Plan | None = None) -> list[Any]:
+    """Run a part of a contender's episodes. Without a plan, in a worker, one is made."""
+    rows: dict[int, list[Any]] = {}
 
+    def report(seed: int, outcome: Outcome) -> None:
+        rows[seed] = [(name, seed, *row) for row in runner.rows(outcome)]
 
-def _spread(arguments: tuple[Any, ...], seeds: list[int], workers: int, size: int) -> list[Outcome]:
-    """Play the episodes of a contender in workers."""
-    return [outcome for _, part in spread(_play_part, arguments, seeds, workers, size) for outcome in part]
-
-
-def _play_part(
-    contender: Mapping[str, Policies],
-    simulation: Any,
-    points: Any,
-    options: Mapping[str, Any],
-    named: Sequence[Any],
-    metrics: Metrics,
-    size: int,
-    team: Any,
-    seeds: list[int],
-) -> list[Outcome]:
-    """Play a part of a contender's episodes, in a worker."""
-    (plan,) = _plans(contender, simulation, points, options, named).values()
     with processes_kept():
-        return _play(plan, seeds, metrics, size, team)
+        runner.run(plan or runner.plan(simulation, name), seeds, report)
+    return [row for seed in seeds for row in rows[seed]]
 
 
-def _play(plan: Plan, seeds: Sequence[int], metrics: Metrics, size: int, team: Any) -> list[Outcome]:
-    """Play episodes of a contender: ``size`` of them at once, or one by one if ``size`` is 0."""
-    if not size:
-        return [play(plan, seed, metrics, team) for seed in seeds]
-    outcomes: dict[int, Outcome] = {}
-    play_many(plan, seeds, size, metrics, outcomes.__setitem__, team)
-    return [outcomes[place] for place in range(len(seeds))]
-
-
-def _frame(seeds: Sequence[int], outcomes: Mapping[str, Sequence[Outcome]], metrics: Sequence[str], team: Any) -> Any:
-    columns: dict[str, list[Any]] = {name: [] for name in ("contender", "seed", "agent", "return", "length", *metrics)}
-    for contender, known in outcomes.items():
-        for seed, outcome in zip(seeds, known, strict=True):
-            for row in rows_of(outcome, team):
-                values = (contender, seed, *row, *outcome.metrics.values())
-                for column, value in zip(columns.values(), values, strict=True):
-                    column.append(value)
-    return typed(columns)
-
-
-def typed(columns: Mapping[str, Sequence[Any]]) -> "DataFrame":
-    """Return a table whose columns keep the types of their values. A numeric column with missing values is float."""
-    pandas = import_extra("pandas", "a table")
-    table: DataFrame = pandas.DataFrame(
-        {name: pandas.Series(values, dtype=_dtype(values)) for name, values in columns.items()}
-    )
-    return table
-
-
-def _dtype(values: Sequence[Any]) -> Any:
-    kinds = {type(value) for value in values}
-    if kinds <= {int} and all(-(2**63) <= value < 2**63 for value in values):
-        return np.int64
-    if kinds == {bool}:
-        return np.bool_
-    if kinds <= {int, float, type(None)} and kinds & {int, float}:
-        exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
-        return np.float64 if exact else object
-    return object if kinds != {str} else "str"
-
-
-def rows_of(outcome: Outcome, team: Any) -> list[tuple[str, float, int]]:
-    """Return agent, return and length for each agent and for the team."""
-    rows = [(agent, value, outcome.lengths[agent]) for agent, value in outcome.returns.items()]
-    return [*rows, (TEAM, team_value(team, outcome.returns), sum(outcome.lengths.values()))]
-
-
-# -- what is checked before anything runs ---------------------------------------------------------
-
-
-def distinct_seeds(given: Iterable[int]) -> list[int]:
-    """Return the seeds as a list; there is at least one, and all are different.
-
-    Raises:
-        OptionValueError: There are none, or one of them is repeated.
-    """
-    seeds = checked_seeds(given)
-    if not seeds:
-        raise OptionValueError("seeds must be integers, such as range(32), but there are none")
-    twice = next((seed for seed in seeds if seeds.count(seed) > 1), None) if len(set(seeds)) < len(seeds) else None
-    if twice is not None:
-        raise OptionValueError(f"the seed {twice} occurs twice: its result would be counted twice")
-    return seeds
-
-
-def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: Any) -> None:
+def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
+    """Check arguments that ``run_experiment`` does not have."""
     if not contenders:
         raise OptionValueError("contenders must be a dict, such as {'rule': {}}, but there are none")
     if baseline is not None and baseline not in list(contenders):
@@ -411,9 +307,83 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any, team: An
             f"the baseline {short_repr(baseline)} is not one of the contenders:"
             f" {', '.join(contenders)}{did_you_mean(baseline, contenders)}"
         )
-    check_confidence(confidence)
+    check_probability("confidence", confidence, 0.95)
     if width is not None:
-        check_number("width", width)
+        _check_number("width", width)
         if width <= 0:
             raise OptionValueError(f"width must be positive, not {short_repr(width)}")
-    checked_team(team)
+
+
+# -- statistics -----------------------------------------------------------------------------------
+
+
+def check_metric(metric: Any, columns: Iterable[str]) -> None:
+    """Check that a metric is one of the columns of a table, and does not say which run it is."""
+    names = [name for name in columns if name not in (*RUN_COLUMNS[:3], *STATUS_COLUMNS)]
+    if metric not in names:
+        raise OptionValueError(
+            f"metric={short_repr(metric)} is not a column of numbers; these are: {names}{did_you_mean(metric, names)}"
+        )
+
+
+def numbers(values: Any, metric: str) -> Any:
+    """Return a ``DataFrame`` or ``Series`` as floats; nan where a value is missing."""
+    try:
+        return values.astype(np.float64)
+    except (TypeError, ValueError):
+        raise OptionValueError(f"metric={short_repr(metric)} is not a column of numbers") from None
+
+
+def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:
+    """Return a confidence interval of the mean, by SciPy's bootstrap (BCa, or percentile for very many values).
+
+    The bounds are nan if there are fewer than two values, or one that is not finite.
+    """
+    stats = import_extra("scipy.stats", "an interval")
+    if len(values) < 2 or not np.isfinite(values).all():
+        return nan, nan
+    if (values == values[0]).all():
+        return float(values[0]), float(values[0])
+    batch = max(1, min(500, AT_ONCE // len(values)))
+    for method in ("BCa", "percentile")[len(values) > CORRECTED :]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about degenerate samples, which the other method handles
+            bounds = stats.bootstrap(
+                (values,), np.mean, confidence_level=confidence, n_resamples=RESAMPLES, batch=batch, method=method,
+                vectorized=True, rng=np.random.default_rng(0),
+            ).confidence_interval  # fmt: skip
+        low, high = float(bounds.low), float(bounds.high)
+        if isfinite(low) and isfinite(high):
+            break
+    return low, high
+
+
+def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
+    """Return the number of seeds that detects a mean difference, by the paired t-test.
+
+    The number is infinity if it is too large, and nan if there are fewer than two differences on present seeds, which
+    give the variance.
+    """
+    stats = import_extra("scipy.stats", "the number of seeds")
+    if len(differences) < 2 or not np.isfinite(differences).all():
+        return nan
+    ratio = float(np.std(differences, ddof=1)) / abs(difference)
+
+    def is_enough(number: int) -> bool:
+        quantiles: Any = stats.t.ppf([1 - (1 - confidence) / 2, power], number - 1)
+        return bool(number >= (quantiles.sum() * ratio) ** 2)
+
+    number = 2 + bisect_left(range(2, MOST_SEEDS + 1), True, key=is_enough)
+    return float(number) if number <= MOST_SEEDS else inf
+
+
+def _check_number(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not isfinite(value):
+        raise OptionValueError(f"{name} must be a finite number, not {short_repr(value)}")
+
+
+def check_probability(name: str, value: Any, example: float) -> None:
+    """Check that an argument is a number between 0 and 1."""
+    _check_number(name, value)
+    if not 0 < value < 1:
+        raise OptionValueError(f"{name} must lie between 0 and 1, such as {example}, not {short_repr(value)}")

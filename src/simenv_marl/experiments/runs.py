@@ -2,42 +2,39 @@
 
 import json
 import os
-import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext, suppress
-from functools import partial
-from itertools import groupby
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing, nullcontext
+from dataclasses import replace
+from functools import partial, wraps
+from itertools import groupby, product
+from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from ..core.options import EpisodeOptions
+from ..core.plan import Plan
 from ..core.points import Points
 from ..core.processes import pack
+from ..core.provenance import as_json, describe, source_name
 from ..core.reuse import processes_kept
 from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
-from ..many.simulate import check_numbers
 from ..many.spread import import_extra, progress_bar, spread
-from .evaluation import distinct_seeds, rows_of, typed
-from .playing import (
-    COLUMNS,
+from .runner import (
+    RUN_COLUMNS,
+    STATUS_COLUMNS,
     TEAM,
-    Metrics,
-    Outcome,
     Policies,
     Returns,
+    Runner,
     checked_contenders,
-    checked_metrics,
-    checked_options,
-    checked_team,
-    play,
-    play_many,
-    points_of,
+    distinct_seeds,
+    make_runner,
+    make_table,
+    plain_value,
 )
-from .store import Known, Stored, Writer, compare, line_of, new_session, prepare, read, warn_of_changes, written
-from .workshop import Row, Workshop, checked_make
+from .store import Provenance, Result, Run, Store, Writer, check_rows, new_session, to_json, warn_of_changes
+from .variants import Variant, check_call
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -55,28 +52,14 @@ TRIED: Final = 10
 
 LONGEST_TRACE: Final = 4000
 
-
-class Run(NamedTuple):
-    """A run.
-
-    Attributes:
-        row: The factors.
-        key: The factors as JSON.
-        contender: The name of the contender.
-        seed: The seed of the simulation.
-    """
-
-    row: Row
-    key: str
-    contender: str
-    seed: int
+LOST: Final = "it did not come to its end: the worker process that ran it has ended"
 
 
 def run_experiment(
     make: Any,
     design: Any,
     *,
-    policies: Mapping[str, Policies] | None = None,
+    contenders: Mapping[str, Policies] | None = None,
     seeds: Iterable[int],
     points: Points = None,
     metric: Any = None,
@@ -98,7 +81,7 @@ def run_experiment(
         make: A callable that gets the factors of a row as keyword arguments and returns a simulation or a ``Variant``;
             or a ``Variant``, whose parameters the factors become. It is called anew for each run.
         design: One row for each combination of factors, as ``design`` makes it: a ``DataFrame``, or data for one.
-        policies: Contenders besides ``"rule"``, the model as it is: a dict from a name to policies for ``simulate``.
+        contenders: Contenders besides ``"rule"``, the model as it is: a dict from a name to policies for ``simulate``.
         seeds: The seeds of the simulations, all different.
         points: The decision points, as ``generate_env`` takes them.
         metric: As ``evaluate`` takes it.
@@ -124,89 +107,46 @@ def run_experiment(
         SimEnvError: Something else cannot work. The subclass tells what.
     """
     import_extra("pandas", "run_experiment")
-    contenders = _contenders(policies, batched=bool(batched))
-    table, rows = checked_design(design)
-    metrics, size = checked_metrics(metric, list(table.columns)), int(batch_size) if batched else 0
-    places = distinct_seeds(seeds)
-    _check(make, rows, batch_size, workers, team)
-    chosen = checked_options(options)
-    points = list(points) if isinstance(points, Iterator) else points
-    workshop = (make, contenders, points, chosen, points_of(contenders))
-    folder, keys, factors = _folder(store), [written(row) for row in rows], list(table.columns)
-    trying = Workshop(*workshop)
-    tried = _try(trying, rows, contenders)
-    arguments = (*workshop, metrics, size, folder, new_session())
-    if workers:
-        pack(arguments)  # errors of pickling come before any run
-    prepare(folder, factors, list(metrics))
-    stored = _compared(folder, factors, keys, rows, tried, partial(_try, trying, contenders=contenders))
-    missing = list(_missing(rows, keys, contenders, places, stored, retry=retry_errors))
-    total = len(set(keys)) * len(contenders) * len(places) if progress else None
-    _run_missing(arguments, missing, int(workers), len(places) if batched else 1, total)
-    return _frame(table, keys, list(contenders), places, read(folder, factors), list(metrics), team)
-
-
-def _compared(
-    folder: Path,
-    factors: list[str],
-    keys: list[str],
-    rows: Sequence[Row],
-    tried: Any,
-    trying: Callable[[list[Row]], Any],
-) -> Stored:
-    """Return the stored runs, after checks that they belong to this experiment; warn of changes since then.
-
-    Args:
-        folder: The folder of the store.
-        factors: The names of the factors.
-        keys: The keys of the rows, as they are stored.
-        rows: All rows.
-        tried: The row of which a simulation was made, and its provenance.
-        trying: A callable that does the same for other rows.
-    """
-    stored = read(folder, factors, tried[0])
-    compare(folder, stored, keys)
-    if tried[0] not in stored.rows:  # so that stored runs are compared with what they would be made of now
-        with suppress(SimEnvError):  # making this row's simulation failed
-            tried = trying([row for row, key in zip(rows, keys, strict=True) if key in stored.rows])
-        stored = read(folder, factors, tried[0])
-    warn_of_changes(folder, stored, tried[1])
-    return stored
-
-
-def _run_missing(arguments: Any, missing: list[Run], workers: int, at_once: int, total: int | None) -> None:
-    """Do the missing runs, with a progress bar if ``total`` is given."""
-    with nullcontext() if total is None else progress_bar(total, "run", total - len(missing)) as bar, processes_kept():
-        for number in _work(arguments, missing, workers, at_once):
-            if bar is not None:
-                bar.update(number)
-
-
-# -- what is checked before anything runs ---------------------------------------------------------
-
-
-def _check(make: Any, rows: Any, batch_size: Any, workers: Any, team: Any) -> None:
-    check_numbers(batch_size, workers)
-    checked_team(team)
-    for row in rows[:1]:
-        checked_make(make, row)
-
-
-def _contenders(policies: Any, *, batched: bool) -> dict[str, Policies]:
-    found = checked_contenders(policies or {}, "policies", batched=batched)
-    if found.pop(BY_RULE, {}):
+    by_name = checked_contenders(contenders or {}, batched=bool(batched))
+    if by_name.pop(BY_RULE, {}):
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another name"
         )
-    return {BY_RULE: {}, **found}
+    by_name = {BY_RULE: {}, **by_name}
+    table, rows = _checked_design(design)
+    keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
+    runner = make_runner(
+        by_name, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
+        factors=list(table.columns),
+    )  # fmt: skip
+    _check_make(make, rows[0])
+    storage = Store(_checked_folder(store), list(table.columns), list(runner.metrics))
+    stored = storage.read(keys)
+    check_rows(storage, stored, keys)
+    work = make, runner, storage.folder, new_session()
+    if workers:
+        pack(work)  # errors of pickling come before any run, and so do those of contenders
+    row, provenances = _try_contenders(make, runner, sorted(keys, key=lambda key: key != stored.sample))
+    storage.create()
+    warn_of_changes(storage, stored, row, provenances)
+    finished = {run for run, result in stored.runs.items() if not (retry_errors and isinstance(result, str))}
+    runs = list(product(dict.fromkeys(keys), by_name, all_seeds))  # a row that occurs twice has the same results
+    missing = [run for run in runs if run not in finished]
+    with progress_bar(len(runs), "run", len(runs) - len(missing)) if progress else nullcontext() as bar:
+        if workers and missing:
+            for number, _ in spread(_run_part, work, missing, int(workers), len(all_seeds) if batched else 1, SHARE):
+                if bar is not None:
+                    bar.update(number)
+        elif missing:
+            _run_part(*work, missing, bar)
+    return _make_frame(table, keys, all_seeds, storage.read(keys).runs, runner)
 
 
-def checked_design(design: Any) -> "tuple[DataFrame, list[Row]]":
-    """Return a design as a table, and its rows as JSON values.
+# -- checks before anything runs ------------------------------------------------------------------
 
-    Raises:
-        OptionValueError: It is not a design.
-    """
+
+def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
+    """Return a design as a table, and its rows as values for JSON."""
     pandas = import_extra("pandas", "a design")
     try:
         table = design if isinstance(design, pandas.DataFrame) else pandas.DataFrame(design)
@@ -218,232 +158,136 @@ def checked_design(design: Any) -> "tuple[DataFrame, list[Row]]":
     for name in names:
         if not isinstance(name, str):
             raise OptionValueError(f"the name of a factor must be a string, not {short_repr(name)}")
-        if name in COLUMNS:
+        if name in (*RUN_COLUMNS, *STATUS_COLUMNS):
             raise OptionValueError(f"the factor {name!r} has the name of another column of the table; rename it")
         if names.count(name) > 1:
             raise OptionValueError(f"the factor {name!r} occurs twice")
     if not len(table):
         raise OptionValueError("the design has no rows")
-    columns = {name: [_plain(name, value) for value in table[name].tolist()] for name in names}
-    return table, [{name: columns[name][place] for name in names} for place in range(len(table))]
+    advice = "; other values cannot be stored: use a name as the value, and look it up in make"
+    levels = {name: [plain_value(f"the factor {name!r}", value, advice) for value in table[name]] for name in names}
+    return table, [{name: levels[name][place] for name in names} for place in range(len(table))]
 
 
-def _plain(name: str, value: Any) -> Any:
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is not None and type(value) not in (bool, int, float, str):
-        raise OptionValueError(
-            f"the factor {name!r} has the value {short_repr(value)}, which cannot be stored: factors"
-            " are numbers, strings,"
-            " bools or None. Use a name as the value, and look it up in make"
-        )
-    return value
-
-
-def _folder(store: Any) -> Path:
+def _checked_folder(store: Any) -> Path:
     try:
         return Path(store).absolute()  # other processes may have another working directory
     except TypeError as error:
         raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
 
 
-def _try(workshop: Workshop, rows: Sequence[Row], contenders: Iterable[str]) -> tuple[str, dict[str, dict[str, Any]]]:
-    """Check that all contenders can be set up.
+def _check_make(make: Any, row: Mapping[str, Any]) -> None:
+    """Check that ``make`` takes the factors."""
+    if isinstance(make, Variant):
+        _source(make, row)  # a variant checks its parameters
+    else:
+        what = "make must be a callable of the factors, such as a class, or a Variant"
+        check_call(make, row, OptionValueError, what, f"the factors {', '.join(row) or '(none)'}")
 
-    Returns:
-        A row, as JSON, and the provenance of its runs by contender; empty if no row's simulation can be made.
 
-    Raises:
-        SimEnvError: A contender cannot be set up.
+def _try_contenders(make: Any, runner: Runner, keys: Sequence[str]) -> tuple[str, dict[str, Provenance]]:
+    """Check that all contenders can be set up; return a row, as JSON, and the provenance of its runs by contender.
+
+    Both are empty if no row's simulation can be made.
     """
-    for row in rows[:TRIED]:
+    for key in keys[:TRIED]:
         try:
-            made = {contender: json.loads(workshop.plan(row, contender)[1](0)) for contender in contenders}
+            return key, {contender: _prepare(make, runner, key, contender)[1] for contender in runner.contenders}
         except SimEnvError:
             raise
         except Exception:  # this row fails; another may not
             continue
-        return written(row), made
     return "", {}
 
 
 # -- runs -----------------------------------------------------------------------------------------
 
 
-def _missing(
-    rows: Sequence[Row],
-    keys: Sequence[str],
-    contenders: Iterable[str],
-    seeds: Sequence[int],
-    stored: Stored,
-    *,
-    retry: bool,
-) -> Iterator[Run]:
-    seen: set[str] = set()
-    for row, key in zip(rows, keys, strict=True):
-        if key in seen:  # the same row has the same result
-            continue
-        seen.add(key)
-        for contender in contenders:
-            for seed in seeds:
-                known = stored.runs.get((key, contender, seed))
-                if known is None or (retry and known.outcome is None):
-                    yield Run(row, key, contender, seed)
+def _source(make: Any, row: Mapping[str, Any]) -> Any:
+    """Return the variant, class or factory of a row's simulations."""
+    if isinstance(make, Variant):
+        return replace(make, parameters={**make.parameters, **row})
+    if isinstance(make, type):
+        return partial(make, **row)
+    first = make(**row)
+    if isinstance(first, (Variant, type)) or not hasattr(first, "run"):
+        return first
+    ready = [first]
+
+    @wraps(type(first), updated=())  # provenance names it after the class that it makes
+    def factory() -> Any:
+        return ready.pop() if ready else make(**row)
+
+    return factory
 
 
-def _work(arguments: tuple[Any, ...], runs: list[Run], workers: int, together: int) -> Iterator[int]:
-    """Do the missing runs; yield the number of runs done since the last yield."""
-    if not runs:
-        return
-    if workers:
-        for number, _ in spread(_do_part, arguments, runs, workers, together, SHARE):
-            yield number
-    else:
-        yield from _do(*arguments, runs=runs)
+def _prepare(make: Any, runner: Runner, key: str, contender: str) -> tuple[Plan, dict[str, Any]]:
+    """Return the plan of runs of a row with a contender, and their provenance."""
+    source = _source(make, json.loads(key))
+    plan = runner.plan(source, contender)
+    name = make.name if isinstance(make, Variant) else source_name(make)
+    policies = {**(source.policies if isinstance(source, Variant) else {}), **runner.contenders[contender]}
+    return plan, describe(plan, None) | {"make": name, "policies": as_json(policies)}
 
 
-def _do_part(*arguments: Any) -> None:
-    """Do a part of the runs, in a worker."""
-    *others, runs = arguments
-    parent = _parents.setdefault(os.getpid(), os.getppid())
-    with processes_kept():
-        for _ in _do(*others, runs=runs):
-            if os.getppid() != parent:  # the parent was killed, so that nothing waits for the results
+def _run_part(make: Any, runner: Runner, folder: Path, session: str, runs: Sequence[Run], bar: Any = None) -> None:
+    """Do runs and store their results."""
+    with closing(Writer(folder, session)) as writer, processes_kept():
+        for (key, contender), group in groupby(runs, lambda run: run[:2]):
+            _run_seeds(make, runner, writer, key, contender, [seed for *_, seed in group], bar)
+
+
+def _run_seeds(
+    make: Any, runner: Runner, writer: Writer, key: str, contender: str, seeds: Sequence[int], bar: Any
+) -> None:
+    """Run seeds of a row with a contender, and store the result of each. An error is a result, too."""
+    remaining = dict.fromkeys(seeds)
+
+    def report(seed: int, result: Result, trace: str | None = None) -> None:
+        writer.write((key, contender, seed), result, {**provenance, "seed": seed}, trace)
+        del remaining[seed]
+        if bar is not None:
+            bar.update()
+
+    while remaining:
+        provenance: dict[str, Any] = {}  # unknown if the simulation cannot be made
+        try:
+            plan, provenance = _prepare(make, runner, key, contender)
+            runner.run(plan, list(remaining), report)
+        except (KeyboardInterrupt, StoreError):
+            raise
+        except BaseException as error:
+            if runner.batch_size > 1 and len(remaining) > 1:  # running them one by one shows which of them failed
+                for seed in list(remaining):
+                    _run_seeds(make, runner, writer, key, contender, [seed], bar)
                 return
-
-
-_parents: dict[int, int] = {}
-
-
-def _do(
-    make: Any,
-    contenders: Mapping[str, Policies],
-    points: Any,
-    options: Mapping[str, Any],
-    named: Sequence[Any],
-    metrics: Metrics,
-    size: int,
-    folder: Path,
-    session: str,
-    *,
-    runs: Sequence[Run],
-) -> Iterator[int]:
-    """Do runs and store their results; yield the number of runs done since the last yield."""
-    workshop = Workshop(make, contenders, points, options, named)
-    writer = Writer(folder, session)
-    try:
-        for (_, contender), group in groupby(runs, lambda run: run[1:3]):
-            together = list(group)
-            row = together[0].row
-            if size and len(together) > 1:
-                left = _do_many(workshop, row, contender, together, metrics, size, writer)
-                yield len(together) - len(left)
-                together = left
-            for run in together:
-                _do_one(workshop, run, metrics, size, writer)
-                yield 1
-    finally:
-        writer.close()
-
-
-def _do_one(workshop: Workshop, run: Run, metrics: Metrics, size: int, writer: Writer) -> None:
-    provenance: Callable[[int], str] = _unknown
-    known = Known(None, None)
-
-    def keep(_: int, outcome: Outcome) -> None:
-        nonlocal known
-        known = Known(outcome, None)
-
-    trace = None
-    try:
-        plan, provenance = workshop.plan(run.row, run.contender)
-        if size:
-            play_many(plan, [run.seed], 1, metrics, keep)
-        else:
-            keep(0, play(plan, run.seed, metrics))
-    except BaseException as error:
-        if not _is_failure(error):
-            raise
-        known, trace = Known(None, describe_error(error)), "".join(traceback.format_exception(error))[-LONGEST_TRACE:]
-        workshop.forget()
-    writer.write(line_of(run.row, run.contender, run.seed, known, provenance(run.seed), trace))
-
-
-def _is_failure(error: BaseException) -> bool:
-    """Return whether an error is a failure of the run, and not a request to stop this process."""
-    cancelled = getattr(sys.modules.get("asyncio"), "CancelledError", SystemExit)  # a task of the model was cancelled
-    return isinstance(error, (Exception, SystemExit, cancelled))
-
-
-def _unknown(seed: int) -> str:
-    """Return the provenance of a run whose simulation could not be made."""
-    return written({"seed": seed})
-
-
-def _do_many(
-    workshop: Workshop, row: Row, contender: str, runs: list[Run], metrics: Metrics, size: int, writer: Writer
-) -> list[Run]:
-    """Do the runs of one row and contender together; return those that did not end because of an error."""
-    left = dict(enumerate(runs))
-    try:
-        plan, provenance = workshop.plan(row, contender)
-
-        def keep(place: int, outcome: Outcome) -> None:
-            seed = left[place].seed
-            writer.write(line_of(row, contender, seed, Known(outcome, None), provenance(seed)))
-            del left[place]
-
-        play_many(plan, [run.seed for run in runs], size, metrics, keep)
-    except StoreError:
-        raise
-    except BaseException as error:
-        if not _is_failure(error):
-            raise
-        workshop.forget()  # running them one by one will show which run it was
-    return list(left.values())
+            trace = "".join(traceback.format_exception(error))[-LONGEST_TRACE:]
+            report(next(iter(remaining)), describe_error(error), trace)
 
 
 # -- the table ------------------------------------------------------------------------------------
 
 
-def _frame(
-    table: "DataFrame",
-    keys: Sequence[str],
-    contenders: Sequence[str],
-    seeds: Sequence[int],
-    stored: Stored,
-    metrics: Sequence[str],
-    team: Any,
+def _make_frame(
+    table: "DataFrame", keys: Sequence[str], seeds: Sequence[int], results: Mapping[Run, Result], runner: Runner
 ) -> "DataFrame":
     """Return the table of all runs, in the order of the design, the contenders and the seeds."""
-    pandas = import_extra("pandas", "run_experiment")
     places: list[int] = []
-    columns: dict[str, list[Any]] = {name: [] for name in (*COLUMNS[:5], *metrics, *COLUMNS[5:])}
+    rows: list[tuple[Any, ...]] = []
     for place, key in enumerate(keys):
-        for contender in contenders:
-            for seed in seeds:
-                known = stored.runs.get((key, contender, seed), LOST)
-                for values in _rows(known, contender, seed, metrics, team):
-                    places.append(place)
-                    for column, value in zip(columns.values(), values, strict=True):
-                        column.append(value)
+        for contender, seed in product(runner.contenders, seeds):
+            for row in _rows(runner, results.get((key, contender, seed), LOST)):
+                places.append(place)
+                rows.append((contender, seed, *row))
     factors = table.iloc[places].reset_index(drop=True)
-    return pandas.concat([factors, typed(columns)], axis=1)
+    return factors.join(make_table((*RUN_COLUMNS, *runner.metrics, *STATUS_COLUMNS), rows))
 
 
-LOST: Final = Known(None, "it did not come to its end: the worker process that ran it has ended")
-
-
-def _rows(known: Known, contender: str, seed: int, metrics: Sequence[str], team: Any) -> Iterator[tuple[Any, ...]]:
-    if known.outcome is None:
-        nothing = [None] * len(metrics)
-        yield contender, seed, TEAM, float("nan"), 0, *nothing, "error", known.error
-        return
-    try:
-        rows = rows_of(known.outcome, team)
-    except Exception as error:  # raised by team=, which is called for stored runs, too
-        yield from _rows(Known(None, describe_error(error)), contender, seed, metrics, team)
-        return
-    measured = [known.outcome.metrics.get(name) for name in metrics]
-    for agent, value, length in rows:
-        yield contender, seed, agent, value, length, *measured, "ok", None
+def _rows(runner: Runner, result: Result) -> list[tuple[Any, ...]]:
+    """Return agent, return, length, metrics, status and error for each agent and for the team."""
+    if not isinstance(result, str):
+        try:
+            return [(*row, "ok", None) for row in runner.rows(result)]
+        except Exception as error:  # raised by team=, which is called for stored runs, too
+            result = describe_error(error)
+    return [(TEAM, nan, 0, *[None] * len(runner.metrics), "error", result)]

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ..core.points import Points, portable
-from ..errors import OptionValueError, SimulationError, short_repr
+from ..errors import OptionValueError, SimEnvError, SimulationError, short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +45,10 @@ class Variant:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise OptionValueError(f"a variant needs a name, not {short_repr(self.name)}")
-        if isinstance(self.simulation, Variant):
+        source = self.simulation
+        if isinstance(source, Variant):
             raise SimulationError(
-                f"the variant {self.name!r} needs a simulation, not the variant {self.simulation.name!r}; derive one"
+                f"the variant {self.name!r} needs a simulation, not the variant {source.name!r}; derive one"
                 " variant from another with dataclasses.replace"
             )
         for name in ("parameters", "policies", "options"):
@@ -56,62 +57,36 @@ class Variant:
                 raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {short_repr(value)}")
             # Copied, so that later changes of the arguments do not change the variant.
             object.__setattr__(self, name, MappingProxyType(dict(value)))
+        object.__setattr__(self, "plugins", tuple(self.plugins))
         twice = [name for name in ("plugins", "policies") if name in self.options]
         if twice:
             raise OptionValueError(
                 f"{' and '.join(twice)} must be arguments of the variant {self.name!r} itself, not among its options"
             )
-        object.__setattr__(self, "plugins", tuple(self.plugins))
-        self._check_parameters()
-
-    def _check_parameters(self) -> None:
-        source = self.simulation
-        if not self.parameters:
-            return
-        if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
-            raise SimulationError(
-                f"the variant {self.name!r} has parameters, so its simulation must be a class or a factory, not"
-                f" {short_repr(source)}"
-            )
-        try:
-            inspect.signature(source).bind(**self.parameters)
-        except TypeError as error:
-            raise SimulationError(
-                f"{getattr(source, '__qualname__', None) or short_repr(source)} cannot be called with"
-                " the parameters of the"
-                f" variant {self.name!r}: {error}"
-            ) from error
-        except ValueError:  # a builtin without a signature
-            pass
+        if self.parameters:
+            what = f"the variant {self.name!r} has parameters, so its simulation must be a class or a factory"
+            check_call(source, self.parameters, SimulationError, what, f"the parameters of the variant {self.name!r}")
 
     def __reduce__(self) -> Any:
         # Functions are pickled by name: while environments are in use, hooks may stand in their places.
-        points, plugins = self.points, [(handler, portable(target), *rest) for handler, target, *rest in self.plugins]
+        points = self.points
         if isinstance(points, Mapping):
             points = {portable(key): definition for key, definition in points.items()}
         elif points is not None and not isinstance(points, str):
             points = [portable(key) for key in (points if isinstance(points, Iterable) else [points])]
-        policies = {portable(key): policy for key, policy in self.policies.items()}
-        return _remake, (
+        return partial(
+            Variant,
             self.name,
             self.simulation,
-            dict(self.parameters),
-            points,
-            plugins,
-            policies,
-            dict(self.options),
-        )
+            parameters=dict(self.parameters),
+            points=points,
+            plugins=[(handler, portable(target), *rest) for handler, target, *rest in self.plugins],
+            policies={portable(key): policy for key, policy in self.policies.items()},
+            options=dict(self.options),
+        ), ()
 
     def environment_arguments(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
-        """Return the arguments of an environment of this variant.
-
-        Args:
-            points: The decision points that are given with it. None: the variant's own.
-            options: The options that are given with it.
-
-        Returns:
-            The source of its simulation, the decision points, and the options.
-        """
+        """Return simulation, points and options of an environment of this variant, with those that are given to it."""
         source = partial(self.simulation, **self.parameters) if self.parameters else self.simulation
         merged = {**self.options, **options}
         policies = {**self.policies, **(options.get("policies") or {})}
@@ -123,7 +98,16 @@ class Variant:
         return source, self.points if points is None else points, merged
 
 
-def _remake(name: str, simulation: Any, parameters: Any, points: Any, plugins: Any, policies: Any, options: Any) -> Any:
-    return Variant(
-        name, simulation, parameters=parameters, points=points, plugins=plugins, policies=policies, options=options
-    )
+def check_call(
+    source: Any, arguments: Mapping[str, Any], error: type[SimEnvError], requirement: str, described: str
+) -> None:
+    """Check that something is a class or a factory, as ``requirement`` says, and takes the described arguments."""
+    if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
+        raise error(f"{requirement}, not {short_repr(source)}")
+    try:
+        inspect.signature(source).bind(**arguments)
+    except TypeError as problem:
+        name = getattr(source, "__qualname__", None) or short_repr(source)
+        raise error(f"{name} cannot be called with {described}: {problem}") from problem
+    except ValueError:  # a builtin without a signature
+        pass

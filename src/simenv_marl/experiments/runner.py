@@ -1,0 +1,361 @@
+"""Runs the episodes of contenders: who decides, what is measured, and the rows of a table that this gives."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from ..core.agent import Agent
+from ..core.episode import Episode, When
+from ..core.plan import Plan
+from ..core.session import Session
+from ..data.collect import learners_plan
+from ..decision import decision_points
+from ..errors import AgentError, OptionValueError, UnknownPointError, annotate, close_after, short_repr, warn_user
+from ..hooks.stacks import outside_simulation
+from ..many.batch import Group, run, takes_identities
+from ..many.simulate import check_numbers, checked_seeds
+from ..many.spread import import_extra
+from ..simulation import RULE
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+TEAM: Final = "team"
+"""The value of the column ``agent`` in the row of the team."""
+
+RUN_COLUMNS: Final = ("contender", "seed", "agent", "return", "length")
+"""The first columns of tables, after the factors."""
+
+STATUS_COLUMNS: Final = ("status", "error")
+"""The last columns of the table of an experiment, after the metrics."""
+
+Policies = Mapping[Any, Any]
+
+
+class Outcome(NamedTuple):
+    """The results of one episode: each agent's undiscounted return and number of decisions, and the metrics."""
+
+    returns: dict[str, float]
+    lengths: dict[str, int]
+    metrics: dict[str, Any]
+
+
+class Returns(tuple[float, ...]):
+    """The returns of an episode's agents: a tuple of numbers, for ``sum`` and ``max``, and a mapping by agent.
+
+    Example:
+        ``returns["waterer_0"]``, ``returns.get("waterer_0", 0.0)``, ``min(returns)``, ``returns.items()``
+    """
+
+    _by_agent: dict[str, float]
+
+    def __new__(cls, returns: Mapping[str, float]) -> Returns:
+        """Make the returns from a dict."""
+        instance = super().__new__(cls, returns.values())
+        instance._by_agent = dict(returns)
+        return instance
+
+    def __getitem__(self, key: Any) -> Any:
+        if not isinstance(key, str):
+            return super().__getitem__(key)
+        if key not in self._by_agent:
+            raise KeyError(
+                f"{key!r} did not decide in this episode; these agents did: {', '.join(self._by_agent) or 'none'}"
+            )
+        return self._by_agent[key]
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._by_agent if isinstance(key, str) else super().__contains__(key)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return ``get``, ``keys``, ``values`` or ``items`` of the dict."""
+        return getattr(self._by_agent, name)
+
+
+@contextmanager
+def noting(note: str) -> Iterator[None]:
+    """Add a note to errors."""
+    try:
+        yield
+    except BaseException as error:
+        annotate(error, f"simenv_marl: {note}")
+        raise
+
+
+# -- arguments that evaluate and run_experiment share ---------------------------------------------
+
+
+def checked_contenders(contenders: Any, *, batched: bool) -> dict[str, Policies]:
+    """Return contenders by name. Policies that answer many decisions at once need ``batched``."""
+    if not isinstance(contenders, Mapping):
+        raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
+    for name, policies in contenders.items():
+        if not isinstance(name, str) or not name:
+            raise OptionValueError(f"the name of a contender must be a string, not {short_repr(name)}")
+        if not isinstance(policies, Mapping):
+            raise OptionValueError(
+                f"the contender {name!r} must be a dict from agents or points to policies, {{}} for the model as it is,"
+                f" not {short_repr(policies)}"
+            )
+        for key, policy in policies.items():
+            if policy is RULE:
+                continue
+            if not callable(policy):
+                raise OptionValueError(
+                    f"the policy of {short_repr(key)} in {name!r} must be callable, not {short_repr(policy)}"
+                )
+            if not batched and takes_identities(policy):
+                raise OptionValueError(
+                    f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)}, answers many decisions at"
+                    " once, as mixtures do; pass batched=True, and only policies as simulate_many takes them"
+                )
+    return dict(contenders)
+
+
+def distinct_seeds(seeds: Iterable[int]) -> list[int]:
+    """Return the seeds as a list: at least one, and all different."""
+    checked = checked_seeds(seeds)
+    if not checked:
+        raise OptionValueError("seeds must be integers, such as range(32), but there are none")
+    seed, number = Counter(checked).most_common(1)[0]
+    if number > 1:
+        raise OptionValueError(f"the seed {seed} occurs twice: its result would be counted twice")
+    return checked
+
+
+def _checked_metrics(metric: Any, factors: Sequence[str]) -> dict[str, Callable[[Any], Any]]:
+    """Return metrics by name; a single one is called ``metric``."""
+    if metric is None:
+        return {}
+    metrics = dict(metric) if isinstance(metric, Mapping) else {"metric": metric}
+    for name, function in metrics.items():
+        if not isinstance(name, str) or not callable(function):
+            raise OptionValueError(
+                f"metric must be a callable of the simulation, or a dict of them, not {short_repr(metric)}"
+            )
+        if name in (*RUN_COLUMNS, *STATUS_COLUMNS, *factors):
+            raise OptionValueError(f"the metric {name!r} has the name of another column; rename it")
+    return metrics
+
+
+def make_runner(
+    contenders: dict[str, Policies],
+    points: Any,
+    options: Mapping[str, Any],
+    metric: Any,
+    team: Any,
+    *,
+    batch_size: int,
+    batched: bool,
+    workers: int,
+    factors: Sequence[str] = (),
+) -> Runner:
+    """Make a runner from arguments of ``evaluate`` and ``run_experiment``, and check them."""
+    check_numbers(batch_size, workers)
+    if team is not None and not callable(team):
+        raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
+    if "policies" in options:
+        raise OptionValueError("there is no option policies here; pass the policies of each contender in contenders=")
+    keys = [key for policies in contenders.values() for key in policies]
+    return Runner(
+        contenders,
+        list(points) if isinstance(points, Iterator) else points,
+        list(dict.fromkeys(key for key in keys if not isinstance(key, str) or "." in key)),
+        {name: list(value) if isinstance(value, Iterator) else value for name, value in options.items()},
+        _checked_metrics(metric, factors),
+        team,
+        int(batch_size) if batched else 0,
+    )
+
+
+# -- episodes -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Runner:
+    """Runs episodes of contenders. Workers get a copy.
+
+    Attributes:
+        contenders: By name, the policies of each contender.
+        points: The decision points, as ``generate_env`` takes them.
+        policy_points: The points that policies name. They are used if the points are not known otherwise.
+        options: The options of the episodes.
+        metrics: By name, callables of a simulation after its end.
+        team: A callable that combines the returns of an episode. None: their sum.
+        batch_size: The largest number of simulations that are suspended together, if policies answer many decisions at
+            once. 0: they answer one decision at a time.
+    """
+
+    contenders: Mapping[str, Policies]
+    points: Any
+    policy_points: Sequence[Any]
+    options: Mapping[str, Any]
+    metrics: Mapping[str, Callable[[Any], Any]]
+    team: Callable[[Returns], Any] | None
+    batch_size: int
+
+    def plan(self, simulation: Any, contender: str) -> Plan:
+        """Return the plan of a contender's episodes. All agents whose rewards count decide in it."""
+        with noting(f"of the contender {contender!r}"):
+            try:
+                return self._plan(simulation, contender, self.points, all_points=True)
+            except (AgentError, UnknownPointError) as error:
+                if self.points is not None:
+                    raise
+                first = error
+            try:
+                named = bool(self.policy_points)
+                plan = self._plan(simulation, contender, self.policy_points or None, all_points=named)
+            except (AgentError, UnknownPointError):
+                raise first from None
+        if not named and decision_points():
+            warn_user(f"returns are not counted, because the decision points are not known: {first}")
+        return plan
+
+    def _plan(self, simulation: Any, contender: str, points: Any, *, all_points: bool) -> Plan:
+        return learners_plan(simulation, self.contenders[contender], points, self.options, all_points=all_points)[0]
+
+    def run(self, plan: Plan, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
+        """Run one episode for each seed. ``report`` gets the seed and its results when the simulation is closed."""
+        tally = Tally()
+
+        def finish(place: int, simulation: Any) -> Callable[[], None]:
+            return partial(report, seeds[place], tally.outcome(place, simulation, self.metrics))
+
+        if self.batch_size:
+            run(plan, seeds, self.batch_size, finish, tally)
+            return
+        for place, seed in enumerate(seeds):
+            with noting(f"while the simulation was made; seed {seed}"):
+                session = Session(plan)
+            _run_alone(session, seed, place, finish, tally)
+
+    def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
+        """Return agent, return, length and metrics for each agent and for the team."""
+        metrics = [outcome.metrics.get(name) for name in self.metrics]
+        rows = [(agent, value, outcome.lengths[agent], *metrics) for agent, value in outcome.returns.items()]
+        value: Any = sum(outcome.returns.values()) if self.team is None else self.team(Returns(outcome.returns))
+        try:
+            return [*rows, (TEAM, float(value), sum(outcome.lengths.values()), *metrics)]
+        except (TypeError, ValueError):
+            raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
+
+
+def _run_alone(session: Session, seed: int, place: int, finish: Callable[..., Any], tally: Tally) -> None:
+    """Run an episode whose policies answer one decision at a time."""
+    try:
+        with outside_simulation():
+            episode = session.start(seed, None, When.DECISION)
+            own_random = session.plan.options.global_rng
+            tally.moved(episode)
+            while (agent := episode.pending) is not None:
+                tally.count(place, agent)
+                if agent.looks:
+                    agent.consultations += 1
+                try:
+                    with episode.at_work() if own_random else nullcontext():
+                        action = agent.policy(agent.observation, agent.info)
+                except BaseException as error:
+                    episode.fail(error)
+                    raise
+                episode.step(action)
+                tally.moved(episode)
+            session.end()
+            with noting(f"after the simulation's end; seed {seed}"):
+                report = finish(place, session.simulation)
+    except BaseException as error:
+        close_after(error, session.close, "the simulation")
+        raise
+    with noting(f"after the simulation's end; seed {seed}"):
+        session.close()
+        report()
+
+
+class Tally:
+    """Counts the returns of agents while episodes run: a ``Watcher`` for ``run``, and for one episode alone."""
+
+    def __init__(self) -> None:
+        self._accounts: dict[int, dict[str, list[Any]]] = {}  # by place of the episode, and by agent: return and length
+
+    def count(self, place: int, agent: Agent) -> None:
+        """Count a decision of an agent."""
+        account = agent.notes
+        if account is None:
+            account = agent.notes = self._accounts.setdefault(place, {}).setdefault(agent.name, [0.0, 0])
+        account[1] += 1
+
+    def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
+        """Count the decisions that are about to be answered: see ``Watcher``."""
+        for place, episode in zip(places, waiting, strict=True):
+            agent: Any = episode.pending
+            self.count(place, agent)
+
+    def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
+        """Do nothing: returns do not depend on the answers."""
+
+    def moved(self, episode: Episode) -> None:
+        """Add the reward when an episode reaches its next decision or its end: see ``Watcher``."""
+        if episode.pending is not None:
+            self._pay(episode.pending)
+        for agent in episode.just_ended:
+            self._pay(agent)
+        episode.just_ended = []
+        if episode.over:
+            for agent in episode.agents.values():
+                self._pay(agent)
+
+    def _pay(self, agent: Agent) -> None:
+        account = agent.notes
+        if account is not None:
+            account[0] += agent.reward
+
+    def outcome(self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]) -> Outcome:
+        """Return the results of an episode that is over."""
+        accounts = self._accounts.pop(place, {})
+        if TEAM in accounts:
+            raise AgentError(f"an agent is called {TEAM!r}, as is the row of all agents together; rename the agent")
+        returns = {name: float(account[0]) for name, account in accounts.items()}
+        lengths = {name: account[1] for name, account in accounts.items()}
+        values = {name: plain_value(f"the metric {name!r}", metric(simulation)) for name, metric in metrics.items()}
+        return Outcome(returns, lengths, values)
+
+
+# -- values and tables ----------------------------------------------------------------------------
+
+
+def plain_value(what: str, value: Any, advice: str = "") -> Any:
+    """Return a number, a string, a bool or None as an object of Python; refuse any other value."""
+    if isinstance(value, (np.generic, np.ndarray)) and value.ndim == 0:
+        value = value.item()
+    if value is not None and type(value) not in (bool, int, float, str):
+        raise OptionValueError(f"{what} must be a number, a string or None, not {short_repr(value)}{advice}")
+    return value
+
+
+def make_table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> DataFrame:
+    """Return a table whose columns keep the types of their values. A numeric column with missing values is float."""
+    pandas = import_extra("pandas", "a table")
+    columns = dict(zip(names, zip(*rows, strict=True), strict=True))
+    table: DataFrame = pandas.DataFrame(
+        {name: pandas.Series(values, dtype=_dtype(values)) for name, values in columns.items()}
+    )
+    return table
+
+
+def _dtype(values: Sequence[Any]) -> Any:
+    kinds = {type(value) for value in values}
+    if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
+        return np.int64
+    if kinds == {bool}:
+        return np.bool_
+    if kinds <= {int, float, type(None)} and kinds & {int, float}:
+        exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
+        return np.float64 if exact else object
+    return object if kinds != {str} else "str"

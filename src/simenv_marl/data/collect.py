@@ -2,17 +2,19 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
-from dataclasses import replace
 from typing import Any, Unpack
+
+import numpy as np
 
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
-from ..many.batch import BatchPolicy, PolicyKey, Watcher, policy_keys, run
+from ..errors import DefinitionError
+from ..many.batch import BatchPolicy, PolicyKey, policy_keys, run
 from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
 from ..many.spread import progress_bar, spread
 from ..simulation import RULE
-from .trajectories import Ledger, Trajectories, merged
+from .trajectories import Recorder, Trajectories, concatenate, is_answered_by
 
 
 def collect_episodes(
@@ -58,23 +60,47 @@ def collect_episodes(
         BaseException: Any exception of a model, a mapping or a policy, with a note that names the seed. All other
             simulations are unwound first.
     """
+    return play_episodes(
+        simulation, policies, seeds=seeds, points=points, collect=collect, batch_size=batch_size, workers=workers,
+        progress=progress, **options,
+    )  # fmt: skip
+
+
+def play_episodes(
+    simulation: Any,
+    policies: Any,
+    *,
+    seeds: Any,
+    rule_keys: Iterable[Any] = (),
+    points: Points = None,
+    collect: Callable[[Any], Any] | None = None,
+    batch_size: int = 1024,
+    workers: int = 0,
+    progress: bool = False,
+    **options: Any,
+) -> dict[Any, Trajectories]:
+    """Do what ``collect_episodes`` does.
+
+    Before anything runs, check that the actions of the rule can be known where a policy of ``rule_keys`` decides.
+    """
     checked = checked_seeds(seeds)
     check_numbers(batch_size, workers)
     check_collect(collect)
-    given = checked_policies(policies)
-    plan, keys = learners_plan(simulation, given, points, options)
+    policies = checked_policies(policies)
+    plan, keys = learners_plan(simulation, policies, points, options)
+    for key in rule_keys:
+        _check_rule_actions(plan, keys[key])
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
+        parts = []
         if not workers or not checked:
-            found = _collect(plan, keys, collect, int(batch_size), checked, bar)
+            parts.append(_play(plan, keys, collect, int(batch_size), checked, bar))
         else:
-            parts = []
-            arguments = (simulation, given, points, collect, int(batch_size), options)
-            for number, part in spread(_collect_part, arguments, checked, int(workers), int(batch_size)):
+            arguments = ((simulation, policies, points, options), collect, int(batch_size))
+            for number, part in spread(_play_part, arguments, checked, int(workers), int(batch_size)):
                 parts.append(part)
                 if bar is not None:
                     bar.update(number)
-            found = {place: merged([part[place] for part in parts]) for place in keys.values()}
-    return {key: found[place] for key, place in keys.items()}
+    return {key: concatenate([part[place] for part in parts]) for key, place in keys.items()}
 
 
 def learners_plan(
@@ -87,40 +113,28 @@ def learners_plan(
 ) -> tuple[Plan, dict[Any, int]]:
     """Return the plan of the episodes, and the place of each policy by its key.
 
-    Args:
-        simulation: As ``collect_episodes`` takes it.
-        policies: As ``collect_episodes`` takes them.
-        points: As ``collect_episodes`` takes them.
-        options: As ``collect_episodes`` takes them.
-        all_points: Whether entities without a policy are agents as well, whose decisions follow the rule.
+    With ``all_points``, entities without a policy are agents as well, whose decisions follow the rule.
     """
-    asked = {key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()}
-    found = policy_keys(asked, rewarded=True)
-    keys = {key: entry.place for key, entry in found.items() if isinstance(entry, PolicyKey)}
-    others = PolicyKey(len(found), BatchPolicy(_left_to_the_rule)) if all_points else None
-    given = {**options, "policies": found}
-    return Plan.draw_up(simulation, points, given, unanswered=True, rewarded=True, others=others), keys
+    callables = {key: _follow_rule if policy is RULE else policy for key, policy in policies.items()}
+    entries = policy_keys(callables, rewarded=True)
+    keys = {key: entry.place for key, entry in entries.items() if isinstance(entry, PolicyKey)}
+    others = PolicyKey(len(entries), BatchPolicy(_follow_rule)) if all_points else None
+    options = {**options, "policies": entries}
+    return Plan.draw_up(simulation, points, options, unanswered=True, rewarded=True, others=others), keys
 
 
-def _left_to_the_rule(observations: Any) -> Any:
+def _follow_rule(observations: Any) -> Any:
     return RULE
 
 
-def _collect_part(
-    simulation: Any,
-    policies: Mapping[Any, Any],
-    points: Any,
-    collect: Callable[[Any], Any] | None,
-    batch_size: int,
-    options: dict[str, Any],
-    seeds: list[int],
+def _play_part(
+    planned: tuple[Any, Any, Any, Any], collect: Callable[[Any], Any] | None, batch_size: int, seeds: list[int]
 ) -> dict[int, Trajectories]:
     """Play a part of the episodes, in a worker process."""
-    plan, keys = learners_plan(simulation, policies, points, options)
-    return _collect(plan, keys, collect, batch_size, seeds, None)
+    return _play(*learners_plan(*planned), collect, batch_size, seeds, None)
 
 
-def _collect(
+def _play(
     plan: Plan,
     keys: Mapping[Any, int],
     collect: Callable[[Any], Any] | None,
@@ -128,8 +142,8 @@ def _collect(
     seeds: list[int],
     bar: Any,
 ) -> dict[int, Trajectories]:
-    ledger = Ledger()
-    watcher: Watcher = ledger
+    """Play episodes in this process; return the trajectories by the place of their policy."""
+    recorder = Recorder()
     collected: list[Any] = [None] * len(seeds)
 
     def finish(place: int, simulation: Any) -> None:
@@ -138,8 +152,34 @@ def _collect(
         if bar is not None:
             bar.update()
 
-    run(plan, seeds, batch_size, finish, watcher)
-    found = ledger.trajectories(plan, keys, seeds)
-    if collect is None:
-        return found
-    return {place: replace(own, collected=tuple(collected)) for place, own in found.items()}
+    run(plan, seeds, batch_size, finish, recorder)
+    return recorder.trajectories(plan, keys, seeds, None if collect is None else tuple(collected))
+
+
+# -- the rule's actions ---------------------------------------------------------------------------
+
+
+def _check_rule_actions(plan: Plan, place: int) -> None:
+    """Check that the actions of the rule can be known where the policy at this place answers."""
+    for point in plan.points:
+        if not point.recorded and is_answered_by(plan, point, place):
+            raise DefinitionError(
+                f"the actions of the rule of {point.point.name} are not known; give its make_step a"
+                " rule_action_mapping, which maps the rule's decision to an action"
+            )
+
+
+def check_known(found: Trajectories) -> None:
+    """Check that the action of each decision is known, also of those that were left to the rule.
+
+    Raises:
+        DefinitionError: Some actions are not known.
+    """
+    unknown = np.flatnonzero(~found.known)
+    if len(unknown):
+        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
+        raise DefinitionError(
+            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known, first for {agent!r} at"
+            f" turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point needs a"
+            " rule_action_mapping that returns an action for every decision of the rule"
+        )

@@ -1,7 +1,8 @@
 """Compares the model's own rule with policies, decision by decision."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -10,18 +11,17 @@ from numpy.typing import NDArray
 from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.options import EpisodeOptions
 from ..core.points import Points
-from ..core.spaces import same as alike
-from ..core.stacking import stacker
+from ..core.spaces import same
+from ..core.stacking import stacker, taken
 from ..errors import OptionValueError, short_repr
 from ..many.batch import BatchPolicy
 from ..simulation import RULE
-from .collect import collect_episodes
-from .mixture import actions_of
-from .rule_actions import check_knowable, check_known
-from .trajectories import Trajectories
+from .collect import check_known, play_episodes
+from .mixture import ask
+from .trajectories import Trajectories, leaves
 
-PLAYING: Final = ("batch_size", "collect", "progress", "workers")
-"""Options of ``collect_episodes`` that are not options of the environment."""
+SHADOW: Final = "shadow action"
+"""The extra in which the actions of the compared policies are recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,81 +94,56 @@ def compare_with_rule(
             "others must be a dict of policies for agents or points that policies does not name, not"
             f" {short_repr(others)}"
         )
-    by_rule = dict.fromkeys(policies, RULE)
-    checked = {name: value for name, value in options.items() if name not in PLAYING}
-    check_knowable(simulation, {**by_rule, **(others or {})}, by_rule, points, checked)
-    asked = {id(policy): _onlooker(policy) for policy in policies.values()}
-    onlookers = {key: asked[id(policy)] for key, policy in policies.items()}
-    collected = collect_episodes(simulation, {**onlookers, **(others or {})}, seeds=seeds, points=points, **options)
-    return {key: _compared(collected[key], float(tolerance)) for key in policies}
+    shadows = {id(policy): _shadow(policy) for policy in policies.values()}  # one for each, so that keys share batches
+    deciding = {**{key: shadows[id(policy)] for key, policy in policies.items()}, **(others or {})}
+    collected = play_episodes(simulation, deciding, seeds=seeds, rule_keys=policies, points=points, **options)
+    return {key: _compare(collected[key], float(tolerance)) for key in policies}
 
 
-class _Onlooker:
-    """A policy that records what another policy would do, and leaves the decision to the rule."""
-
-    def __init__(self, policy: Any) -> None:
-        self.policy = policy
-        self.asked = BatchPolicy(policy)
-
-    def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
-        noted = np.empty(len(identities), object)
-        returned = self.asked.answers(observations, infos, identities)
-        for place, action in enumerate(actions_of(returned, len(identities), self.policy)):
-            noted[place] = action
-        return RULE, {"noted": noted}
+# -- the policy beside the rule -------------------------------------------------------------------
 
 
-class _AskingOnlooker:
-    """An ``_Onlooker`` for a policy that asks for the environment."""
-
-    def __init__(self, policy: Any) -> None:
-        self.asked = AskingPolicy(policy)
-
-    def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
-        noted = np.empty((), object)
-        noted[()] = self.asked.answer(observation, info, _environment)
-        return RULE, {"noted": noted}
+def _shadow(policy: Any) -> Any:
+    """Make a policy that records the action of another policy as an extra, and leaves the decision to the rule."""
+    if asks_for_environment(policy):
+        return partial(_record_one, AskingPolicy(policy))
+    return partial(_record, policy, BatchPolicy(policy))
 
 
-def _onlooker(policy: Any) -> Any:
-    return _AskingOnlooker(policy) if asks_for_environment(policy) else _Onlooker(policy)
+def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> Any:
+    recorded = np.empty(len(identities), object)
+    for place, action in enumerate(ask(policy, batch_policy, observations, infos, identities)):
+        recorded[place] = action
+    return RULE, {SHADOW: recorded}
 
 
-def _compared(found: Trajectories, tolerance: float) -> Comparison:
-    """Make a comparison from the records of an onlooker."""
-    noted = found.extras.get("noted", np.zeros(0)).tolist()
-    found = replace(found, extras={name: values for name, values in found.extras.items() if name != "noted"})
+def _record_one(policy: AskingPolicy, observation: Any, info: Any, *, _environment: Any) -> Any:
+    recorded = np.empty((), object)
+    recorded[()] = policy.answer(observation, info, _environment)
+    return RULE, {SHADOW: recorded}
+
+
+# -- the comparison -------------------------------------------------------------------------------
+
+
+def _compare(found: Trajectories, tolerance: float) -> Comparison:
+    """Compare the rule's actions with those that a shadow has recorded."""
+    recorded = found.extras.get(SHADOW, ())
+    found = replace(found, extras={name: values for name, values in found.extras.items() if name != SHADOW})
     if not len(found):
         return Comparison(found, found.actions, np.zeros(0, np.bool_))
     check_known(found)
     assert found.action_space is not None
-    actions = [_row(found.actions, row) if action is RULE else action for row, action in enumerate(noted)]
+    actions = [taken(found.actions, np.array(row)) if action is RULE else action for row, action in enumerate(recorded)]
     policy_actions = stacker(found.action_space)(actions)
-    return Comparison(found, policy_actions, _agreeing(found.actions, policy_actions, tolerance))
+    pairs = zip(leaves(found.actions), leaves(policy_actions), strict=True)
+    agreements = [_agreements(one, other, tolerance) for (_, one), (_, other) in pairs]
+    return Comparison(found, policy_actions, np.all(agreements, axis=0))
 
 
-def _row(stack: Any, row: int) -> Any:
-    if isinstance(stack, Mapping):
-        return {key: _row(part, row) for key, part in stack.items()}
-    if isinstance(stack, tuple):
-        return tuple(_row(part, row) for part in stack)
-    return stack[row]
-
-
-def _agreeing(one: Any, other: Any, tolerance: float) -> NDArray[np.bool_]:
-    """Return in which rows two stacks agree."""
-    if isinstance(one, Mapping):
-        return _everywhere([_agreeing(part, other[key], tolerance) for key, part in one.items()])
-    if isinstance(one, tuple):
-        return _everywhere([_agreeing(*parts, tolerance) for parts in zip(one, other, strict=True)])
-    if one.dtype.kind == "f":
-        same = np.abs(one - other) <= tolerance
-    elif one.dtype == object:
-        same = np.array(list(map(alike, one, other)))
-    else:
-        same = one == other
-    return np.asarray(same.reshape(len(one), -1).all(axis=1), np.bool_)
-
-
-def _everywhere(parts: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    return np.asarray(np.all(parts, axis=0), np.bool_)
+def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+    """Return in which rows two arrays agree."""
+    if one.dtype == object:
+        return np.array([same(*pair) for pair in zip(one, other, strict=True)], np.bool_)
+    equal = np.abs(one - other) <= tolerance if one.dtype.kind == "f" else one == other
+    return np.asarray(equal.reshape(len(one), -1).all(axis=1), np.bool_)

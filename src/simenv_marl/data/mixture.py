@@ -1,4 +1,4 @@
-"""Mixtures of policies, and helpers for the policies that users give."""
+"""Mixtures of policies, which draw the policy of each decision."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite
@@ -41,85 +41,88 @@ class Mixture:
                 f"a mixture needs a dict from policies to weights, or pairs of these, not {short_repr(parts)}"
             )
         for policy, weight in pairs:
-            if policy is not RULE and not callable(policy):
-                raise OptionValueError(
-                    f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
-                )
-            if asks_for_environment(policy):
-                raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
-            if (
-                isinstance(weight, bool)
-                or not isinstance(weight, (int, float))
-                or not (isfinite(weight) and weight >= 0)
-            ):
-                raise OptionValueError(
-                    f"the weight of {short_repr(policy)} must be a number that is not negative, not"
-                    f" {short_repr(weight)}"
-                )
+            _check_part(policy, weight)
         weights = np.array([weight for _, weight in pairs], np.float64)
         if not weights.sum() > 0:
             raise OptionValueError("at least one weight of a mixture must be positive")
         self.policies: tuple[Any, ...] = tuple(policy for policy, _ in pairs)
         self.weights: NDArray[np.float64] = weights / weights.sum()
         self._bounds = np.cumsum(self.weights)[:-1]
-        self._asked = [None if policy is RULE else BatchPolicy(policy) for policy in self.policies]
+        self._batch_policies = [None if policy is RULE else BatchPolicy(policy) for policy in self.policies]
 
     def __repr__(self) -> str:
         parts = zip(self.policies, self.weights.tolist(), strict=True)
-        return f"<Mixture: {', '.join(f'{weight:.3g} {name_of(policy)}' for policy, weight in parts)}>"
+        return f"<Mixture: {', '.join(f'{weight:.3g} {policy_name(policy)}' for policy, weight in parts)}>"
 
     def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
         """Answer a batch of decisions, as policies of ``collect_episodes`` do."""
-        component = np.searchsorted(self._bounds, _drawn(identities), side="right")
+        component = np.searchsorted(self._bounds, _random_numbers(identities), side="right")
         actions: list[Any] = [RULE] * len(identities)
-        for number, asked in enumerate(self._asked):
+        for number, batch_policy in enumerate(self._batch_policies):
             own = np.flatnonzero(component == number)
-            if asked is None or not len(own):
+            if batch_policy is None or not len(own):
                 continue
-            where = own.tolist()
-            returned = asked.answers(
-                taken(observations, own), [infos[row] for row in where], [identities[row] for row in where]
-            )
-            for row, action in zip(where, actions_of(returned, len(where), self.policies[number]), strict=True):
+            places = own.tolist()
+            arguments = taken(observations, own), [infos[row] for row in places], [identities[row] for row in places]
+            for row, action in zip(places, ask(self.policies[number], batch_policy, *arguments), strict=True):
                 actions[row] = action
         return actions, {"component": component}
 
 
-def _drawn(identities: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+def _check_part(policy: Any, weight: Any) -> None:
+    """Check a policy of a mixture and its weight."""
+    if policy is not RULE and not callable(policy):
+        raise OptionValueError(f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}")
+    if asks_for_environment(policy):
+        raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
+    number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
+    if not number or not isfinite(weight) or weight < 0:
+        raise OptionValueError(
+            f"the weight of {short_repr(policy)} must be a number that is not negative, not {short_repr(weight)}"
+        )
+
+
+def _random_numbers(identities: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
     """Return a number in [0, 1) for each decision, which depends on its identity alone."""
-    # SplitMix64, twice: a generator of its own for each decision would take longer than the decision.
-    state = np.array([seed % 2**64 for seed, _ in identities], np.uint64)
+    # SplitMix64, twice: to make a generator for each decision would take longer than the decision.
+    seeds = np.array([seed % 2**64 for seed, _ in identities], np.uint64)
     turns = np.array([turn for _, turn in identities], np.uint64)
-    return np.asarray((_mixed(_mixed(state) + turns) >> np.uint64(11)) * 2.0**-53, np.float64)
+    return np.asarray((_splitmix(_splitmix(seeds) + turns) >> np.uint64(11)) * 2.0**-53, np.float64)
 
 
-def _mixed(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def _splitmix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     state = state + np.uint64(0x9E3779B97F4A7C15)
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return state ^ (state >> np.uint64(31))
 
 
-def actions_of(returned: Any, number: int, policy: Any) -> list[Any]:
-    """Return the actions that a policy returned for ``number`` decisions, without its extras."""
-    if type(returned) is tuple and len(returned) == 2 and isinstance(returned[1], Mapping):
-        returned = returned[0]
-    actions = [RULE] * number if returned is RULE else rows(returned, integers=False)
+def ask(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> list[Any]:
+    """Ask a policy for the actions of some decisions, and drop the extras.
+
+    Raises:
+        InvalidActionError: The policy did not return one action for each decision.
+    """
+    number, answers = len(identities), batch_policy.answers(observations, infos, identities)
+    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
+        answers = answers[0]
+    actions = [RULE] * number if answers is RULE else rows(answers, integers=False)
     if actions is None or len(actions) != number:
-        what = short_repr(returned) if actions is None else f"{len(actions)} actions"
+        returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
         raise InvalidActionError(
-            f"{short_repr(policy)} was asked for {number} decisions at once and has returned {what}"
+            f"{short_repr(policy)} was asked for {number} decisions at once and returned {returned}; it must return"
+            " one action for each row of the observations, in their order"
         )
     return actions
 
 
-def name_of(policy: Any) -> str:
+def policy_name(policy: Any) -> str:
     """Return the name of a policy."""
     return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or short_repr(policy))
 
 
-def defers(policy: Any) -> bool:
+def follows_rule(policy: Any) -> bool:
     """Return whether a policy certainly leaves decisions to the rule."""
     if isinstance(policy, Mixture):
-        return any(defers(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
+        return any(follows_rule(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
     return policy is RULE

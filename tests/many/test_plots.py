@@ -13,7 +13,8 @@ from matplotlib.legend import Legend
 
 from simenv_marl import RULE, TRUNCATED
 from simenv_marl.data import collect_episodes, plot_returns, plot_timeline
-from simenv_marl.data.plots import COLOURS, UNKNOWN
+from simenv_marl.data.plots import COLOURS
+from simenv_marl.data.timeline import UNKNOWN
 from simenv_marl.errors import MissingExtraError, OptionValueError, UnknownAgentError
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script

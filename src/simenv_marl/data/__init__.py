@@ -4,7 +4,8 @@ from .collect import collect_episodes
 from .comparison import Comparison, compare_with_rule
 from .demonstrations import record_dataset, save_dataset
 from .mixture import Mixture
-from .plots import plot_returns, plot_timeline
+from .plots import plot_returns
+from .timeline import plot_timeline
 from .trajectories import Trajectories
 
 __all__ = [

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
+from dataclasses import dataclass
 from typing import Any, Unpack
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..many.batch import BatchPolicy, PolicyKey, policy_keys, run
 from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
 from ..many.spread import progress_bar, spread
 from ..simulation import RULE
-from .trajectories import Recorder, Trajectories, concatenate, is_answered_by
+from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by
 
 
 def collect_episodes(
@@ -60,47 +61,31 @@ def collect_episodes(
         BaseException: Any exception of a model, a mapping or a policy, with a note that names the seed. All other
             simulations are unwound first.
     """
-    return play_episodes(
-        simulation, policies, seeds=seeds, points=points, collect=collect, batch_size=batch_size, workers=workers,
-        progress=progress, **options,
-    )  # fmt: skip
-
-
-def play_episodes(
-    simulation: Any,
-    policies: Any,
-    *,
-    seeds: Any,
-    rule_keys: Iterable[Any] = (),
-    points: Points = None,
-    collect: Callable[[Any], Any] | None = None,
-    batch_size: int = 1024,
-    workers: int = 0,
-    progress: bool = False,
-    **options: Any,
-) -> dict[Any, Trajectories]:
-    """Do what ``collect_episodes`` does.
-
-    Before anything runs, check that the actions of the rule can be known where a policy of ``rule_keys`` decides.
-    """
-    checked = checked_seeds(seeds)
+    episodes = list(enumerate(checked_seeds(seeds)))
     check_numbers(batch_size, workers)
     check_collect(collect)
     policies = checked_policies(policies)
     plan, keys = learners_plan(simulation, policies, points, options)
-    for key in rule_keys:
-        _check_rule_actions(plan, keys[key])
-    with progress_bar(len(checked)) if progress else nullcontext() as bar:
+    with progress_bar(len(episodes)) if progress else nullcontext() as bar:
         parts = []
-        if not workers or not checked:
-            parts.append(_play(plan, keys, collect, int(batch_size), checked, bar))
+        if not workers or not episodes:
+            parts.append(_play(plan, keys, collect, int(batch_size), episodes, bar))
         else:
             arguments = ((simulation, policies, points, options), collect, int(batch_size))
-            for number, part in spread(_play_part, arguments, checked, int(workers), int(batch_size)):
+            for number, part in spread(_play_part, arguments, episodes, int(workers), int(batch_size)):
                 parts.append(part)
                 if bar is not None:
                     bar.update(number)
-    return {key: concatenate([part[place] for part in parts]) for key, place in keys.items()}
+    all_seeds = tuple(seed for _, seed in episodes)
+    collected = None if collect is None else tuple(value for _, values in parts for value in values)
+    return {key: combine([records[place] for records, _ in parts], all_seeds, collected) for key, place in keys.items()}
+
+
+@dataclass(frozen=True)
+class LeftToRule:
+    """A policy that leaves decisions to the rule, whose actions must be known."""
+
+    policy: Any
 
 
 def learners_plan(
@@ -115,23 +100,40 @@ def learners_plan(
 
     With ``all_points``, entities without a policy are agents as well, whose decisions follow the rule.
     """
+    left = [key for key, policy in policies.items() if isinstance(policy, LeftToRule)]
+    policies = {**policies, **{key: policies[key].policy for key in left}}
     callables = {key: _follow_rule if policy is RULE else policy for key, policy in policies.items()}
     entries = policy_keys(callables, rewarded=True)
     keys = {key: entry.place for key, entry in entries.items() if isinstance(entry, PolicyKey)}
     others = PolicyKey(len(entries), BatchPolicy(_follow_rule)) if all_points else None
     options = {**options, "policies": entries}
-    return Plan.draw_up(simulation, points, options, unanswered=True, rewarded=True, others=others), keys
+    plan = Plan.draw_up(simulation, points, options, unanswered=True, rewarded=True, others=others)
+    for key in left:
+        for point in plan.points:
+            if not point.recorded and is_answered_by(plan, point, keys[key]):
+                raise DefinitionError(
+                    f"the actions of the rule of {point.point.name} are not known; give its make_step a"
+                    " rule_action_mapping, which maps the rule's decision to an action"
+                )
+    return plan, keys
 
 
 def _follow_rule(observations: Any) -> Any:
     return RULE
 
 
+Part = tuple[dict[int, Records], list[Any]]
+"""The results of some episodes: the records by the place of their policy, and what ``collect`` returned."""
+
+
 def _play_part(
-    planned: tuple[Any, Any, Any, Any], collect: Callable[[Any], Any] | None, batch_size: int, seeds: list[int]
-) -> dict[int, Trajectories]:
+    planned: tuple[Any, Any, Any, Any],
+    collect: Callable[[Any], Any] | None,
+    batch_size: int,
+    episodes: list[tuple[int, int]],
+) -> Part:
     """Play a part of the episodes, in a worker process."""
-    return _play(*learners_plan(*planned), collect, batch_size, seeds, None)
+    return _play(*learners_plan(*planned), collect, batch_size, episodes, None)
 
 
 def _play(
@@ -139,12 +141,12 @@ def _play(
     keys: Mapping[Any, int],
     collect: Callable[[Any], Any] | None,
     batch_size: int,
-    seeds: list[int],
+    episodes: list[tuple[int, int]],
     bar: Any,
-) -> dict[int, Trajectories]:
-    """Play episodes in this process; return the trajectories by the place of their policy."""
-    recorder = Recorder()
-    collected: list[Any] = [None] * len(seeds)
+) -> Part:
+    """Play episodes, which are pairs of number and seed, in this process."""
+    recorder = Recorder(episodes[0][0] if episodes else 0)
+    collected: list[Any] = [None] * len(episodes)
 
     def finish(place: int, simulation: Any) -> None:
         if collect is not None:
@@ -152,21 +154,8 @@ def _play(
         if bar is not None:
             bar.update()
 
-    run(plan, seeds, batch_size, finish, recorder)
-    return recorder.trajectories(plan, keys, seeds, None if collect is None else tuple(collected))
-
-
-# -- the rule's actions ---------------------------------------------------------------------------
-
-
-def _check_rule_actions(plan: Plan, place: int) -> None:
-    """Check that the actions of the rule can be known where the policy at this place answers."""
-    for point in plan.points:
-        if not point.recorded and is_answered_by(plan, point, place):
-            raise DefinitionError(
-                f"the actions of the rule of {point.point.name} are not known; give its make_step a"
-                " rule_action_mapping, which maps the rule's decision to an action"
-            )
+    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder)
+    return recorder.records(plan, keys), collected
 
 
 def check_known(found: Trajectories) -> None:

@@ -16,7 +16,7 @@ from ..core.stacking import stacker, taken
 from ..errors import OptionValueError, short_repr
 from ..many.batch import BatchPolicy
 from ..simulation import RULE
-from .collect import check_known, play_episodes
+from .collect import LeftToRule, check_known, collect_episodes
 from .mixture import ask
 from .trajectories import Trajectories, leaves
 
@@ -95,8 +95,8 @@ def compare_with_rule(
             f" {short_repr(others)}"
         )
     shadows = {id(policy): _shadow(policy) for policy in policies.values()}  # one for each, so that keys share batches
-    deciding = {**{key: shadows[id(policy)] for key, policy in policies.items()}, **(others or {})}
-    collected = play_episodes(simulation, deciding, seeds=seeds, rule_keys=policies, points=points, **options)
+    deciding = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
+    collected = collect_episodes(simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options)
     return {key: _compare(collected[key], float(tolerance)) for key in policies}
 
 

@@ -18,7 +18,7 @@ from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
-from .collect import check_known, play_episodes
+from .collect import LeftToRule, check_known, collect_episodes
 from .mixture import follows_rule, policy_name
 from .trajectories import Trajectories
 
@@ -73,11 +73,9 @@ def record_dataset(
     names = _dataset_ids(dataset_id, policies)
     for name in names.values():
         _free_path(name)
-    rule_keys = [key for key in names if follows_rule(policies[key])]
-    collected = play_episodes(
-        simulation, policies, seeds=seeds, rule_keys=rule_keys, points=points, batch_size=batch_size, workers=workers,
-        progress=progress, **options,
-    )  # fmt: skip
+    left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
+    sizes: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress}
+    collected = collect_episodes(simulation, {**policies, **left}, seeds=seeds, points=points, **sizes, **options)
     for key, name in names.items():
         _check_writable(name, collected[key])
     origin = provenance(simulation, points, **options)

@@ -31,6 +31,9 @@ NAMED: Final = 12
 UNKNOWN: Final = "#BDBDBD"
 """The colour of decisions whose action is unknown."""
 
+REWARDS: Final = ("#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B")
+"""The scale of rewards, from the lowest to the highest."""
+
 ENDS: Final = {"x": "terminated", "|": "truncated"}
 """The marks of terminations and truncations."""
 
@@ -409,12 +412,20 @@ def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], part: _Part, values
 
 
 def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
-    """Colour the decisions by their rewards; zero is pale."""
+    """Colour the decisions by their rewards; zero is white."""
+    from matplotlib.colors import LinearSegmentedColormap
+
     rewards = np.concatenate([row.rewards for row in rows])
     # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
     low, high = rewards.min(), rewards.max()
     extend = ("neither", "min", "max", "both")[int(low < -most) + 2 * int(high > most)]
-    scale = _colour(axes, _cells(rows, slim=False), array=rewards, cmap="PuOr", clim=(-most, most))
+    scale = _colour(
+        axes,
+        _cells(rows, slim=False),
+        array=rewards,
+        cmap=LinearSegmentedColormap.from_list("reward", REWARDS),
+        clim=(-most, most),
+    )
     bar = _colour_bar(axes, scale, extend)
     bar.ax.set_ylim(-most if low < 0 else 0.0, most if high > 0 or low == 0 else 0.0)

@@ -5,10 +5,10 @@ get the same rows sorted by policy, episode, agent and step, independent of that
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from math import nan
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -127,14 +127,6 @@ class Trajectories:
         return taken(joined([self.observations, self.last_observations]), following)
 
 
-ARRAYS: Final = [
-    own.name
-    for own in fields(Trajectories)
-    if own.name not in ("seeds", "names", "observation_space", "action_space", "collected")
-]
-"""The attributes that are arrays, or dicts or tuples of arrays."""
-
-
 def leaves(stack: Any, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the arrays of a stack, with their names: ``[1]`` in a tuple, ``litres`` or ``[1]['litres']`` in a dict."""
     if isinstance(stack, Mapping):
@@ -147,32 +139,47 @@ def leaves(stack: Any, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
         yield name, stack
 
 
-def concatenate(parts: Sequence[Trajectories]) -> Trajectories:
-    """Concatenate the trajectories of one policy in consecutive parts of the episodes.
+@dataclass(frozen=True)
+class Records:
+    """The records of one policy in some episodes, in the order of its ``Trajectories``."""
+
+    decisions: Mapping[str, Any]  # by attribute of ``Trajectories``: arrays with a row for each decision
+    trajectories: Mapping[str, Any]  # the same with a row for each trajectory
+    observation_space: spaces.Space[Any] | None
+    action_space: spaces.Space[Any] | None
+
+
+def combine(parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[Any, ...] | None = None) -> Trajectories:
+    """Combine the records of one policy in consecutive parts of the episodes.
+
+    Args:
+        parts: The records.
+        seeds: The seeds of all episodes.
+        collected: What ``collect`` returned for each episode.
 
     Raises:
         OptionValueError: The policy did not return the same extras in all parts.
     """
-    seeds = tuple(seed for part in parts for seed in part.seeds)
-    collected = None
-    if parts[0].collected is not None:
-        collected = tuple(value for part in parts for value in part.collected or ())
-    names = dict.fromkeys(name for part in parts for name in part.names)
-    codes = {name: code for code, name in enumerate(names)}
-    arrays, first_row, first_episode = [], 0, 0
-    for part in parts:
-        if len(part):  # the arrays of parts without a decision are incomplete
-            own = {name: getattr(part, name) for name in ARRAYS if getattr(part, name) is not None}
-            own["starts"] = part.starts + first_row
-            own["episodes"] = part.episodes + first_episode
-            own["agents"] = np.array([codes[name] for name in part.names])[part.agents]
-            arrays.append(own)
-        first_row += len(part)
-        first_episode += len(part.seeds)
-    template = next((part for part in parts if len(part)), parts[0])
-    _check_extras([own["extras"] for own in arrays])
-    changes = joined(arrays) if arrays else {}
-    return replace(template, **changes, names=tuple(names), seeds=seeds, collected=collected)
+    filled = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
+    _check_extras([part.decisions["extras"] for part in filled])
+    trajectories = joined([part.trajectories for part in filled])
+    lengths, names = trajectories["lengths"], dict.fromkeys(trajectories["agents"].tolist())
+    starts, codes = np.cumsum(lengths) - lengths, {name: code for code, name in enumerate(names)}
+    agents = np.array([codes[name] for name in trajectories["agents"].tolist()], np.int64)
+    return Trajectories(
+        **joined([part.decisions for part in filled]),
+        last_observations=trajectories["last_observations"],
+        last_turns=trajectories["last_turns"],
+        starts=starts,
+        episodes=np.repeat(trajectories["episodes"], lengths),
+        seeds=seeds,
+        agents=np.repeat(agents, lengths),
+        names=tuple(names),
+        steps=np.arange(lengths.sum()) - np.repeat(starts, lengths),
+        observation_space=filled[0].observation_space,
+        action_space=filled[0].action_space,
+        collected=collected,
+    )
 
 
 # -- while episodes run ---------------------------------------------------------------------------
@@ -180,24 +187,14 @@ def concatenate(parts: Sequence[Trajectories]) -> Trajectories:
 
 @dataclass(slots=True)
 class _TrajectoryLog:
-    """The record of one trajectory. If its episode fails, it has no end.
-
-    Attributes:
-        decisions: The log that has its decisions.
-        episode: The place of its episode.
-        agent: The name of its agent.
-        rows: The rows of its decisions in that log.
-        last_observation: Its final observation.
-        last_turn: The number of decisions in the episode when it ended.
-        terminated, truncated: How it ended.
-    """
+    """The record of one trajectory. If its episode fails, it has no end."""
 
     decisions: "_DecisionLog"
     episode: int
     agent: str
-    rows: list[int] = field(default_factory=list)
+    rows: list[int] = field(default_factory=list)  # of its decisions in their log
     last_observation: Any = None
-    last_turn: int = -1
+    last_turn: int = -1  # the number of decisions in the episode when it ended
     terminated: bool = False
     truncated: bool = False
 
@@ -235,11 +232,7 @@ class _DecisionLog:
 
     @cached_property
     def columns(self) -> dict[str, Any]:
-        """Return the values of all decisions, by the names of attributes of ``Trajectories``.
-
-        Raises:
-            OptionValueError: The policy did not always return the same extras.
-        """
+        """Return the values of all decisions, by attribute of ``Trajectories``."""
         _check_extras(self.extras)
         number, by_rule = len(self.rewards), np.array(self.by_rule, np.bool_)
         # The actions of the rule lie behind those of the policy; ``rows`` finds the action of each decision.
@@ -264,40 +257,31 @@ class _DecisionLog:
             columns["elapsed"] = np.array(self.elapsed, np.float64)
         return columns
 
-    def trajectories_of(self, place: int, seeds: tuple[int, ...], collected: tuple[Any, ...] | None) -> Trajectories:
-        """Return the trajectories of the policy at a place, sorted as learners get them."""
+    def records(self, place: int) -> Records:
+        """Return the records of the policy at a place, sorted by episode, agent and step."""
         logs = sorted(self.trajectories.get(place, ()), key=lambda log: (log.episode, log.rows[0]))
         lengths = np.array([len(log.rows) for log in logs], np.int64)
-        starts = np.cumsum(lengths) - lengths
-        rows = np.array([row for log in logs for row in log.rows], np.int64)
-        last_rows = starts + lengths - 1
-        terminations, truncations = np.zeros((2, len(rows)), np.bool_)
+        last_rows = np.cumsum(lengths) - 1
+        terminations, truncations = np.zeros((2, lengths.sum()), np.bool_)
         terminations[last_rows] = [log.terminated for log in logs]
         truncations[last_rows] = [log.truncated for log in logs]
-        names = dict.fromkeys(log.agent for log in logs)
-        codes = {name: code for code, name in enumerate(names)}
-        return Trajectories(
-            **taken(self.columns, rows),
-            terminations=terminations,
-            truncations=truncations,
-            last_observations=self.stack_observations([log.last_observation for log in logs]),
-            last_turns=np.array([log.last_turn for log in logs], np.int64),
-            starts=starts,
-            episodes=np.repeat(np.array([log.episode for log in logs], np.int64), lengths),
-            seeds=seeds,
-            agents=np.repeat(np.array([codes[log.agent] for log in logs], np.int64), lengths),
-            names=tuple(names),
-            steps=np.arange(len(rows)) - np.repeat(starts, lengths),
-            observation_space=self.observation_space,
-            action_space=self.action_space,
-            collected=collected,
-        )
+        rows = np.array([row for log in logs for row in log.rows], np.int64)
+        decisions = taken(self.columns, rows) | {"terminations": terminations, "truncations": truncations}
+        trajectories = {
+            "lengths": lengths,
+            "episodes": np.array([log.episode for log in logs], np.int64),
+            "agents": np.array([log.agent for log in logs], object),
+            "last_turns": np.array([log.last_turn for log in logs], np.int64),
+            "last_observations": self.stack_observations([log.last_observation for log in logs]),
+        }
+        return Records(decisions, trajectories, self.observation_space, self.action_space)
 
 
 class Recorder:
     """Records the decisions of episodes while they run: a ``Watcher`` for ``run``."""
 
-    def __init__(self) -> None:
+    def __init__(self, first_episode: int = 0) -> None:
+        self._first_episode = first_episode
         self._logs: dict[Group, _DecisionLog] = {}
 
     def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
@@ -310,7 +294,7 @@ class Recorder:
         for place, episode, agent in zip(places, waiting, agents, strict=True):
             trajectory = agent.notes
             if trajectory is None:
-                trajectory = agent.notes = _TrajectoryLog(log, place, agent.name)
+                trajectory = agent.notes = _TrajectoryLog(log, self._first_episode + place, agent.name)
                 log.trajectories.setdefault(agent.policy.place, []).append(trajectory)
             trajectory.rows.append(row)
             turns.append(episode.turns)
@@ -349,22 +333,18 @@ class Recorder:
             for agent in episode.agents.values():
                 _end(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
-    def trajectories(
-        self, plan: Plan, keys: Mapping[Any, int], seeds: Sequence[int], collected: tuple[Any, ...] | None
-    ) -> dict[int, Trajectories]:
-        """Return the recorded trajectories, by the place of their policy.
+    def records(self, plan: Plan, keys: Mapping[Any, int]) -> dict[int, Records]:
+        """Return the records by the place of their policy.
 
         Args:
             plan: The plan of the episodes.
             keys: The places of the policies, by their keys.
-            seeds: The seeds of the episodes.
-            collected: What ``collect`` returned for each episode.
 
         Raises:
             AgentError: One policy key answered at several points whose spaces differ.
             OptionValueError: A policy did not always return the same extras.
         """
-        found = {}
+        records = {}
         for key, place in keys.items():
             logs = [log for log in self._logs.values() if place in log.trajectories]
             if len(logs) > 1:
@@ -375,8 +355,8 @@ class Recorder:
             if not logs:
                 point = next((point for point in plan.points if is_answered_by(plan, point, place)), None)
                 logs = [_DecisionLog(point)]
-            found[place] = logs[0].trajectories_of(place, tuple(seeds), collected)
-        return found
+            records[place] = logs[0].records(place)
+        return records
 
 
 def is_answered_by(plan: Plan, point: BoundPoint, place: int) -> bool:

@@ -300,6 +300,16 @@ def test_policies_have_panels_of_their_own_unless_they_are_many():
     assert texts(many.axes[0]) == ["1"]
 
 
+def test_policies_with_too_many_different_actions_share_a_scale():
+    names = [f"being_{place}" for place in range(30)]
+    policies = {name: lambda seen, own=place: [own] * len(seen) for place, name in enumerate(names)}
+    points = beings(action_space=spaces.Discrete(40))
+    found = collect_episodes(herd(30, 1), policies, points=points, seeds=[5])
+    scale = of(plot_timeline(found).axes[0], PolyCollection)[-1]
+    assert scale.get_array().tolist() == list(range(30))
+    assert scale.get_clim() == (0, 29)
+
+
 def test_decisions_of_the_same_time_share_it():
     def main(simulation):
         simulation.crowd = [Being(number) for number in range(8)]

@@ -5,8 +5,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Unpack
 
-import numpy as np
-
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
@@ -156,19 +154,3 @@ def _play(
 
     run(plan, [seed for _, seed in episodes], batch_size, finish, recorder)
     return recorder.records(plan, keys), collected
-
-
-def check_known(found: Trajectories) -> None:
-    """Check that the action of each decision is known, also of those that were left to the rule.
-
-    Raises:
-        DefinitionError: Some actions are not known.
-    """
-    unknown = np.flatnonzero(~found.known)
-    if len(unknown):
-        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
-        raise DefinitionError(
-            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known, first for {agent!r} at"
-            f" turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point needs a"
-            " rule_action_mapping that returns an action for every decision of the rule"
-        )

@@ -18,8 +18,8 @@ from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
-from .collect import LeftToRule, check_known, collect_episodes
-from .mixture import follows_rule, policy_name
+from .collect import LeftToRule, collect_episodes
+from .rule import check_known, follows_rule, policy_name
 from .trajectories import Trajectories
 
 __all__ = ["record_dataset", "save_dataset"]

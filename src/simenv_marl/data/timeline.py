@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
@@ -40,12 +40,12 @@ ENDS: Final = {"x": "terminated", "|": "truncated"}
 
 @dataclass(frozen=True)
 class _Part:
-    """One array of a policy's actions."""
+    """One array of the actions of a policy or of one of its agents."""
 
     name: str  # its place in the action; empty if the action is one array
-    values: NDArray[Any]  # (N, width): of all decisions of the policy
-    labels: Mapping[int, str] | None  # of its values, where each value has a colour
-    limits: tuple[float, float]  # of its values, in all episodes
+    values: NDArray[Any]  # (decisions, width)
+    labels: Mapping[int, str] | None  # of the policy's values in all episodes, where each has a colour
+    limits: tuple[float, float]  # of the policy's values in all episodes
 
     @property
     def components(self) -> list[str]:
@@ -63,20 +63,11 @@ class TimelineRow:
     turn: int  # of its first decision
     times: NDArray[Any]  # of its decisions
     end: float  # the time of its end
-    actions: list[NDArray[Any]]  # (decisions, width): for each part
+    parts: list[_Part]  # of its actions
     rewards: NDArray[np.float64]
     known: NDArray[np.bool_]
     by_rule: NDArray[np.bool_]
     marks: list[str]  # of its end
-
-
-@dataclass(frozen=True)
-class _Panel:
-    """Agents with like actions: those of one policy, or of several."""
-
-    title: str
-    rows: list[TimelineRow]
-    parts: list[_Part]
 
 
 def plot_timeline(
@@ -131,16 +122,16 @@ def plot_timeline(
         raise OptionValueError(
             f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has decided in it"
         )
-    parts = {key: _parts(found, _names(key, action_names)) for key, found in deciding.items()}
-    rows = [row for key, found in deciding.items() for row in _rows(key, found, parts[key], number)]
+    rows: list[TimelineRow] = []
+    for key, found in deciding.items():
+        rows += _rows(key, found, _parts(found, _names(key, action_names)), number)
     if agents is not None:
         rows = _choose(rows, agents, number)
-    panels = _panels(rows, parts)
     begin, end = min(row.times[0] for row in rows), max(row.end for row in rows)
     with style("plot_timeline") as new_figure:
         make = new_figure if figure is None else lambda width, height: figure
         charts = len(rows) <= CHARTED
-        columns = _draw_charts(panels, make, begin, end) if charts else _draw_rows(panels, make, component)
+        columns = _draw_charts(rows, make, begin, end) if charts else _draw_panels(_panels(rows), make, component)
         margin = (0.02 if charts else 0.01) * (end - begin or 1.0)
         clock = all(found.times is not None for found in deciding.values())
         for column in columns:
@@ -200,7 +191,7 @@ def _rows(key: Any, found: Trajectories, parts: list[_Part], episode: int) -> It
             turn=int(found.turns[start]),
             times=times,
             end=end,
-            actions=[part.values[rows] for part in parts],
+            parts=[replace(part, values=part.values[rows]) for part in parts],
             rewards=found.rewards[rows],
             known=found.known[rows],
             by_rule=found.by_rule[rows],
@@ -222,18 +213,13 @@ def _choose(rows: Sequence[TimelineRow], agents: Any, episode: int) -> list[Time
     return [by_name[name] for name in dict.fromkeys(agents)]
 
 
-def _panels(rows: list[TimelineRow], parts: Mapping[Any, list[_Part]]) -> list[_Panel]:
-    """Return one panel for each policy; a single one if there are many policies with like actions."""
+def _panels(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
+    """Group the rows by policy; make one group of them if there are many policies with like actions."""
     keys = list(dict.fromkeys(row.key for row in rows))
-    kinds = {tuple((part.name, part.values.shape[1], part.labels is None) for part in parts[key]) for key in keys}
+    kinds = {tuple((*part.components, part.labels is None) for part in row.parts) for row in rows}
     if len(keys) <= CHARTED or len(kinds) > 1:
-        return [_Panel(title_of(key), [row for row in rows if row.key == key], parts[key]) for key in keys]
-    shared = []
-    for same in zip(*(parts[key] for key in keys), strict=True):
-        labels = {value: label for part in same for value, label in (part.labels or {}).items()}
-        limits = min(part.limits[0] for part in same), max(part.limits[1] for part in same)
-        shared.append(_Part(same[0].name, same[0].values, dict(sorted(labels.items())) or None, limits))
-    return [_Panel("", sorted(rows, key=lambda row: row.turn), shared)]
+        return [[row for row in rows if row.key == key] for key in keys]
+    return [sorted(rows, key=lambda row: row.turn)]
 
 
 def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> None:
@@ -260,18 +246,20 @@ def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> No
 # -- few agents: charts ---------------------------------------------------------------------------
 
 
-def _draw_charts(panels: Sequence[_Panel], make: Callable[..., Any], begin: float, end: float) -> list[list[Any]]:
+def _draw_charts(rows: Sequence[TimelineRow], make: Callable[..., Any], begin: float, end: float) -> list[list[Any]]:
     """Draw charts of the actions and one of the rewards for each agent; return them as one column."""
-    rows = [(panel, row, min(len(panel.parts), DRAWN)) for panel in panels for row in panel.rows]
-    heights = [height for *_, number in rows for height in [1.0] * number + [0.6]]
-    figure = make(9.5, 0.9 + sum(0.75 + 0.95 * number for *_, number in rows))
+    numbers = [min(len(row.parts), DRAWN) for row in rows]
+    heights = [height for number in numbers for height in [1.0] * number + [0.6]]
+    figure = make(9.5, 0.9 + sum(0.75 + 0.95 * number for number in numbers))
     column = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0].tolist()
     remaining = iter(column)
-    for panel, row, number in rows:
+    for row, number in zip(rows, numbers, strict=True):
         *charts, rewards = islice(remaining, number + 1)
-        for axes, part, values in zip(charts, panel.parts, row.actions, strict=False):
-            _chart_actions(axes, row, part, values)
-        charts[0].set_title(row.agent if panel.title in ("", row.agent) else f"{row.agent}  ({panel.title})")
+        for axes, part in zip(charts, row.parts, strict=False):
+            _chart_actions(axes, row, part)
+        charts[0].set_title(
+            row.agent if title_of(row.key) in ("", row.agent) else f"{row.agent}  ({title_of(row.key)})"
+        )
         rewards.vlines(row.times, 0.0, row.rewards, color=INK, linewidth=1.4 if len(row.times) <= 150 else 0.7)
         rewards.axhline(0.0, color=PALE, linewidth=0.8, zorder=1)
         rewards.set_ylabel("reward")
@@ -287,12 +275,12 @@ def _draw_charts(panels: Sequence[_Panel], make: Callable[..., Any], begin: floa
     return [column]
 
 
-def _chart_actions(axes: Axes, row: TimelineRow, part: _Part, values: NDArray[Any]) -> None:
+def _chart_actions(axes: Axes, row: TimelineRow, part: _Part) -> None:
     """Draw a line for each component of the actions, with a dot for each decision."""
     hollow: dict[str, Any] = {"color": "white", "linewidths": 0.9, "zorder": 3}
     size = 14 if len(row.times) <= 150 else 5
     by_policy, by_rule = row.known & ~row.by_rule, row.known & row.by_rule
-    for name, heights, colour in zip(part.components[:DRAWN], values.T.astype(float), COLOURS, strict=False):
+    for name, heights, colour in zip(part.components[:DRAWN], part.values.T.astype(float), COLOURS, strict=False):
         line = np.where(row.known, heights, np.nan)
         axes.step(row.times, line, where="post", color=colour, linewidth=0.8, alpha=0.5, zorder=2)
         axes.scatter(row.times[by_policy], heights[by_policy], size, **hollow | {"color": colour}, label=name)
@@ -315,16 +303,15 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: _Part, values: NDArray[An
 # -- many agents: rows of colours -----------------------------------------------------------------
 
 
-def _draw_rows(panels: Sequence[_Panel], make: Callable[..., Any], component: str | None) -> list[list[Any]]:
+def _draw_panels(panels: list[list[TimelineRow]], make: Callable[..., Any], component: str | None) -> list[list[Any]]:
     """Draw a row for each agent, coloured by its actions and by its rewards; return the axes in two columns."""
     components = _components(panels, component)
-    heights = np.clip([0.16 * len(panel.rows) for panel in panels], 1.2, 6.0)
+    heights = np.clip([0.16 * len(rows) for rows in panels], 1.2, 6.0)
     heights = np.maximum(1.2, heights * min(1.0, 9.0 / heights.sum()))
     figure = make(11.0, 1.0 + 0.3 * len(panels) + heights.sum())
     grid = figure.subplots(len(panels), 2, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
-    for (left, right), panel, (number, place) in zip(grid, panels, components, strict=True):
-        part, rows = panel.parts[number], panel.rows
-        _colour_actions(left, rows, part, np.concatenate([row.actions[number][:, place] for row in rows]))
+    for (left, right), rows, (number, place) in zip(grid, panels, components, strict=True):
+        _colour_actions(left, rows, number, place)
         _colour_rewards(right, rows)
         points = 72 * left.get_window_extent().height / figure.dpi / len(rows)  # the height of a row
         size = float(np.clip(0.8 * points, 1.5, 6.0))
@@ -337,19 +324,20 @@ def _draw_rows(panels: Sequence[_Panel], make: Callable[..., Any], component: st
         step = max(1, int(np.ceil(9.0 / points)))
         left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
         left.set_ylim(len(rows) - 0.4, -0.6)
-        total = sum(len(part.components) for part in panel.parts)
-        what = f"action {part.components[place]}, one of {total}" if total > 1 else "action"
-        left.set_title(f"{panel.title}, {len(rows)} agents: {what}".removeprefix(", "))
+        title = title_of(rows[0].key) if len({row.key for row in rows}) == 1 else ""
+        names = [name for part in rows[0].parts for name in part.components]
+        what = f"action {rows[0].parts[number].components[place]}, one of {len(names)}" if len(names) > 1 else "action"
+        left.set_title(f"{title}, {len(rows)} agents: {what}".removeprefix(", "))
         right.set_title("reward")
     columns: list[list[Any]] = grid.T.tolist()
     return columns
 
 
-def _components(panels: Sequence[_Panel], component: str | None) -> list[tuple[int, int]]:
+def _components(panels: list[list[TimelineRow]], component: str | None) -> list[tuple[int, int]]:
     """Return the part and its column by which the rows of each panel are coloured."""
     places = [
-        {name: (number, place) for number, part in enumerate(panel.parts) for place, name in enumerate(part.components)}
-        for panel in panels
+        {name: (number, place) for number, part in enumerate(parts) for place, name in enumerate(part.components)}
+        for parts in (rows[0].parts for rows in panels)
     ]
     names = dict.fromkeys(name for own in places for name in own)
     if component is not None and component not in names:
@@ -391,23 +379,27 @@ def _colour_bar(axes: Axes, scale: Any, extend: str) -> Any:
     return bar
 
 
-def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], part: _Part, values: NDArray[Any]) -> None:
-    """Colour the decisions by their actions."""
+def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], number: int, place: int) -> None:
+    """Colour the decisions by a component of their actions: its part, and its column in it."""
     from matplotlib.patches import Patch
 
+    parts = [row.parts[number] for row in rows]
+    values = np.concatenate([part.values[:, place] for part in parts])
     known = np.concatenate([row.known for row in rows])
     _colour(axes, _cells(rows, slim=False), facecolors="white")  # white while the agent lives
     cells = _cells(rows, slim=True)
     if not known.all():
         _colour(axes, cells[~known], facecolors=UNKNOWN)
-    if part.labels is None:
-        scale = _colour(axes, cells[known], array=values[known].astype(float), cmap="viridis", clim=part.limits)
+    labels = {value: label for part in parts for value, label in (part.labels or {}).items()}
+    if not 0 < len(labels) <= NAMED:
+        limits = min(part.limits[0] for part in parts), max(part.limits[1] for part in parts)
+        scale = _colour(axes, cells[known], array=values[known].astype(float), cmap="viridis", clim=limits)
         _colour_bar(axes, scale, "neither")
         return
-    inside = all(0 <= action < len(COLOURS) for action in part.labels)
-    colours = {action: COLOURS[action if inside else rank] for rank, action in enumerate(part.labels)}
+    inside = all(0 <= action < len(COLOURS) for action in labels)
+    colours = {action: COLOURS[action if inside else rank] for rank, action in enumerate(sorted(labels))}
     _colour(axes, cells[known], facecolors=[colours[int(value)] for value in values[known]])
-    patches = [Patch(color=colours[action], label=label) for action, label in part.labels.items()]
+    patches = [Patch(color=colour, label=labels[action]) for action, colour in colours.items()]
     axes.legend(handles=patches, loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=0.9, handleheight=0.9)
 
 
@@ -420,12 +412,7 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
     low, high = rewards.min(), rewards.max()
     extend = ("neither", "min", "max", "both")[int(low < -most) + 2 * int(high > most)]
-    scale = _colour(
-        axes,
-        _cells(rows, slim=False),
-        array=rewards,
-        cmap=LinearSegmentedColormap.from_list("reward", REWARDS),
-        clim=(-most, most),
-    )
+    colours = LinearSegmentedColormap.from_list("reward", REWARDS)
+    scale = _colour(axes, _cells(rows, slim=False), array=rewards, cmap=colours, clim=(-most, most))
     bar = _colour_bar(axes, scale, extend)
     bar.ax.set_ylim(-most if low < 0 else 0.0, most if high > 0 or low == 0 else 0.0)

@@ -161,7 +161,12 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
                 action_space=trajectories.action_space,
                 **{"jpeg_encoding": False, **metadata},
             )
-        dataset.storage.update_episode_metadata(_episode_metadata(trajectories))
+        starts, names = trajectories.starts, trajectories.names
+        columns = (trajectories.agents[starts], trajectories.episodes[starts], trajectories.turns[starts])
+        dataset.storage.update_episode_metadata(
+            {"agent": names[agent], "episode": episode, "turn": turn}
+            for agent, episode, turn in zip(*(column.tolist() for column in columns), strict=True)
+        )
     except BaseException:
         shutil.rmtree(path, ignore_errors=True)  # never leave half a data set
         raise
@@ -245,11 +250,3 @@ def _object_lists(stack: Any) -> Any:
     if isinstance(stack, tuple):
         return tuple(_object_lists(part) for part in stack)
     return list(stack) if stack.dtype == object else stack
-
-
-def _episode_metadata(found: Trajectories) -> list[dict[str, Any]]:
-    """Return the metadata of each trajectory."""
-    starts = found.starts
-    agents = [found.names[agent] for agent in found.agents[starts]]
-    columns = zip(agents, found.episodes[starts].tolist(), found.turns[starts].tolist(), strict=True)
-    return [{"agent": agent, "episode": episode, "turn": turn} for agent, episode, turn in columns]

@@ -188,9 +188,6 @@ def compare_with_rule(
     return {key: _compare(collected[key], float(tolerance)) for key in policies}
 
 
-# -- the policy beside the rule -------------------------------------------------------------------
-
-
 def _shadow(policy: Any) -> Any:
     """Make a policy that records the action of another policy as an extra, and leaves the decision to the rule."""
     if asks_for_environment(policy):
@@ -209,9 +206,6 @@ def _record_one(policy: AskingPolicy, observation: Any, info: Any, *, _environme
     recorded = np.empty((), object)
     recorded[()] = policy.answer(observation, info, _environment)
     return RULE, {SHADOW: recorded}
-
-
-# -- the comparison -------------------------------------------------------------------------------
 
 
 def _compare(found: Trajectories, tolerance: float) -> Comparison:
@@ -241,11 +235,7 @@ def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> NDA
 
 
 def _ask(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> list[Any]:
-    """Ask a policy for the actions of some decisions, and drop the extras.
-
-    Raises:
-        InvalidActionError: The policy did not return one action for each decision.
-    """
+    """Ask a policy for one action for each decision, and drop the extras."""
     number, answers = len(identities), batch_policy.answers(observations, infos, identities)
     if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
         answers = answers[0]
@@ -272,11 +262,7 @@ def follows_rule(policy: Any) -> bool:
 
 
 def check_known(found: Trajectories) -> None:
-    """Check that the action of each decision is known, also of those that were left to the rule.
-
-    Raises:
-        DefinitionError: Some actions are not known.
-    """
+    """Check that the action of each decision is known, also of those that were left to the rule."""
     unknown = np.flatnonzero(~found.known)
     if len(unknown):
         agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]

@@ -150,16 +150,7 @@ class Records:
 
 
 def combine(parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[Any, ...] | None = None) -> Trajectories:
-    """Combine the records of one policy in consecutive parts of the episodes.
-
-    Args:
-        parts: The records.
-        seeds: The seeds of all episodes.
-        collected: What ``collect`` returned for each episode.
-
-    Raises:
-        OptionValueError: The policy did not return the same extras in all parts.
-    """
+    """Combine the records of one policy in consecutive parts of the episodes; seeds and values are those of all."""
     filled = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
     _check_extras([part.decisions["extras"] for part in filled])
     trajectories = joined([part.trajectories for part in filled])
@@ -202,13 +193,7 @@ class _TrajectoryLog:
 class _DecisionLog:
     """The decisions of one group, in the order of the answers.
 
-    Observations, actions, masks and extras have one entry for each batch; all other lists have one for each decision.
-    Without a decision point, there are no decisions.
-
-    Attributes:
-        name: The name of one of the group's decision points.
-        trajectories: The trajectories by the place of their policy, in the order of their beginnings.
-        rule_actions: The known actions of the rule, by row.
+    The point is one of those at which the group decides; None if it is not known, and there are no decisions.
     """
 
     def __init__(self, point: BoundPoint | None) -> None:
@@ -218,17 +203,19 @@ class _DecisionLog:
         self.stack_observations = _stacker(self.observation_space)
         self.stack_actions = _stacker(self.action_space)
         self.unknown_action = None if self.action_space is None else blank(self.action_space)
+        # One entry for each batch.
         self.observations: list[Any] = []
         self.actions: list[Any] = []
         self.masks: list[Any] = []
         self.extras: list[dict[str, NDArray[Any]]] = []
+        # One entry for each decision.
         self.turns: list[int] = []
         self.by_rule: list[bool] = []
         self.times: list[float] = []
         self.rewards: list[float] = []
         self.elapsed: list[float] = []
-        self.rule_actions: dict[int, Any] = {}
-        self.trajectories: dict[int, list[_TrajectoryLog]] = {}
+        self.rule_actions: dict[int, Any] = {}  # by row; only those that are known
+        self.trajectories: dict[int, list[_TrajectoryLog]] = {}  # by the place of their policy
 
     @cached_property
     def columns(self) -> dict[str, Any]:
@@ -334,16 +321,7 @@ class Recorder:
                 _end(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
     def records(self, plan: Plan, keys: Mapping[Any, int]) -> dict[int, Records]:
-        """Return the records by the place of their policy.
-
-        Args:
-            plan: The plan of the episodes.
-            keys: The places of the policies, by their keys.
-
-        Raises:
-            AgentError: One policy key answered at several points whose spaces differ.
-            OptionValueError: A policy did not always return the same extras.
-        """
+        """Return the records by the place of their policy, from the places by key."""
         records = {}
         for key, place in keys.items():
             logs = [log for log in self._logs.values() if place in log.trajectories]

@@ -91,7 +91,7 @@ test-wheel:
 PYTHONS := 3.11 3.12 3.13
 test-pythons:
 	sh tools/pythons.sh "$(TESTED_WITH)" \
-	    "tests/contract tests/core tests/envs" \
+	    "tests/contract tests/core tests/data/test_collected.py tests/data/test_rule_actions.py tests/envs" \
 	    $(filter-out $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])'),$(PYTHONS))
 
 # Local clusters, on the loopback address only. Each has its own virtual environment, because of its pinned versions.

@@ -1,10 +1,10 @@
 """Trajectories of many episodes, data sets, comparisons with the rule, and plots."""
 
 from .collect import collect_episodes
-from .comparison import Comparison, compare_with_rule
 from .demonstrations import record_dataset, save_dataset
-from .mixture import Mixture
-from .plots import plot_returns, plot_timeline
+from .plots import plot_returns
+from .rule import Comparison, Mixture, compare_with_rule
+from .timeline import plot_timeline
 from .trajectories import Trajectories
 
 __all__ = [

@@ -2,17 +2,18 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any, Unpack
 
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
-from ..many.batch import BatchPolicy, PolicyKey, Watcher, policy_keys, run
+from ..errors import DefinitionError
+from ..many.batch import BatchPolicy, PolicyKey, policy_keys, run
 from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
 from ..many.spread import progress_bar, spread
 from ..simulation import RULE
-from .trajectories import Ledger, Trajectories, merged
+from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by
 
 
 def collect_episodes(
@@ -58,23 +59,31 @@ def collect_episodes(
         BaseException: Any exception of a model, a mapping or a policy, with a note that names the seed. All other
             simulations are unwound first.
     """
-    checked = checked_seeds(seeds)
+    episodes = list(enumerate(checked_seeds(seeds)))
     check_numbers(batch_size, workers)
     check_collect(collect)
-    given = checked_policies(policies)
-    plan, keys = learners_plan(simulation, given, points, options)
-    with progress_bar(len(checked)) if progress else nullcontext() as bar:
-        if not workers or not checked:
-            found = _collect(plan, keys, collect, int(batch_size), checked, bar)
+    policies = checked_policies(policies)
+    plan, keys = learners_plan(simulation, policies, points, options)
+    with progress_bar(len(episodes)) if progress else nullcontext() as bar:
+        parts = []
+        if not workers or not episodes:
+            parts.append(_play(plan, keys, collect, int(batch_size), episodes, bar))
         else:
-            parts = []
-            arguments = (simulation, given, points, collect, int(batch_size), options)
-            for number, part in spread(_collect_part, arguments, checked, int(workers), int(batch_size)):
+            arguments = ((simulation, policies, points, options), collect, int(batch_size))
+            for number, part in spread(_play_part, arguments, episodes, int(workers), int(batch_size)):
                 parts.append(part)
                 if bar is not None:
                     bar.update(number)
-            found = {place: merged([part[place] for part in parts]) for place in keys.values()}
-    return {key: found[place] for key, place in keys.items()}
+    all_seeds = tuple(seed for _, seed in episodes)
+    collected = None if collect is None else tuple(value for _, values in parts for value in values)
+    return {key: combine([records[place] for records, _ in parts], all_seeds, collected) for key, place in keys.items()}
+
+
+@dataclass(frozen=True)
+class LeftToRule:
+    """A policy that leaves decisions to the rule, whose actions must be known."""
+
+    policy: Any
 
 
 def learners_plan(
@@ -87,50 +96,55 @@ def learners_plan(
 ) -> tuple[Plan, dict[Any, int]]:
     """Return the plan of the episodes, and the place of each policy by its key.
 
-    Args:
-        simulation: As ``collect_episodes`` takes it.
-        policies: As ``collect_episodes`` takes them.
-        points: As ``collect_episodes`` takes them.
-        options: As ``collect_episodes`` takes them.
-        all_points: Whether entities without a policy are agents as well, whose decisions follow the rule.
+    With ``all_points``, entities without a policy are agents as well, whose decisions follow the rule.
     """
-    asked = {key: _left_to_the_rule if policy is RULE else policy for key, policy in policies.items()}
-    found = policy_keys(asked, rewarded=True)
-    keys = {key: entry.place for key, entry in found.items() if isinstance(entry, PolicyKey)}
-    others = PolicyKey(len(found), BatchPolicy(_left_to_the_rule)) if all_points else None
-    given = {**options, "policies": found}
-    return Plan.draw_up(simulation, points, given, unattended=True, rewarded=True, others=others), keys
+    left = [key for key, policy in policies.items() if isinstance(policy, LeftToRule)]
+    policies = {**policies, **{key: policies[key].policy for key in left}}
+    callables = {key: _follow_rule if policy is RULE else policy for key, policy in policies.items()}
+    entries = policy_keys(callables, rewarded=True)
+    keys = {key: entry.place for key, entry in entries.items() if isinstance(entry, PolicyKey)}
+    others = PolicyKey(len(entries), BatchPolicy(_follow_rule)) if all_points else None
+    options = {**options, "policies": entries}
+    plan = Plan.draw_up(simulation, points, options, unanswered=True, rewarded=True, others=others)
+    for key in left:
+        for point in plan.points:
+            if not point.recorded and is_answered_by(plan, point, keys[key]):
+                raise DefinitionError(
+                    f"the actions of the rule of {point.point.name} are not known; give its make_step a"
+                    " rule_action_mapping, which maps the rule's decision to an action"
+                )
+    return plan, keys
 
 
-def _left_to_the_rule(observations: Any) -> Any:
+def _follow_rule(observations: Any) -> Any:
     return RULE
 
 
-def _collect_part(
-    simulation: Any,
-    policies: Mapping[Any, Any],
-    points: Any,
+Part = tuple[dict[int, Records], list[Any]]
+"""The results of some episodes: the records by the place of their policy, and what ``collect`` returned."""
+
+
+def _play_part(
+    planned: tuple[Any, Any, Any, Any],
     collect: Callable[[Any], Any] | None,
     batch_size: int,
-    options: dict[str, Any],
-    seeds: list[int],
-) -> dict[int, Trajectories]:
+    episodes: list[tuple[int, int]],
+) -> Part:
     """Play a part of the episodes, in a worker process."""
-    plan, keys = learners_plan(simulation, policies, points, options)
-    return _collect(plan, keys, collect, batch_size, seeds, None)
+    return _play(*learners_plan(*planned), collect, batch_size, episodes, None)
 
 
-def _collect(
+def _play(
     plan: Plan,
     keys: Mapping[Any, int],
     collect: Callable[[Any], Any] | None,
     batch_size: int,
-    seeds: list[int],
+    episodes: list[tuple[int, int]],
     bar: Any,
-) -> dict[int, Trajectories]:
-    ledger = Ledger()
-    watcher: Watcher = ledger
-    collected: list[Any] = [None] * len(seeds)
+) -> Part:
+    """Play episodes, which are pairs of number and seed, in this process."""
+    recorder = Recorder(episodes[0][0] if episodes else 0)
+    collected: list[Any] = [None] * len(episodes)
 
     def finish(place: int, simulation: Any) -> None:
         if collect is not None:
@@ -138,8 +152,5 @@ def _collect(
         if bar is not None:
             bar.update()
 
-    run(plan, seeds, batch_size, finish, watcher)
-    found = ledger.trajectories(plan, keys, seeds)
-    if collect is None:
-        return found
-    return {place: replace(own, collected=tuple(collected)) for place, own in found.items()}
+    run(plan, [seed for _, seed in episodes], batch_size, finish, recorder)
+    return recorder.records(plan, keys), collected

@@ -6,19 +6,20 @@ written.
 
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.options import EpisodeOptions
 from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
-from .collect import collect_episodes
-from .mixture import name_of
-from .rule_actions import check_knowable, check_known
+from .collect import LeftToRule, collect_episodes
+from .rule import check_known, follows_rule, policy_name
 from .trajectories import Trajectories
 
 __all__ = ["record_dataset", "save_dataset"]
@@ -70,19 +71,21 @@ def record_dataset(
     if not isinstance(policies, Mapping) or not policies:
         raise OptionValueError(f"policies must be a dict from agents or points to policies, not {short_repr(policies)}")
     names = _dataset_ids(dataset_id, policies)
-    _check_free(names.values())
-    check_knowable(simulation, policies, names, points, options)
+    for name in names.values():
+        _free_path(name)
+    left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
     sizes: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress}
-    collected = collect_episodes(simulation, policies, seeds=seeds, points=points, **sizes, **options)
+    collected = collect_episodes(simulation, {**policies, **left}, seeds=seeds, points=points, **sizes, **options)
     for key, name in names.items():
         _check_writable(name, collected[key])
     origin = provenance(simulation, points, **options)
-    written, begun = {}, list[Any]()
+    written, begun = {}, list[Path]()
     try:
         for key, name in names.items():
-            begun += _check_free([name])
-            given = {"algorithm_name": name_of(policies[key]), **(metadata or {})}
-            written[key] = save_dataset(name, collected[key], **given)
+            begun.append(_free_path(name))
+            written[key] = save_dataset(
+                name, collected[key], **{"algorithm_name": policy_name(policies[key]), **(metadata or {})}
+            )
             written[key].storage.update_metadata({"provenance": origin})
     except BaseException:
         for path in begun:
@@ -92,6 +95,7 @@ def record_dataset(
 
 
 def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]:
+    """Return the name of each data set, by the key of its policy."""
     if isinstance(dataset_id, str):
         if len(policies) > 1:
             raise OptionValueError(
@@ -99,19 +103,16 @@ def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]
                 f" {dataset_id!r}"
             )
         return {next(iter(policies)): dataset_id}
-    if (
-        not isinstance(dataset_id, Mapping)
-        or not dataset_id
-        or not all(isinstance(n, str) for n in dataset_id.values())
-    ):
+    names = list(dataset_id.values()) if isinstance(dataset_id, Mapping) else []
+    if not names or not all(isinstance(name, str) for name in names):
         raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {short_repr(dataset_id)}")
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
         raise OptionValueError(
-            f"dataset_id names {short_repr(unknown[0])}, which has no"
-            f" policy{did_you_mean(unknown[0], map(str, policies))}"
+            f"dataset_id names {short_repr(unknown[0])}, which has no policy"
+            f"{did_you_mean(unknown[0], map(str, policies))}"
         )
-    if len(set(dataset_id.values())) < len(dataset_id):
+    if len(set(names)) < len(names):
         raise OptionValueError(f"each policy needs a data set of its own: {short_repr(dict(dataset_id))}")
     return dict(dataset_id)
 
@@ -142,15 +143,13 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
     """
     if not isinstance(trajectories, Trajectories):
         raise OptionValueError(
-            f"the data set {short_repr(dataset_id)} needs Trajectories, as collect_episodes returns"
-            " them under each key,"
-            f" not {short_repr(trajectories)}"
+            f"the data set {short_repr(dataset_id)} needs Trajectories, as collect_episodes returns them under each"
+            f" key, not {short_repr(trajectories)}"
         )
-    (path,) = _check_free([dataset_id])
+    path = _free_path(dataset_id)
     _check_writable(dataset_id, trajectories)
     import minari
 
-    given = {"jpeg_encoding": False, **metadata}
     try:
         with warnings.catch_warnings():
             # Warnings about missing metadata: users know best whether readers of the data set need it.
@@ -160,97 +159,94 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
                 list(_episodes(trajectories, minari.data_collector.EpisodeBuffer)),
                 observation_space=trajectories.observation_space,
                 action_space=trajectories.action_space,
-                **given,
+                **{"jpeg_encoding": False, **metadata},
             )
-        dataset.storage.update_episode_metadata(_episode_metadata(trajectories))
+        starts, names = trajectories.starts, trajectories.names
+        columns = (trajectories.agents[starts], trajectories.episodes[starts], trajectories.turns[starts])
+        dataset.storage.update_episode_metadata(
+            {"agent": names[agent], "episode": episode, "turn": turn}
+            for agent, episode, turn in zip(*(column.tolist() for column in columns), strict=True)
+        )
     except BaseException:
         shutil.rmtree(path, ignore_errors=True)  # never leave half a data set
         raise
     return dataset
 
 
-def _check_free(names: Iterable[str]) -> list[Any]:
-    """Return the paths of the data sets, which must not exist yet."""
+def _free_path(name: str) -> Path:
+    """Return the path of a data set, which must not exist yet."""
     try:
         from minari.dataset.minari_dataset import parse_dataset_id
         from minari.storage.datasets_root_dir import get_dataset_path
     except ImportError as error:
         raise MissingExtraError(f"data sets need Minari: install simenv-marl[minari] ({error})") from None
-    paths = []
-    for name in names:
-        try:
-            parse_dataset_id(name)
-        except (TypeError, ValueError):
-            raise OptionValueError(
-                f'{short_repr(name)} is not a name for a data set; a valid one is "namespace/name-v0"'
-            ) from None
-        paths.append(get_dataset_path(name))
-        if paths[-1].exists():
-            raise OptionValueError(
-                f"the data set {short_repr(name)} exists already, in {paths[-1]}; take another name or"
-                " version, or delete"
-                " it with minari.delete_dataset"
-            )
-    return paths
+    try:
+        parse_dataset_id(name)
+    except (TypeError, ValueError):
+        raise OptionValueError(
+            f'{short_repr(name)} is not a name for a data set; a valid one is "namespace/name-v0"'
+        ) from None
+    path = Path(get_dataset_path(name))
+    if path.exists():
+        raise OptionValueError(
+            f"the data set {short_repr(name)} exists already, in {path}; take another name or version, or delete it"
+            " with minari.delete_dataset"
+        )
+    return path
 
 
 def _check_writable(name: str, found: Trajectories) -> None:
+    """Check that there are decisions to write, and that their actions are known."""
     if not len(found):
         raise OptionValueError(f"there is nothing to write to {short_repr(name)}: no agent has decided in any episode")
     check_known(found)
 
 
-def _episodes(found: Trajectories, buffer: Any) -> Iterable[Any]:
+def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
     """Make a Minari episode buffer of each trajectory."""
-    infos = _infos(found)
-    ends = found.starts + found.lengths
-    for place, (start, end) in enumerate(zip(found.starts.tolist(), ends.tolist(), strict=True)):
-        own, last = np.arange(start, end), np.array([place])
+    number = len(found.starts)
+    # The rows of the ends follow those of the decisions.
+    columns = {"observations": joined([found.observations, found.last_observations]), "infos": _infos(found, number)}
+    for place, (start, length) in enumerate(zip(found.starts, found.lengths, strict=True)):
+        rows = np.arange(start, start + length)
         seed = found.seeds[found.episodes[start]]
+        own = taken(columns, np.append(rows, len(found) + place))
         yield buffer(
             seed=seed if seed < 2**63 else str(seed),  # Minari reads the string as an integer
-            observations=_listed(joined([taken(found.observations, own), taken(found.last_observations, last)])),
-            actions=_listed(taken(found.actions, own)),
-            rewards=found.rewards[start:end],
-            terminations=found.terminations[start:end],
-            truncations=found.truncations[start:end],
-            infos={name: joined([taken(values, own), taken(final, last)]) for name, (values, final) in infos.items()},
+            observations=_object_lists(own["observations"]),
+            actions=_object_lists(taken(found.actions, rows)),
+            rewards=found.rewards[rows],
+            terminations=found.terminations[rows],
+            truncations=found.truncations[rows],
+            infos=own["infos"],
         )
 
 
-def _infos(found: Trajectories) -> dict[str, tuple[Any, Any]]:
-    """Return the infos: by name, the rows of the decisions and those of the ends."""
-    number = len(found.starts)
-    infos: dict[str, tuple[Any, Any]] = {"by_rule": (found.by_rule, np.zeros(number, np.bool_))}
-    if found.action_masks is not None:
-        masks = found.action_masks
-        if isinstance(masks, tuple):
-            masks = {str(place): part for place, part in enumerate(masks)}
-            infos["action_mask"] = masks, {key: np.ones((number, *p.shape[1:]), p.dtype) for key, p in masks.items()}
-        else:
-            infos["action_mask"] = masks, np.ones((number, *masks.shape[1:]), masks.dtype)
+def _infos(found: Trajectories, ends: int) -> dict[str, Any]:
+    """Return the infos by name: the rows of the decisions, and behind them those of the ends."""
+    infos: dict[str, Any] = {"by_rule": _extend(found.by_rule, ends, False)}
+    if isinstance(found.action_masks, tuple):
+        infos["action_mask"] = {str(place): _extend(mask, ends, 1) for place, mask in enumerate(found.action_masks)}
+    elif found.action_masks is not None:
+        infos["action_mask"] = _extend(found.action_masks, ends, 1)
     if found.times is not None and found.elapsed is not None:
         last = found.starts + found.lengths - 1
-        infos["time"] = found.times, found.times[last] + found.elapsed[last]
+        infos["time"] = np.append(found.times, found.times[last] + found.elapsed[last])
     for name, values in found.extras.items():
         if values.dtype.kind in "biufc":
-            infos.setdefault(name, (values, np.zeros((number, *values.shape[1:]), values.dtype)))
+            infos.setdefault(name, _extend(values, ends, 0))
     return infos
 
 
-def _listed(stack: Any) -> Any:
+def _extend(values: NDArray[Any], number: int, filler: Any) -> NDArray[Any]:
+    """Append rows that consist of a filler."""
+    return np.concatenate([values, np.full((number, *values.shape[1:]), filler, values.dtype)])
+
+
+def _object_lists(stack: Any) -> Any:
     """Return a stack with lists in place of arrays of objects."""
     if isinstance(stack, Mapping):
-        return {key: _listed(part) for key, part in stack.items()}
+        return {key: _object_lists(part) for key, part in stack.items()}
     if isinstance(stack, tuple):
-        return tuple(_listed(part) for part in stack)
+        return tuple(_object_lists(part) for part in stack)
     return list(stack) if stack.dtype == object else stack
-
-
-def _episode_metadata(found: Trajectories) -> list[dict[str, Any]]:
-    starts = found.starts
-    columns = found.agents[starts].tolist(), found.episodes[starts].tolist(), found.turns[starts].tolist()
-    return [
-        {"agent": found.names[agent], "episode": episode, "turn": turn}
-        for agent, episode, turn in zip(*columns, strict=True)
-    ]

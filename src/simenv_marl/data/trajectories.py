@@ -1,12 +1,11 @@
 """Trajectories of many episodes: observations, actions, rewards and what else a learner needs.
 
-While the episodes run, a ``Ledger`` has a page for each group of decisions. A page has the decisions in the order in
-which they were answered. Learners get the same rows sorted by policy, episode, agent and step, independent of that
-order.
+While the episodes run, a ``Recorder`` keeps a log for each group of decisions, in the order of the answers. Learners
+get the same rows sorted by policy, episode, agent and step, independent of that order.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from math import nan
 from typing import Any
@@ -16,11 +15,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..core.agent import Agent
+from ..core.bound import BoundPoint
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.point import Point
 from ..core.spaces import blank
-from ..core.stacking import empty, joined, stack_masks, stacker, taken
+from ..core.stacking import Stacker, joined, stack_masks, stacker, taken
 from ..errors import AgentError, OptionValueError, short_repr
 from ..many.batch import Group, PolicyKey
 from ..simulation import RULE
@@ -128,36 +127,48 @@ class Trajectories:
         return taken(joined([self.observations, self.last_observations]), following)
 
 
-def merged(parts: Sequence[Trajectories]) -> Trajectories:
-    """Concatenate the trajectories of one policy in several parts of the episodes."""
-    seeds = tuple(seed for part in parts for seed in part.seeds)
-    first_episodes = np.cumsum([0, *(len(part.seeds) for part in parts)])
-    first_rows = np.cumsum([0, *(len(part) for part in parts)])
-    codes = {name: code for code, name in enumerate(dict.fromkeys(name for part in parts for name in part.names))}
-    filled = [(number, part) for number, part in enumerate(parts) if len(part)]
-    collected = None if parts[0].collected is None else tuple(one for part in parts for one in part.collected or ())
-    if not filled:
-        return replace(parts[0], seeds=seeds, collected=collected)
+def leaves(stack: Any, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the arrays of a stack, with their names: ``[1]`` in a tuple, ``litres`` or ``[1]['litres']`` in a dict."""
+    if isinstance(stack, Mapping):
+        for key, part in stack.items():
+            yield from leaves(part, f"{name}[{key!r}]" if name else str(key))
+    elif isinstance(stack, tuple):
+        for place, part in enumerate(stack):
+            yield from leaves(part, f"{name}[{place}]")
+    else:
+        yield name, stack
 
-    def together(name: str) -> Any:
-        values = [getattr(part, name) for _, part in filled]
-        return None if values[0] is None else joined(values)
 
-    _check_extras([part.extras for _, part in filled])
-    same = (
-        "observations", "actions", "rewards", "terminations", "truncations", "last_observations", "last_turns", "steps",
-        "turns", "by_rule", "known", "action_masks", "times", "elapsed",
-    )  # fmt: skip
+@dataclass(frozen=True)
+class Records:
+    """The records of one policy in some episodes, in the order of its ``Trajectories``."""
+
+    decisions: Mapping[str, Any]  # by attribute of ``Trajectories``: arrays with a row for each decision
+    trajectories: Mapping[str, Any]  # the same with a row for each trajectory
+    observation_space: spaces.Space[Any] | None
+    action_space: spaces.Space[Any] | None
+
+
+def combine(parts: Sequence[Records], seeds: tuple[int, ...], collected: tuple[Any, ...] | None = None) -> Trajectories:
+    """Combine the records of one policy in consecutive parts of the episodes; seeds and values are those of all."""
+    filled = [part for part in parts if len(part.decisions["rewards"])] or parts[:1]
+    _check_extras([part.decisions["extras"] for part in filled])
+    trajectories = joined([part.trajectories for part in filled])
+    lengths, names = trajectories["lengths"], dict.fromkeys(trajectories["agents"].tolist())
+    starts, codes = np.cumsum(lengths) - lengths, {name: code for code, name in enumerate(names)}
+    agents = np.array([codes[name] for name in trajectories["agents"].tolist()], np.int64)
     return Trajectories(
-        **{name: together(name) for name in same},
-        starts=np.concatenate([part.starts + first_rows[number] for number, part in filled]),
-        episodes=np.concatenate([part.episodes + first_episodes[number] for number, part in filled]),
+        **joined([part.decisions for part in filled]),
+        last_observations=trajectories["last_observations"],
+        last_turns=trajectories["last_turns"],
+        starts=starts,
+        episodes=np.repeat(trajectories["episodes"], lengths),
         seeds=seeds,
-        agents=np.concatenate([np.array([codes[name] for name in part.names])[part.agents] for _, part in filled]),
-        names=tuple(codes),
-        extras={name: joined([part.extras[name] for _, part in filled]) for name in filled[0][1].extras},
-        observation_space=filled[0][1].observation_space,
-        action_space=filled[0][1].action_space,
+        agents=np.repeat(agents, lengths),
+        names=tuple(names),
+        steps=np.arange(lengths.sum()) - np.repeat(starts, lengths),
+        observation_space=filled[0].observation_space,
+        action_space=filled[0].action_space,
         collected=collected,
     )
 
@@ -165,282 +176,204 @@ def merged(parts: Sequence[Trajectories]) -> Trajectories:
 # -- while episodes run ---------------------------------------------------------------------------
 
 
-@dataclass
-class _Life:
-    """The record of one trajectory. If its episode fails, the trajectory has no end.
+@dataclass(slots=True)
+class _TrajectoryLog:
+    """The record of one trajectory. If its episode fails, it has no end."""
 
-    Attributes:
-        page: The page that has its decisions.
-        number: The number of the trajectory on the page.
-        policy: The place of its policy.
-        episode: The place of its episode.
-        first_turn, last_turn: The number of decisions in the episode when the trajectory began, and when it ended.
-        name: The name of its agent.
-        row: The row of its latest decision.
-        steps: The number of its decisions so far.
-        last_observation: Its final observation.
-        terminated, truncated: How it ended.
-    """
-
-    page: "_Page"
-    number: int
-    policy: int
+    decisions: "_DecisionLog"
     episode: int
-    first_turn: int
-    name: str
-    last_turn: int = -1
-    row: int = -1
-    steps: int = 0
+    agent: str
+    rows: list[int] = field(default_factory=list)  # of its decisions in their log
     last_observation: Any = None
+    last_turn: int = -1  # the number of decisions in the episode when it ended
     terminated: bool = False
     truncated: bool = False
 
 
-class _Page:
-    """The records of one group: rows in the order of the answers, trajectories in the order of their beginnings."""
+class _DecisionLog:
+    """The decisions of one group, in the order of the answers.
 
-    def __init__(self, group: Group) -> None:
-        definition = group.point.definition
-        self.point = group.point
-        self.restricted = group.point.legal is not None
-        self.stack = stacker(definition.observation_space)
-        self.stack_actions = stacker(definition.action_space)
-        self.blank = blank(definition.action_space)
-        self.asked = group.asked
-        # One entry per row, or one per batch of answers.
+    The point is one of those at which the group decides; None if it is not known, and there are no decisions.
+    """
+
+    def __init__(self, point: BoundPoint | None) -> None:
+        self.name = "" if point is None else point.point.name
+        self.observation_space = None if point is None else point.definition.observation_space
+        self.action_space = None if point is None else point.definition.action_space
+        self.stack_observations = _stacker(self.observation_space)
+        self.stack_actions = _stacker(self.action_space)
+        self.unknown_action = None if self.action_space is None else blank(self.action_space)
+        # One entry for each batch.
         self.observations: list[Any] = []
         self.actions: list[Any] = []
         self.masks: list[Any] = []
         self.extras: list[dict[str, NDArray[Any]]] = []
-        self.trajectory: list[int] = []
-        self.steps: list[int] = []
+        # One entry for each decision.
         self.turns: list[int] = []
         self.by_rule: list[bool] = []
-        self.rule_actions: dict[int, Any] = {}  # by row; only those that are known
         self.times: list[float] = []
         self.rewards: list[float] = []
         self.elapsed: list[float] = []
-        self.lives: list[_Life] = []
+        self.rule_actions: dict[int, Any] = {}  # by row; only those that are known
+        self.trajectories: dict[int, list[_TrajectoryLog]] = {}  # by the place of their policy
 
-    def begin(self, place: int, episode: Episode, agent: Agent) -> _Life:
-        """Begin the trajectory of an agent."""
-        life = _Life(self, len(self.lives), agent.policy.place, place, episode.turns, agent.name)
-        self.lives.append(life)
-        return life
+    @cached_property
+    def columns(self) -> dict[str, Any]:
+        """Return the values of all decisions, by attribute of ``Trajectories``."""
+        _check_extras(self.extras)
+        number, by_rule = len(self.rewards), np.array(self.by_rule, np.bool_)
+        # The actions of the rule lie behind those of the policy; ``rows`` finds the action of each decision.
+        actions = joined([*self.actions, self.stack_actions(list(self.rule_actions.values()))])
+        rows, replaced = np.arange(number), list(self.rule_actions)
+        rows[replaced] = number + np.arange(len(replaced))
+        known = ~by_rule
+        known[replaced] = True
+        columns = {
+            "observations": joined([*self.observations, self.stack_observations([])]),
+            "actions": taken(actions, rows),
+            "rewards": np.array(self.rewards, np.float64),
+            "turns": np.array(self.turns, np.int64),
+            "by_rule": by_rule,
+            "known": known,
+            "extras": joined(self.extras) if self.extras else {},
+        }
+        if self.masks:
+            columns["action_masks"] = joined(self.masks)
+        if self.times:
+            columns["times"] = np.array(self.times, np.float64)
+            columns["elapsed"] = np.array(self.elapsed, np.float64)
+        return columns
 
-    def all_actions(self) -> Any:
-        """Return the actions of all rows."""
-        actions = joined(self.actions)
-        if not self.rule_actions:
-            return actions
-        rows = np.arange(len(self.rewards))
-        places = list(self.rule_actions)
-        rows[places] = len(rows) + np.arange(len(places))
-        return taken(joined([actions, self.stack_actions(list(self.rule_actions.values()))]), rows)
+    def records(self, place: int) -> Records:
+        """Return the records of the policy at a place, sorted by episode, agent and step."""
+        logs = sorted(self.trajectories.get(place, ()), key=lambda log: (log.episode, log.rows[0]))
+        lengths = np.array([len(log.rows) for log in logs], np.int64)
+        last_rows = np.cumsum(lengths) - 1
+        terminations, truncations = np.zeros((2, lengths.sum()), np.bool_)
+        terminations[last_rows] = [log.terminated for log in logs]
+        truncations[last_rows] = [log.truncated for log in logs]
+        rows = np.array([row for log in logs for row in log.rows], np.int64)
+        decisions = taken(self.columns, rows) | {"terminations": terminations, "truncations": truncations}
+        trajectories = {
+            "lengths": lengths,
+            "episodes": np.array([log.episode for log in logs], np.int64),
+            "agents": np.array([log.agent for log in logs], object),
+            "last_turns": np.array([log.last_turn for log in logs], np.int64),
+            "last_observations": self.stack_observations([log.last_observation for log in logs]),
+        }
+        return Records(decisions, trajectories, self.observation_space, self.action_space)
 
 
-class Ledger:
-    """Records the decisions of episodes while they run."""
+class Recorder:
+    """Records the decisions of episodes while they run: a ``Watcher`` for ``run``."""
 
-    def __init__(self) -> None:
-        self._pages: list[_Page] = []
+    def __init__(self, first_episode: int = 0) -> None:
+        self._first_episode = first_episode
+        self._logs: dict[Group, _DecisionLog] = {}
 
     def asking(self, group: Group, places: Sequence[int], waiting: Sequence[Episode], observations: Any) -> None:
         """Record the decisions that are about to be answered: see ``Watcher``."""
-        page: _Page = group.book
-        if page is None:
-            page = group.book = _Page(group)
-            self._pages.append(page)
-        row = len(page.rewards)
-        trajectories, steps, turns = page.trajectory, page.steps, page.turns
+        log = self._logs.get(group)
+        if log is None:
+            log = self._logs[group] = _DecisionLog(group.point)
+        row, turns = len(log.rewards), log.turns
         agents: list[Any] = [episode.pending for episode in waiting]
         for place, episode, agent in zip(places, waiting, agents, strict=True):
-            life = agent.notes
-            if life is None:
-                life = agent.notes = page.begin(place, episode, agent)
-            life.row = row
-            trajectories.append(life.number)
-            steps.append(life.steps)
+            trajectory = agent.notes
+            if trajectory is None:
+                trajectory = agent.notes = _TrajectoryLog(log, self._first_episode + place, agent.name)
+                log.trajectories.setdefault(agent.policy.place, []).append(trajectory)
+            trajectory.rows.append(row)
             turns.append(episode.turns)
-            life.steps += 1
             row += 1
-        page.observations.append(observations)
-        page.rewards.extend([0.0] * len(agents))
-        page.elapsed.extend([nan] * len(agents))
-        if page.restricted:
-            page.masks.append(stack_masks([agent.mask for agent in agents]))
+        log.observations.append(observations)
+        log.rewards.extend([0.0] * len(agents))
+        log.elapsed.extend([nan] * len(agents))
+        if group.point.legal is not None:
+            log.masks.append(stack_masks([agent.mask for agent in agents]))
         if waiting[0].clock is not None:
-            page.times.extend([agent.now for agent in agents])  # the policy may have been given the info
+            log.times.extend([agent.now for agent in agents])  # the policy may have been given the info
 
     def answered(self, group: Group, actions: list[Any], extras: Mapping[str, Any]) -> None:
         """Record the answers: see ``Watcher``."""
-        page: _Page = group.book
-        by_rule = [action is RULE for action in actions]
-        if True in by_rule:
-            actions = [page.blank if action is RULE else action for action in actions]
-        page.by_rule += by_rule
-        page.actions.append(page.stack_actions(actions))
+        log = self._logs[group]
+        log.by_rule += [action is RULE for action in actions]
+        log.actions.append(log.stack_actions([log.unknown_action if action is RULE else action for action in actions]))
         # Copied because policies may reuse their arrays; in two steps because np.array cannot copy every tensor.
         arrays = {str(name): np.array(np.asarray(values)) for name, values in extras.items()}
         for name, array in arrays.items():
             if not array.ndim or len(array) != len(actions):
                 raise OptionValueError(
-                    f"{page.asked!r} returned {short_repr(name)} of shape {array.shape} for"
-                    f" {len(actions)} decisions; the"
-                    " length of its first axis must be their number"
+                    f"{group.asked!r} returned {short_repr(name)} of shape {array.shape} for {len(actions)} decisions;"
+                    " the length of its first axis must be their number"
                 )
-        page.extras.append(arrays)
+        log.extras.append(arrays)
 
     def moved(self, episode: Episode) -> None:
         """Record the reward when an episode reaches its next decision or its end: see ``Watcher``."""
         if episode.pending is not None:
-            self._pay(episode.pending)
+            _reward(episode.pending)
         for agent in episode.just_ended:
-            self._close(agent, episode.turns, terminated=True, truncated=False)
+            _end(agent, episode.turns, terminated=True, truncated=False)
         episode.just_ended = []
         if episode.over:
             for agent in episode.agents.values():
-                self._close(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
+                _end(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
 
-    def _pay(self, agent: Agent) -> None:
-        """Record the reward of the agent's latest action."""
-        life = agent.notes
-        if life is None:  # it has not decided before
-            return
-        page, row = life.page, life.row
-        page.rewards[row] = agent.reward
-        page.elapsed[row] = agent.info.get("elapsed", nan)
-        if agent.rule_action is not None:
-            page.rule_actions[row], agent.rule_action = agent.rule_action, None
-
-    def _close(self, agent: Agent, turns: int, *, terminated: bool, truncated: bool) -> None:
-        self._pay(agent)
-        life = agent.notes
-        if life is not None:
-            life.last_observation, life.last_turn = agent.observation, turns
-            life.terminated, life.truncated = terminated, truncated
-
-    # -- afterwards -------------------------------------------------------------------------------
-
-    def trajectories(self, plan: Plan, keys: Mapping[Any, int], seeds: Sequence[int]) -> dict[int, Trajectories]:
-        """Return the recorded trajectories, by the place of their policy.
-
-        Args:
-            plan: The plan of the episodes.
-            keys: The places of the policies, by their keys.
-            seeds: The seeds of the episodes.
-
-        Raises:
-            AgentError: One policy key answered at several points whose spaces differ.
-            OptionValueError: A policy did not always return the same extras.
-        """
-        found: dict[int, Trajectories] = {}
-        pages = [_Sorted(page) for page in self._pages]
+    def records(self, plan: Plan, keys: Mapping[Any, int]) -> dict[int, Records]:
+        """Return the records by the place of their policy, from the places by key."""
+        records = {}
         for key, place in keys.items():
-            own = [page for page in pages if (page.policies == place).any()]
-            if len(own) > 1:
+            logs = [log for log in self._logs.values() if place in log.trajectories]
+            if len(logs) > 1:
                 raise AgentError(
-                    f"{short_repr(key)} has decided at"
-                    f" {' and at '.join(page.page.point.point.name for page in own)}, whose"
-                    " spaces differ; give its policy under the names of the points"
+                    f"{short_repr(key)} has decided at {' and at '.join(log.name for log in logs)}, whose spaces"
+                    " differ; give its policy under the names of the points"
                 )
-            tuple_of_seeds = tuple(seeds)
-            found[place] = own[0].of(place, tuple_of_seeds) if own else _nothing(plan, place, tuple_of_seeds)
-        return found
+            if not logs:
+                point = next((point for point in plan.points if is_answered_by(plan, point, place)), None)
+                logs = [_DecisionLog(point)]
+            records[place] = logs[0].records(place)
+        return records
 
 
-class _Sorted:
-    """A page whose rows are sorted as learners get them, to be selected by policy."""
-
-    def __init__(self, page: "_Page") -> None:
-        _check_extras(page.extras)
-        self.page, lives = page, page.lives
-        self.policies = np.array([life.policy for life in lives])
-        self.episodes = np.array([life.episode for life in lives])
-        self.trajectory, self.steps = np.array(page.trajectory), np.array(page.steps)
-        self.trajectories = np.lexsort((np.array([life.first_turn for life in lives]), self.episodes))
-        ranks = np.argsort(self.trajectories)
-        self.rows = np.lexsort((self.steps, ranks[self.trajectory]))
-        self.observations, self.actions = joined(page.observations), page.all_actions()
-        self.masks = joined(page.masks) if page.masks else None
-        self.extras = {name: joined([extras[name] for extras in page.extras]) for name in page.extras[0]}
-        self.numbers = {
-            "rewards": np.array(page.rewards, np.float64),
-            "turns": np.array(page.turns, np.int64),
-            "by_rule": np.array(page.by_rule, np.bool_),
-            "known": ~np.array(page.by_rule, np.bool_),
-        }
-        self.numbers["known"][np.array(list(page.rule_actions), np.int64)] = True
-        if page.times:
-            self.numbers["times"] = np.array(page.times, np.float64)
-            self.numbers["elapsed"] = np.array(page.elapsed, np.float64)
-        last_rows = [life.row for life in lives]
-        for name in ("terminations", "truncations"):
-            self.numbers[name] = np.zeros(len(self.steps), np.bool_)
-        self.numbers["terminations"][last_rows] = [life.terminated for life in lives]
-        self.numbers["truncations"][last_rows] = [life.truncated for life in lives]
-
-    def of(self, policy: int, seeds: tuple[int, ...]) -> Trajectories:
-        page = self.page
-        rows = self.rows[self.policies[self.trajectory[self.rows]] == policy]
-        trajectories = self.trajectories[self.policies[self.trajectories] == policy]
-        lives = [page.lives[trajectory] for trajectory in trajectories]
-        codes = {name: code for code, name in enumerate(dict.fromkeys(life.name for life in lives))}
-        agents = np.zeros(len(page.lives), np.int64)
-        agents[trajectories] = [codes[life.name] for life in lives]
-        steps = self.steps[rows]
-        return Trajectories(
-            observations=taken(self.observations, rows),
-            actions=taken(self.actions, rows),
-            last_observations=page.stack([life.last_observation for life in lives]),
-            last_turns=np.array([life.last_turn for life in lives], np.int64),
-            starts=np.flatnonzero(steps == 0),
-            episodes=self.episodes[self.trajectory[rows]],
-            seeds=seeds,
-            agents=agents[self.trajectory[rows]],
-            names=tuple(codes),
-            steps=steps,
-            action_masks=None if self.masks is None else taken(self.masks, rows),
-            extras=taken(self.extras, rows),
-            observation_space=page.point.definition.observation_space,
-            action_space=page.point.definition.action_space,
-            **{name: array[rows] for name, array in self.numbers.items()},
-        )
-
-
-def _check_extras(extras: Sequence[Mapping[str, Any]]) -> None:
-    for other in extras:
-        if other.keys() != extras[0].keys():
-            raise OptionValueError(
-                f"a policy returned {sorted(extras[0])} beside its actions, but later {sorted(other)}; it must return"
-                " the same names in every call"
-            )
-
-
-def _nothing(plan: Plan, place: int, seeds: tuple[int, ...]) -> Trajectories:
-    """Return the empty trajectories of a policy that was never asked."""
-    point = next((point for point in plan.points if answers(plan, point, place)), None)
-    definition = None if point is None else point.definition
-    floats, whole, flags = np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.bool_)
-    none: dict[str, Any] = {
-        **dict.fromkeys(("last_turns", "starts", "episodes", "agents", "steps", "turns"), whole),
-        **dict.fromkeys(("terminations", "truncations", "by_rule", "known"), flags),
-    }
-    observations = floats if definition is None else empty(definition.observation_space)
-    return Trajectories(
-        observations=observations,
-        actions=floats if definition is None else empty(definition.action_space),
-        last_observations=observations,
-        rewards=floats,
-        seeds=seeds,
-        names=(),
-        observation_space=None if definition is None else definition.observation_space,
-        action_space=None if definition is None else definition.action_space,
-        **none,
-    )
-
-
-def answers(plan: Plan, point: Point, place: int) -> bool:
+def is_answered_by(plan: Plan, point: BoundPoint, place: int) -> bool:
     """Return whether it is known beforehand that the policy at this place answers at a decision point."""
     policy = point.policy if point.agent is None else plan.policies.get(point.agent, point.policy)
     return isinstance(policy, PolicyKey) and policy.place == place
+
+
+def _reward(agent: Agent) -> None:
+    """Record the reward of the agent's latest action, if it has decided before."""
+    trajectory: _TrajectoryLog | None = agent.notes
+    if trajectory is None:
+        return
+    log, row = trajectory.decisions, trajectory.rows[-1]
+    log.rewards[row] = agent.reward
+    log.elapsed[row] = agent.info.get("elapsed", nan)
+    if agent.rule_action is not None:
+        log.rule_actions[row], agent.rule_action = agent.rule_action, None
+
+
+def _end(agent: Agent, turns: int, *, terminated: bool, truncated: bool) -> None:
+    """Record the agent's last reward and its end."""
+    _reward(agent)
+    trajectory: _TrajectoryLog | None = agent.notes
+    if trajectory is not None:
+        trajectory.last_observation, trajectory.last_turn = agent.observation, turns
+        trajectory.terminated, trajectory.truncated = terminated, truncated
+
+
+def _stacker(space: spaces.Space[Any] | None) -> Stacker:
+    """Return the function that stacks elements of a space; of an unknown space there are none."""
+    return np.array if space is None else stacker(space)
+
+
+def _check_extras(batches: Sequence[Mapping[str, Any]]) -> None:
+    """Check that all batches of a policy have the same extras."""
+    for batch in batches:
+        if batch.keys() != batches[0].keys():
+            raise OptionValueError(
+                f"a policy returned {sorted(batches[0])} beside its actions, but later {sorted(batch)}; it must return"
+                " the same names in every call"
+            )

@@ -15,7 +15,7 @@ from simenv_marl.data import (
     record_dataset,
     save_dataset,
 )
-from simenv_marl.data.mixture import _drawn
+from simenv_marl.data.rule import _random_numbers
 from simenv_marl.errors import (
     DefinitionError,
     InvalidActionError,
@@ -62,7 +62,7 @@ def test_a_mixture_draws_by_splitmix():
 
     identities = [(0, 0), (7, 3), (2**64 - 1, 9), (2**31, 10**6)]
     expected = [(mixed((mixed(seed) + turn) % 2**64) >> 11) * 2.0**-53 for seed, turn in identities]
-    assert _drawn(identities).tolist() == expected
+    assert _random_numbers(identities).tolist() == expected
 
 
 def test_mixtures_draw_by_seed_and_decision_alone():
@@ -211,7 +211,7 @@ def test_what_cannot_be_saved():
 
 
 def test_what_the_rule_decides_must_be_known_before_anything_runs(monkeypatch):
-    monkeypatch.setattr("simenv_marl.data.demonstrations._check_free", lambda names: [])
+    monkeypatch.setattr("simenv_marl.data.demonstrations._free_path", lambda name: None)
 
     def never(simulation):
         raise AssertionError

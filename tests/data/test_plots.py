@@ -13,7 +13,8 @@ from matplotlib.legend import Legend
 
 from simenv_marl import RULE, TRUNCATED
 from simenv_marl.data import collect_episodes, plot_returns, plot_timeline
-from simenv_marl.data.plots import COLOURS, UNKNOWN
+from simenv_marl.data.plots import COLOURS
+from simenv_marl.data.timeline import UNKNOWN
 from simenv_marl.errors import MissingExtraError, OptionValueError, UnknownAgentError
 from tests.worlds.many_worlds import Being, beings
 from tests.worlds.models import Script, calling, decision, script
@@ -297,6 +298,16 @@ def test_policies_have_panels_of_their_own_unless_they_are_many():
     assert [axes.get_title(loc="left") for axes in many.axes[:2]] == ["30 agents: action", "reward"]
     assert len(drawn(many.axes[0])) == 60
     assert texts(many.axes[0]) == ["1"]
+
+
+def test_policies_with_too_many_different_actions_share_a_scale():
+    names = [f"being_{place}" for place in range(30)]
+    policies = {name: lambda seen, own=place: [own] * len(seen) for place, name in enumerate(names)}
+    points = beings(action_space=spaces.Discrete(40))
+    found = collect_episodes(herd(30, 1), policies, points=points, seeds=[5])
+    scale = of(plot_timeline(found).axes[0], PolyCollection)[-1]
+    assert scale.get_array().tolist() == list(range(30))
+    assert scale.get_clim() == (0, 29)
 
 
 def test_decisions_of_the_same_time_share_it():

@@ -1,0 +1,273 @@
+"""Policies beside the model's rule: mixtures of both, and comparisons, decision by decision."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from math import isfinite
+from typing import Any, Final, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.asking import AskingPolicy, asks_for_environment
+from ..core.options import EpisodeOptions
+from ..core.points import Points
+from ..core.spaces import same
+from ..core.stacking import rows, stacker, taken
+from ..errors import DefinitionError, InvalidActionError, OptionValueError, short_repr
+from ..many.batch import BatchPolicy
+from ..simulation import RULE
+from .collect import LeftToRule, collect_episodes
+from .trajectories import Trajectories, leaves
+
+SHADOW: Final = "shadow action"
+"""The extra in which the actions of the compared policies are recorded."""
+
+# -- mixtures -------------------------------------------------------------------------------------
+
+
+class Mixture:
+    """A policy for ``collect_episodes`` that draws, for each decision, which of several policies answers it.
+
+    The draw depends only on the seed of the episode and the number of the decision in it. It does not depend on other
+    simulations or on the number of processes. ``extras["component"]`` has the index of the policy that decided; the
+    extras of the policies themselves are dropped.
+
+    Example:
+        ``Mixture({RULE: 0.8, trained: 0.2})``
+    """
+
+    def __init__(self, parts: Mapping[Any, float] | Iterable[tuple[Any, float]]) -> None:
+        """Mix policies.
+
+        Args:
+            parts: A dict from policy to weight, or an iterable of such pairs. A policy is anything that
+                ``collect_episodes`` takes. Weights are not negative and need not sum to one.
+
+        Raises:
+            OptionValueError: There are no policies, or a weight is invalid.
+        """
+        pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
+        if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
+            raise OptionValueError(
+                f"a mixture needs a dict from policies to weights, or pairs of these, not {short_repr(parts)}"
+            )
+        for policy, weight in pairs:
+            _check_part(policy, weight)
+        weights = np.array([weight for _, weight in pairs], np.float64)
+        if not weights.sum() > 0:
+            raise OptionValueError("at least one weight of a mixture must be positive")
+        self.policies: tuple[Any, ...] = tuple(policy for policy, _ in pairs)
+        self.weights: NDArray[np.float64] = weights / weights.sum()
+        self._bounds = np.cumsum(self.weights)[:-1]
+        self._batch_policies = [None if policy is RULE else BatchPolicy(policy) for policy in self.policies]
+
+    def __repr__(self) -> str:
+        parts = zip(self.policies, self.weights.tolist(), strict=True)
+        return f"<Mixture: {', '.join(f'{weight:.3g} {policy_name(policy)}' for policy, weight in parts)}>"
+
+    def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
+        """Answer a batch of decisions, as policies of ``collect_episodes`` do."""
+        component = np.searchsorted(self._bounds, _random_numbers(identities), side="right")
+        actions: list[Any] = [RULE] * len(identities)
+        for number, batch_policy in enumerate(self._batch_policies):
+            own = np.flatnonzero(component == number)
+            if batch_policy is None or not len(own):
+                continue
+            places = own.tolist()
+            arguments = taken(observations, own), [infos[row] for row in places], [identities[row] for row in places]
+            for row, action in zip(places, _ask(self.policies[number], batch_policy, *arguments), strict=True):
+                actions[row] = action
+        return actions, {"component": component}
+
+
+def _check_part(policy: Any, weight: Any) -> None:
+    """Check a policy of a mixture and its weight."""
+    if policy is not RULE and not callable(policy):
+        raise OptionValueError(f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}")
+    if asks_for_environment(policy):
+        raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
+    number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
+    if not number or not isfinite(weight) or weight < 0:
+        raise OptionValueError(
+            f"the weight of {short_repr(policy)} must be a number that is not negative, not {short_repr(weight)}"
+        )
+
+
+def _random_numbers(identities: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """Return a number in [0, 1) for each decision, which depends on its identity alone."""
+    # SplitMix64, twice: to make a generator for each decision would take longer than the decision.
+    seeds = np.array([seed % 2**64 for seed, _ in identities], np.uint64)
+    turns = np.array([turn for _, turn in identities], np.uint64)
+    return np.asarray((_splitmix(_splitmix(seeds) + turns) >> np.uint64(11)) * 2.0**-53, np.float64)
+
+
+def _splitmix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state ^ (state >> np.uint64(31))
+
+
+# -- comparisons ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The decisions of the model's own rule, and what a policy would have decided. Made by ``compare_with_rule``.
+
+    Attributes:
+        trajectories: The trajectories of the rule.
+        policy_actions: The actions that the policy would have taken on the same observations, in the form of
+            ``trajectories.actions``. Where the policy would have left the decision to the rule, the rule's action.
+        agreements: ``(N,)`` bool: whether both agree, for each decision.
+    """
+
+    trajectories: Trajectories
+    policy_actions: Any
+    agreements: NDArray[np.bool_]
+
+    @property
+    def agreement(self) -> float:
+        """The share of decisions in which both agree, 0 to 1; nan if there are no decisions."""
+        return float(self.agreements.mean()) if len(self.agreements) else float("nan")
+
+    def __repr__(self) -> str:
+        return f"<Comparison: agreement {self.agreement:.3f} in {len(self.agreements)} decisions>"
+
+
+def compare_with_rule(
+    simulation: Any,
+    policies: Mapping[Any, Any],
+    *,
+    seeds: Iterable[int],
+    points: Points = None,
+    others: Mapping[Any, Any] | None = None,
+    tolerance: float = 0.0,
+    **options: Unpack[EpisodeOptions],
+) -> dict[Any, Comparison]:
+    """Let the model's own rule decide, and record what policies would have decided instead.
+
+    At each decision the policy gets what it would get if it decided; then the rule decides. So the episodes are those
+    of the plain model, unless ``others`` names policies that decide.
+
+    Args:
+        simulation: As ``collect_episodes`` takes it.
+        policies: The policies to compare, as ``collect_episodes`` takes them. Their actions are not checked for being
+            legal.
+        seeds: The seeds of the simulations.
+        points: The decision points, as ``generate_env`` takes them.
+        others: Policies that decide instead of the rule, as ``collect_episodes`` takes policies. They are not compared.
+        tolerance: The largest difference between numbers in two actions that agree. It applies to ``Box`` spaces of
+            floats.
+        **options: As ``collect_episodes`` takes them.
+
+    Returns:
+        A dict from each key of ``policies`` to its comparison.
+
+    Raises:
+        DefinitionError: The actions that correspond to the rule's decisions are unknown.
+        OptionValueError: An argument has an invalid value.
+        InvalidActionError: A policy did not return one action for each decision.
+        SimEnvError: As ``collect_episodes`` raises it; this holds for all other errors, too.
+    """
+    if not isinstance(policies, Mapping) or not all(callable(policy) for policy in policies.values()):
+        raise OptionValueError(
+            f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
+        )
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
+        raise OptionValueError(f"tolerance must be a number that is not negative, not {short_repr(tolerance)}")
+    if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
+        raise OptionValueError(
+            "others must be a dict of policies for agents or points that policies does not name, not"
+            f" {short_repr(others)}"
+        )
+    shadows = {id(policy): _shadow(policy) for policy in policies.values()}  # one for each, so that keys share batches
+    deciding = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
+    collected = collect_episodes(simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options)
+    return {key: _compare(collected[key], float(tolerance)) for key in policies}
+
+
+def _shadow(policy: Any) -> Any:
+    """Make a policy that records the action of another policy as an extra, and leaves the decision to the rule."""
+    if asks_for_environment(policy):
+        return partial(_record_one, AskingPolicy(policy))
+    return partial(_record, policy, BatchPolicy(policy))
+
+
+def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> Any:
+    recorded = np.empty(len(identities), object)
+    for place, action in enumerate(_ask(policy, batch_policy, observations, infos, identities)):
+        recorded[place] = action
+    return RULE, {SHADOW: recorded}
+
+
+def _record_one(policy: AskingPolicy, observation: Any, info: Any, *, _environment: Any) -> Any:
+    recorded = np.empty((), object)
+    recorded[()] = policy.answer(observation, info, _environment)
+    return RULE, {SHADOW: recorded}
+
+
+def _compare(found: Trajectories, tolerance: float) -> Comparison:
+    """Compare the rule's actions with those that a shadow has recorded."""
+    recorded = found.extras.get(SHADOW, ())
+    found = replace(found, extras={name: values for name, values in found.extras.items() if name != SHADOW})
+    if not len(found):
+        return Comparison(found, found.actions, np.zeros(0, np.bool_))
+    check_known(found)
+    assert found.action_space is not None
+    actions = [taken(found.actions, np.array(row)) if action is RULE else action for row, action in enumerate(recorded)]
+    policy_actions = stacker(found.action_space)(actions)
+    pairs = zip(leaves(found.actions), leaves(policy_actions), strict=True)
+    agreements = [_agreements(one, other, tolerance) for (_, one), (_, other) in pairs]
+    return Comparison(found, policy_actions, np.all(agreements, axis=0))
+
+
+def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+    """Return in which rows two arrays agree."""
+    if one.dtype == object:
+        return np.array([same(*pair) for pair in zip(one, other, strict=True)], np.bool_)
+    equal = np.abs(one - other) <= tolerance if one.dtype.kind == "f" else one == other
+    return np.asarray(equal.reshape(len(one), -1).all(axis=1), np.bool_)
+
+
+# -- policies and their answers -------------------------------------------------------------------
+
+
+def _ask(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> list[Any]:
+    """Ask a policy for one action for each decision, and drop the extras."""
+    number, answers = len(identities), batch_policy.answers(observations, infos, identities)
+    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
+        answers = answers[0]
+    actions = [RULE] * number if answers is RULE else rows(answers, integers=False)
+    if actions is None or len(actions) != number:
+        returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
+        raise InvalidActionError(
+            f"{short_repr(policy)} was asked for {number} decisions at once and returned {returned}; it must return"
+            " one action for each row of the observations, in their order"
+        )
+    return actions
+
+
+def policy_name(policy: Any) -> str:
+    """Return the name of a policy."""
+    return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or short_repr(policy))
+
+
+def follows_rule(policy: Any) -> bool:
+    """Return whether a policy certainly leaves decisions to the rule."""
+    if isinstance(policy, Mixture):
+        return any(follows_rule(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
+    return policy is RULE
+
+
+def check_known(found: Trajectories) -> None:
+    """Check that the action of each decision is known, also of those that were left to the rule."""
+    unknown = np.flatnonzero(~found.known)
+    if len(unknown):
+        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
+        raise DefinitionError(
+            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known, first for {agent!r} at"
+            f" turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point needs a"
+            " rule_action_mapping that returns an action for every decision of the rule"
+        )

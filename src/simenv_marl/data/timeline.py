@@ -1,0 +1,418 @@
+"""The plot of one episode: when each agent decided what, and with which reward."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OptionValueError, UnknownAgentError, did_you_mean, short_repr
+from .plots import ABSENT, COLOURS, INK, PALE, by_key, style, title_of, write_beside
+from .trajectories import Trajectories, leaves
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+CHARTED: Final = 6
+"""The largest number of agents that have charts. More agents have a row of colours each."""
+
+DRAWN: Final = 4
+"""The largest number of parts of an action that are charted, and of lines in each chart."""
+
+NAMED: Final = 12
+"""The largest number of different actions that have a colour each. More actions share a colour scale."""
+
+UNKNOWN: Final = "#BDBDBD"
+"""The colour of decisions whose action is unknown."""
+
+REWARDS: Final = ("#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B")
+"""The scale of rewards, from the lowest to the highest."""
+
+ENDS: Final = {"x": "terminated", "|": "truncated"}
+"""The marks of terminations and truncations."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One array of the actions of a policy or of one of its agents."""
+
+    name: str  # its place in the action; empty if the action is one array
+    values: NDArray[Any]  # (decisions, width)
+    labels: Mapping[int, str] | None  # of the policy's values in all episodes, where each has a colour
+    limits: tuple[float, float]  # of the policy's values in all episodes
+
+    @property
+    def components(self) -> list[str]:
+        """The names of its components."""
+        width = self.values.shape[1]
+        return [f"{self.name}[{place}]" for place in range(width)] if width > 1 else [self.name]
+
+
+@dataclass(frozen=True)
+class TimelineRow:
+    """The decisions of one agent in the episode."""
+
+    key: Any  # of its policy
+    agent: str
+    turn: int  # of its first decision
+    times: NDArray[Any]  # of its decisions
+    end: float  # the time of its end
+    parts: list[_Part]  # of its actions
+    rewards: NDArray[np.float64]
+    known: NDArray[np.bool_]
+    by_rule: NDArray[np.bool_]
+    marks: list[str]  # of its end
+
+
+def plot_timeline(
+    trajectories: Trajectories | Mapping[Any, Trajectories],
+    episode: int = 0,
+    *,
+    agents: Sequence[str] | None = None,
+    action_names: Any = None,
+    component: str | None = None,
+    figure: Figure | SubFigure | None = None,
+) -> Figure | SubFigure:
+    """Draw one episode: when each agent decided what, with which reward, and when it was born and ended.
+
+    The horizontal axis is the simulation's time or, without a clock, the number of the decision among all decisions
+    that policies answered in the episode.
+
+    Up to six agents have charts of their own: dots at the height of the action, stems at the height of its reward. A
+    dot is hollow where the decision was left to the model's rule. More agents have one row each, in the order of their
+    births, once coloured by action and once by reward. A colour lasts until the agent's next decision. It is a slim bar
+    where the rule decided, and grey where the rule's action is unknown. A cross marks a termination, a vertical dash a
+    truncation. The background is grey where an agent does not live.
+
+    Args:
+        trajectories: The result of ``collect_episodes``, or its value for one key.
+        episode: The number of the episode, which is the index of its seed.
+        agents: The names of the agents to draw. None: all agents that decided in this episode.
+        action_names: The names of discrete actions: a sequence of names, or a dict from action to name; where policies
+            differ in them, a dict from their keys to these. None: the numbers of the actions.
+        component: The component of the action by which rows are coloured, where actions have several components. The
+            name of a component is its index: ``"[1]"`` in a vector, ``"litres"`` in a ``Dict``, ``"litres[1]"`` in a
+            vector of the dict. None: the first component.
+        figure: The figure or subfigure to draw in; its size does not change. None: a new figure.
+
+    Returns:
+        The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
+
+    Raises:
+        OptionValueError: The episode does not exist or has no decision, or an argument has an invalid value.
+        UnknownAgentError: One of ``agents`` did not decide in this episode.
+        MissingExtraError: Matplotlib is missing.
+    """
+    found_by_key = by_key(trajectories)
+    seeds = next(iter(found_by_key.values())).seeds
+    try:
+        number = range(len(seeds))[operator.index(episode)]
+    except (IndexError, TypeError):
+        raise OptionValueError(
+            f"episode must be the number of one of the {len(seeds)} episodes, counted from 0, not {short_repr(episode)}"
+        ) from None
+    deciding = {key: found for key, found in found_by_key.items() if (found.episodes == number).any()}
+    if not deciding:
+        raise OptionValueError(
+            f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has decided in it"
+        )
+    rows: list[TimelineRow] = []
+    for key, found in deciding.items():
+        rows += _rows(key, found, _parts(found, _names(key, action_names)), number)
+    if agents is not None:
+        rows = _choose(rows, agents, number)
+    begin, end = min(row.times[0] for row in rows), max(row.end for row in rows)
+    with style("plot_timeline") as new_figure:
+        make = new_figure if figure is None else lambda width, height: figure
+        charts = len(rows) <= CHARTED
+        columns = _draw_charts(rows, make, begin, end) if charts else _draw_panels(_panels(rows), make, component)
+        margin = (0.02 if charts else 0.01) * (end - begin or 1.0)
+        clock = all(found.times is not None for found in deciding.values())
+        for column in columns:
+            column[-1].set_xlabel("time" if clock else "decision number in the episode")
+            column[-1].set_xlim(begin - margin, end + margin)
+        _mark_legend(columns[-1][0], rows, charts=charts)
+        drawn: Figure | SubFigure = columns[0][0].figure
+        drawn.suptitle(f"Episode {number}, seed {seeds[number]}", x=0.01, ha="left")
+    return drawn
+
+
+# -- what is drawn --------------------------------------------------------------------------------
+
+
+def _names(key: Any, action_names: Any) -> Mapping[Any, Any]:
+    """Return the names of the actions of one policy."""
+    if isinstance(action_names, Mapping) and not isinstance(action_names.get(key, ""), str):
+        action_names = action_names[key]
+    if action_names is None or isinstance(action_names, Mapping):
+        return action_names or {}
+    if isinstance(action_names, (str, bytes)) or not isinstance(action_names, Sequence):
+        raise OptionValueError(f"action_names must be a sequence or a dict of names, not {short_repr(action_names)}")
+    return dict(enumerate(action_names))
+
+
+def _parts(found: Trajectories, names: Mapping[Any, Any]) -> list[_Part]:
+    """Split the actions of a policy into their arrays. Some actions may be unknown."""
+    parts = []
+    for name, array in leaves(found.actions):
+        own_names = names
+        if array.dtype == object:  # values without a shape are distinguished by their text
+            texts, array = np.unique([str(action) for action in array], return_inverse=True)
+            own_names = {code: text if len(text) < 20 else f"{text[:18]}…" for code, text in enumerate(texts)}
+        values = array.reshape(len(array), -1)
+        known = values[found.known]
+        distinct = np.unique(known).tolist() if values.dtype.kind in "iub" else []
+        labels = {int(value): str(own_names.get(value, int(value))) for value in distinct}
+        finite = known[np.isfinite(known)]
+        limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+        parts.append(_Part(name, values, labels if 0 < len(labels) <= NAMED else None, limits))
+    return parts
+
+
+def _rows(key: Any, found: Trajectories, parts: list[_Part], episode: int) -> Iterator[TimelineRow]:
+    """Yield the row of each agent that a policy answered for in the episode."""
+    for place in np.flatnonzero(found.episodes[found.starts] == episode):
+        start, last = int(found.starts[place]), int(found.starts[place] + found.lengths[place]) - 1
+        rows = slice(start, last + 1)
+        times: NDArray[Any] = found.turns[rows]
+        end = float(found.last_turns[place])
+        if found.times is not None and found.elapsed is not None:
+            times, end = found.times[rows], float(found.times[last] + found.elapsed[last])
+        ends = zip(ENDS, (found.terminations[last], found.truncations[last]), strict=True)
+        yield TimelineRow(
+            key=key,
+            agent=found.names[found.agents[start]],
+            turn=int(found.turns[start]),
+            times=times,
+            end=end,
+            parts=[replace(part, values=part.values[rows]) for part in parts],
+            rewards=found.rewards[rows],
+            known=found.known[rows],
+            by_rule=found.by_rule[rows],
+            marks=[mark for mark, ended in ends if ended],
+        )
+
+
+def _choose(rows: Sequence[TimelineRow], agents: Any, episode: int) -> list[TimelineRow]:
+    """Return the rows of some agents, in the order of ``agents``."""
+    if isinstance(agents, str) or not agents:
+        raise OptionValueError(f"agents must be a sequence of names, not {short_repr(agents)}")
+    by_name = {row.agent: row for row in rows}
+    for name in agents:
+        if name not in by_name:
+            raise UnknownAgentError(
+                f"{short_repr(name)} did not decide in episode {episode}; these agents did:"
+                f" {', '.join(list(by_name)[:20])}{' and others' if len(by_name) > 20 else ''}"
+            )
+    return [by_name[name] for name in dict.fromkeys(agents)]
+
+
+def _panels(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
+    """Group the rows by policy; make one group of them if there are many policies with like actions."""
+    keys = list(dict.fromkeys(row.key for row in rows))
+    kinds = {tuple((*part.components, part.labels is None) for part in row.parts) for row in rows}
+    if len(keys) <= CHARTED or len(kinds) > 1:
+        return [[row for row in rows if row.key == key] for key in keys]
+    return [sorted(rows, key=lambda row: row.turn)]
+
+
+def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> None:
+    """Explain the marks that occur, above axes that may have another legend."""
+    from matplotlib.legend import Legend
+    from matplotlib.lines import Line2D
+
+    by_rule, known = any(row.by_rule.any() for row in rows), all(row.known.all() for row in rows)
+    dot: dict[str, Any] = {"marker": "o", "linewidth": 0, "markersize": 4}
+    marks: list[tuple[bool, str, dict[str, Any]]] = [
+        (by_rule and charts, "policy", dot | {"color": COLOURS[0]}),
+        (by_rule and charts, "rule", dot | {"color": COLOURS[0] if known else UNKNOWN, "markerfacecolor": "white"}),
+        (by_rule and not charts, "by rule", {"color": INK, "linewidth": 2}),
+        (not known and not charts, "by rule, action unknown", {"color": UNKNOWN, "linewidth": 2}),
+    ]
+    for mark, text in ENDS.items():
+        occurs = any(mark in row.marks for row in rows)
+        marks.append((occurs, text, {"marker": mark, "color": INK, "linewidth": 0, "markersize": 6}))
+    handles = {text: Line2D([], [], **look) for occurs, text, look in marks if occurs}
+    above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "bbox_transform": axes.transAxes}
+    axes.add_artist(Legend(axes, list(handles.values()), list(handles), ncols=6, borderaxespad=0.2, **above))
+
+
+# -- few agents: charts ---------------------------------------------------------------------------
+
+
+def _draw_charts(rows: Sequence[TimelineRow], make: Callable[..., Any], begin: float, end: float) -> list[list[Any]]:
+    """Draw charts of the actions and one of the rewards for each agent; return them as one column."""
+    numbers = [min(len(row.parts), DRAWN) for row in rows]
+    heights = [height for number in numbers for height in [1.0] * number + [0.6]]
+    figure = make(9.5, 0.9 + sum(0.75 + 0.95 * number for number in numbers))
+    column = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0].tolist()
+    remaining = iter(column)
+    for row, number in zip(rows, numbers, strict=True):
+        *charts, rewards = islice(remaining, number + 1)
+        for axes, part in zip(charts, row.parts, strict=False):
+            _chart_actions(axes, row, part)
+        charts[0].set_title(
+            row.agent if title_of(row.key) in ("", row.agent) else f"{row.agent}  ({title_of(row.key)})"
+        )
+        rewards.vlines(row.times, 0.0, row.rewards, color=INK, linewidth=1.4 if len(row.times) <= 150 else 0.7)
+        rewards.axhline(0.0, color=PALE, linewidth=0.8, zorder=1)
+        rewards.set_ylabel("reward")
+        write_beside(rewards, f"sum {row.rewards.sum():.4g}", 0.5, rewards.transAxes)
+        for axes in (*charts, rewards):
+            for left, right in ((begin, row.times[0]), (row.end, end)):
+                if right > left:  # where the agent does not live
+                    axes.axvspan(left, right, color=ABSENT, linewidth=0, zorder=0)
+            ground = {"transform": axes.get_xaxis_transform(), "clip_on": False}
+            for mark in row.marks:
+                axes.plot([row.end], [0.0], mark, color=INK, markersize=7, zorder=4, **ground)
+    figure.align_ylabels(column)
+    return [column]
+
+
+def _chart_actions(axes: Axes, row: TimelineRow, part: _Part) -> None:
+    """Draw a line for each component of the actions, with a dot for each decision."""
+    hollow: dict[str, Any] = {"color": "white", "linewidths": 0.9, "zorder": 3}
+    size = 14 if len(row.times) <= 150 else 5
+    by_policy, by_rule = row.known & ~row.by_rule, row.known & row.by_rule
+    for name, heights, colour in zip(part.components[:DRAWN], part.values.T.astype(float), COLOURS, strict=False):
+        line = np.where(row.known, heights, np.nan)
+        axes.step(row.times, line, where="post", color=colour, linewidth=0.8, alpha=0.5, zorder=2)
+        axes.scatter(row.times[by_policy], heights[by_policy], size, **hollow | {"color": colour}, label=name)
+        axes.scatter(row.times[by_rule], heights[by_rule], size, edgecolors=colour, **hollow)
+    if not row.known.all():  # their heights are unknown
+        times, ground = row.times[~row.known], axes.get_xaxis_transform()
+        axes.scatter(times, np.full(len(times), 0.04), 12, edgecolors=UNKNOWN, transform=ground, **hollow)
+    axes.set_ylabel(part.name or "action")
+    low, high = part.limits
+    margin = 0.12 * (high - low or 1.0)
+    axes.set_ylim(low - margin, high + margin)
+    if part.labels is not None:
+        axes.set_yticks(list(part.labels), list(part.labels.values()))
+    if len(part.components) > 1:
+        more = len(part.components) - DRAWN
+        beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.05), "handletextpad": 0.1}
+        axes.legend(title=f"and {more} more" if more > 0 else None, fontsize=8, title_fontsize=8, **beside)
+
+
+# -- many agents: rows of colours -----------------------------------------------------------------
+
+
+def _draw_panels(panels: list[list[TimelineRow]], make: Callable[..., Any], component: str | None) -> list[list[Any]]:
+    """Draw a row for each agent, coloured by its actions and by its rewards; return the axes in two columns."""
+    components = _components(panels, component)
+    heights = np.clip([0.16 * len(rows) for rows in panels], 1.2, 6.0)
+    heights = np.maximum(1.2, heights * min(1.0, 9.0 / heights.sum()))
+    figure = make(11.0, 1.0 + 0.3 * len(panels) + heights.sum())
+    grid = figure.subplots(len(panels), 2, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
+    for (left, right), rows, (number, place) in zip(grid, panels, components, strict=True):
+        _colour_actions(left, rows, number, place)
+        _colour_rewards(right, rows)
+        points = 72 * left.get_window_extent().height / figure.dpi / len(rows)  # the height of a row
+        size = float(np.clip(0.8 * points, 1.5, 6.0))
+        for axes in (left, right):
+            axes.set_facecolor(ABSENT)
+            for mark in ENDS:
+                ends = {at: row.end for at, row in enumerate(rows) if mark in row.marks}
+                if ends:
+                    axes.plot(list(ends.values()), list(ends), mark, color=INK, markersize=size, mew=size / 6, zorder=4)
+        step = max(1, int(np.ceil(9.0 / points)))
+        left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
+        left.set_ylim(len(rows) - 0.4, -0.6)
+        title = title_of(rows[0].key) if len({row.key for row in rows}) == 1 else ""
+        names = [name for part in rows[0].parts for name in part.components]
+        what = f"action {rows[0].parts[number].components[place]}, one of {len(names)}" if len(names) > 1 else "action"
+        left.set_title(f"{title}, {len(rows)} agents: {what}".removeprefix(", "))
+        right.set_title("reward")
+    columns: list[list[Any]] = grid.T.tolist()
+    return columns
+
+
+def _components(panels: list[list[TimelineRow]], component: str | None) -> list[tuple[int, int]]:
+    """Return the part and its column by which the rows of each panel are coloured."""
+    places = [
+        {name: (number, place) for number, part in enumerate(parts) for place, name in enumerate(part.components)}
+        for parts in (rows[0].parts for rows in panels)
+    ]
+    names = dict.fromkeys(name for own in places for name in own)
+    if component is not None and component not in names:
+        raise OptionValueError(
+            f"no action has a component {short_repr(component)}; there are {', '.join(map(repr, names))}"
+            f"{did_you_mean(component, names)}"
+        )
+    return [own.get(component or "", (0, 0)) for own in places]
+
+
+def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> NDArray[np.float64]:
+    """Return ``(decisions, 4, 2)``: the corners of each decision's coloured cell, row by row."""
+    cells = []
+    for number, row in enumerate(rows):
+        # Decisions at the same time divide the time until the next one among them.
+        times, which, same = np.unique(row.times.astype(float), return_inverse=True, return_counts=True)
+        width = (np.diff(times, append=max(row.end, times[-1])) / same)[which]
+        left = times[which] + width * (np.arange(len(row.times)) - np.searchsorted(row.times, row.times))
+        half = np.full(len(left), 0.5 if len(rows) > 60 else 0.42)
+        if slim:
+            half[row.by_rule] *= 0.45
+        x = np.stack([left, left + width, left + width, left], axis=1)
+        cells.append(np.stack([x, number + np.stack([-half, -half, half, half], axis=1)], axis=2))
+    return np.concatenate(cells)
+
+
+def _colour(axes: Axes, cells: NDArray[np.float64], **colours: Any) -> Any:
+    """Draw cells in their colours."""
+    from matplotlib.collections import PolyCollection
+
+    # In vector graphics, many cells become one image.
+    return axes.add_collection(PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours))
+
+
+def _colour_bar(axes: Axes, scale: Any, extend: str) -> Any:
+    """Draw the scale of colours beside axes."""
+    bar = axes.figure.colorbar(scale, ax=axes, extend=extend, fraction=0.04, pad=0.01, aspect=30)
+    bar.outline.set_visible(False)
+    return bar
+
+
+def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], number: int, place: int) -> None:
+    """Colour the decisions by a component of their actions: its part, and its column in it."""
+    from matplotlib.patches import Patch
+
+    parts = [row.parts[number] for row in rows]
+    values = np.concatenate([part.values[:, place] for part in parts])
+    known = np.concatenate([row.known for row in rows])
+    _colour(axes, _cells(rows, slim=False), facecolors="white")  # white while the agent lives
+    cells = _cells(rows, slim=True)
+    if not known.all():
+        _colour(axes, cells[~known], facecolors=UNKNOWN)
+    labels = {value: label for part in parts for value, label in (part.labels or {}).items()}
+    if not 0 < len(labels) <= NAMED:
+        limits = min(part.limits[0] for part in parts), max(part.limits[1] for part in parts)
+        scale = _colour(axes, cells[known], array=values[known].astype(float), cmap="viridis", clim=limits)
+        _colour_bar(axes, scale, "neither")
+        return
+    inside = all(0 <= action < len(COLOURS) for action in labels)
+    colours = {action: COLOURS[action if inside else rank] for rank, action in enumerate(sorted(labels))}
+    _colour(axes, cells[known], facecolors=[colours[int(value)] for value in values[known]])
+    patches = [Patch(color=colour, label=labels[action]) for action, colour in colours.items()]
+    axes.legend(handles=patches, loc="upper left", bbox_to_anchor=(1.0, 1.0), handlelength=0.9, handleheight=0.9)
+
+
+def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
+    """Colour the decisions by their rewards; zero is white."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    rewards = np.concatenate([row.rewards for row in rows])
+    # So that a few large rewards do not make all others pale.
+    most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
+    low, high = rewards.min(), rewards.max()
+    extend = ("neither", "min", "max", "both")[int(low < -most) + 2 * int(high > most)]
+    colours = LinearSegmentedColormap.from_list("reward", REWARDS)
+    scale = _colour(axes, _cells(rows, slim=False), array=rewards, cmap=colours, clim=(-most, most))
+    bar = _colour_bar(axes, scale, extend)
+    bar.ax.set_ylim(-most if low < 0 else 0.0, most if high > 0 or low == 0 else 0.0)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.resources import files
-from textwrap import TextWrapper, indent
+from textwrap import fill, indent
 from typing import Any, Final, Literal
 
 from ..errors import CheckFailedError
@@ -17,11 +17,7 @@ Severity = Literal["error", "warning", "note"]
 SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 """The severities, the most important first."""
 
-WIDTH: Final = 100
 _MOST_COMPONENTS: Final = 12
-
-
-# -- findings -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -41,13 +37,21 @@ class Finding:
     evidence: str = ""
 
     def __str__(self) -> str:
-        lines = [f"{self.severity.upper():<9}{self.title}", _wrapped(self.explanation)]
+        lines = [f"{self.severity.upper():<9}{self.title}", _wrapped(self.explanation, 9)]
         if self.evidence:
-            lines += [_wrapped(line, hang=11) for line in f"Seen: {self.evidence}".splitlines()]
+            lines += [_wrapped(line, 9) for line in f"Seen: {self.evidence}".splitlines()]
         return "\n".join(lines)
 
 
-_WORDS: Final = tomllib.loads(files(__package__).joinpath("findings.toml").read_text(encoding="utf-8"))
+_TEXTS: Final[dict[Any, dict[str, str]]] = tomllib.loads(
+    files(__package__).joinpath("findings.toml").read_text(encoding="utf-8")
+)
+"""By severity and name, the title of a finding, a line break, and its explanation."""
+
+
+def finding_names() -> set[str]:
+    """Return the names of all findings."""
+    return {name for texts in _TEXTS.values() for name in texts}
 
 
 def finding(name: str, evidence: str = "", **words: Any) -> Finding:
@@ -58,13 +62,9 @@ def finding(name: str, evidence: str = "", **words: Any) -> Finding:
         evidence: Where and when it was seen.
         **words: The values of placeholders in title and explanation.
     """
-    entry = _WORDS[name]
-    severity = next(severity for severity in SEVERITIES if severity in entry)
-    title, text = entry[severity].format(**words), " ".join(entry["text"].split()).format(**words)
-    return Finding(severity, title, text, evidence)
-
-
-# -- statistics -----------------------------------------------------------------------------------
+    severity = next(severity for severity in SEVERITIES if name in _TEXTS[severity])
+    title, text = _TEXTS[severity][name].format(**words).split("\n", 1)
+    return Finding(severity, title, " ".join(text.split()), evidence)
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,12 @@ class ComponentStatistics:
     def constant(self) -> bool:
         """Whether all values were the same."""
         return self.minimum == self.maximum
+
+    def __str__(self) -> str:
+        return (
+            f"{self.name or 'value'}: {self.minimum:.4g} to {self.maximum:.4g}, mean {self.mean:.4g};"
+            f" bounds {self.low:.4g} to {self.high:.4g}, at a bound {self.at_bounds:.0%}"
+        )
 
 
 @dataclass(frozen=True)
@@ -123,23 +129,15 @@ class PointStatistics:
     reward_mean: float
 
     def __str__(self) -> str:
-        rewards = "no rewards"
-        if self.rewards:
-            rewards = (
-                f"rewards {in_digits(self.reward_minimum)} to {in_digits(self.reward_maximum)},"
-                f" mean {in_digits(self.reward_mean)}"
-            )
-        lines = [f"{self.agents}, at {self.point}", f"  {self.decisions} decisions, {rewards}"]
-        lines.append(f"  actions {self.action_space}, observations {self.observation_space}")
-        if self.components:
-            rows = [("observed", "least", "mean", "most", "bounds", "at a bound")]
-            for part in self.components[:_MOST_COMPONENTS]:
-                values = in_digits(part.minimum), in_digits(part.mean), in_digits(part.maximum)
-                bounds = f"{in_digits(part.low)} to {in_digits(part.high)}"
-                rows.append((part.name or "(value)", *values, bounds, f"{part.at_bounds:.0%}"))
-            lines += [f"  {line}" for line in _table(rows)]
-            if len(self.components) > _MOST_COMPONENTS:
-                lines.append(f"    ... and {len(self.components) - _MOST_COMPONENTS} more")
+        rewards = f"{self.reward_minimum:.4g} to {self.reward_maximum:.4g}, mean {self.reward_mean:.4g}"
+        lines = [
+            f"{self.agents}, at {self.point}",
+            f"  {self.decisions} decisions, {f'rewards {rewards}' if self.rewards else 'no rewards'}",
+            f"  actions {self.action_space}, observations {self.observation_space}",
+            *(f"    {component}" for component in self.components[:_MOST_COMPONENTS]),
+        ]
+        if len(self.components) > _MOST_COMPONENTS:
+            lines.append(f"    ... and {len(self.components) - _MOST_COMPONENTS} more")
         return "\n".join(lines)
 
 
@@ -165,29 +163,24 @@ class EpisodeStatistics:
     def __str__(self) -> str:
         if not self.episodes:
             return "none was played to its end"
-        ends = {"ended": self.terminated, "truncated by the simulation": self.truncated, "cut at max_steps": self.cut}
-        length = f"{self.shortest}" if self.shortest == self.longest else f"{self.shortest} to {self.longest}"
         return (
-            f"{self.episodes} of {length} decisions (mean {in_digits(self.mean)});"
-            f" {', '.join(f'{number} {end}' for end, number in ends.items() if number)}"
+            f"{self.episodes} of {self.shortest} to {self.longest} decisions (mean {self.mean:.4g}); {self.terminated}"
+            f" ended, {self.truncated} truncated by the simulation, {self.cut} cut at max_steps"
         )
 
 
 @dataclass(frozen=True)
 class Timing:
-    """The time per decision, in microseconds: in the plain run, and with ``RULE`` in the AEC view."""
+    """The time per decision, in microseconds: in the plain run, and with ``RULE`` in the AEC view.
+
+    Both include the reset, and the recording of decisions for the comparison.
+    """
 
     plain: float
     environment: float
 
     def __str__(self) -> str:
-        return (
-            f"{in_digits(self.plain)} us per decision in the plain run, {in_digits(self.environment)} us in the"
-            " environment"
-        )
-
-
-# -- reports --------------------------------------------------------------------------------------
+        return f"{self.plain:.4g} us per decision in the plain run, {self.environment:.4g} us in the environment"
 
 
 @dataclass(frozen=True)
@@ -229,29 +222,28 @@ class CheckReport:
         """
         errors = self.of("error")
         if errors:
-            raise CheckFailedError("\n\n".join([f"{self.simulation}: {self._counts()}", *map(str, errors)]))
+            raise CheckFailedError("\n\n".join([self._heading(), *map(str, errors)]))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as dicts, lists, strings and numbers, for JSON; infinite numbers as strings."""
-        made: dict[str, Any] = {"ok": self.ok, **_for_json(asdict(self))}
-        return made
+        return {"ok": self.ok, **_for_json(asdict(self))}
 
     def __str__(self) -> str:
-        parts = [f"{self.simulation}: {self._counts()}", *map(str, self.findings)]
+        parts = [self._heading(), *map(str, self.findings)]
         if self.checked:
-            parts.append("\n".join(["What was checked", *(_wrapped(line, "  ") for line in self.checked)]))
+            parts.append("\n".join(["What was checked", *(_wrapped(line, 2) for line in self.checked)]))
         points = [indent(str(point), "  ") for point in self.observations]
-        parts.append("\n".join([f"Episodes of random legal actions: {self.episodes}", *points]))
+        parts.append("\n".join([_wrapped(f"Episodes of random legal actions: {self.episodes}", 0), *points]))
         if self.calls:
-            parts.append(f"Order of the decisions in a plain run\n{_wrapped(self.calls, '  ')}")
+            parts.append(f"Order of the decisions in a plain run\n{_wrapped(self.calls, 2)}")
         if self.timing is not None:
             parts.append(f"Time: {self.timing}")
         return "\n\n".join(parts)
 
-    def _counts(self) -> str:
+    def _heading(self) -> str:
         counts = [(len(self.of(severity)), severity) for severity in SEVERITIES]
         named = [f"{number} {severity}{'s' * (number != 1)}" for number, severity in counts if number]
-        return ", ".join(named) if named else "nothing to complain of"
+        return f"{self.simulation}: {', '.join(named) or 'nothing to complain of'}"
 
 
 @dataclass(frozen=True)
@@ -305,48 +297,44 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the inspection as dicts, lists, strings and numbers, for JSON."""
-        made: dict[str, Any] = _for_json(asdict(self))
-        return made
+        return dict(_for_json(asdict(self)))
 
     def __str__(self) -> str:
         counts = ", ".join(f"{point} {number} times" for point, number in self.counts.items())
         more = f" and {len(self.agents) - 8} more" if len(self.agents) > 8 else ""
-        episode = {"calls": counts, "order": self.calls, "agents": ", ".join(self.agents[:8]) + more}
-        empty = {"calls": "none", "order": "-", "agents": "-"}
-        lines = [f"One episode with the model's own rules: {self.ended}"]
-        lines += [_wrapped(f"{name:<8} {text or empty[name]}", "  ", 11) for name, text in episode.items()]
+        episode = [
+            f"One episode with the model's own rules: {self.ended}",
+            _wrapped(f"calls    {counts or 'none'}", 2),
+            _wrapped(f"order    {self.calls or '-'}", 2),
+            _wrapped(f"agents   {', '.join(self.agents[:8]) or '-'}{more}", 2),
+        ]
         return "\n\n".join(
             [
                 f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}",
                 *map(str, self.points),
                 f"Possible views: {', '.join(self.views)}",
-                "\n".join(lines),
+                "\n".join(episode),
             ]
         )
 
 
-# -- the order of calls ---------------------------------------------------------------------------
+def order_of(calls: Sequence[str], longest_block: int = 24, most_calls: int = 3000, most_terms: int = 30) -> str:
+    """Return the order in which decision points were called: the shortest unique names, and repetitions in braces.
 
-_LONGEST_BLOCK: Final = 24
-_MOST_CALLS: Final = 3000
-_MOST_TERMS: Final = 30
-
-
-def order_of(calls: Sequence[str]) -> str:
-    """Return the order in which decision points were called, compressed and with the shortest names."""
+    Args:
+        calls: The dotted names of the points, in the order of their calls.
+        longest_block: The length of the longest blocks whose repetitions are found.
+        most_calls: The number of calls that are looked at.
+        most_terms: The number of terms that are written.
+    """
     short = short_names(list(dict.fromkeys(calls)))
-    return compressed(short[name] for name in calls)
-
-
-def compressed(calls: Iterable[str]) -> str:
-    """Write a sequence with its repetitions, as ``(a b){30} c``; long ones end with an ellipsis."""
-    all_calls = list(calls)
-    terms = all_calls[:_MOST_CALLS]
-    for length in range(1, _LONGEST_BLOCK + 1):
+    terms = [short[name] for name in calls[:most_calls]]
+    for length in range(1, longest_block + 1):
         terms = _folded(terms, length)
-    rest, left = len(terms) - _MOST_TERMS, len(all_calls) - _MOST_CALLS
-    ending = f" ... and {rest} more such terms" if rest > 0 else f" ... and {left} more calls" if left > 0 else ""
-    return " ".join(terms[:_MOST_TERMS]) + ending
+    left = f"{len(terms) - most_terms} more such terms" if len(terms) > most_terms else ""
+    if not left and len(calls) > most_calls:
+        left = f"{len(calls) - most_calls} more calls"
+    return " ".join(terms[:most_terms]) + (f" ... and {left}" if left else "")
 
 
 def _folded(terms: Sequence[str], length: int) -> list[str]:
@@ -354,15 +342,16 @@ def _folded(terms: Sequence[str], length: int) -> list[str]:
     made: list[str] = []
     place = 0
     while place < len(terms):
-        block = terms[place : place + length]
+        block = list(terms[place : place + length])
         times = 1
         while terms[place + times * length : place + (times + 1) * length] == block:
             times += 1
-        if times > 1:
-            made.append(f"{block[0]}{{{times}}}" if length == 1 else f"({' '.join(block)}){{{times}}}")
-        else:
+        if times == 1:
             made.append(terms[place])
-        place += times * length if times > 1 else 1
+            place += 1
+        else:
+            made.append(f"{block[0]}{{{times}}}" if length == 1 else f"({' '.join(block)}){{{times}}}")
+            place += times * length
     return made
 
 
@@ -377,28 +366,10 @@ def short_names(points: Sequence[str]) -> dict[str, str]:
     return short
 
 
-# -- text -----------------------------------------------------------------------------------------
-
-
-def _wrapped(text: str, margin: str = " " * 9, hang: int | None = None) -> str:
-    """Wrap a text, with a margin before its first line and one of ``hang`` spaces before the others."""
-    rest = margin if hang is None else " " * hang
-    wrapper = TextWrapper(WIDTH, margin, rest, break_long_words=False, break_on_hyphens=False)
-    return wrapper.fill(text)
-
-
-def in_digits(value: float) -> str:
-    """Return a number as text with four significant digits."""
-    if not math.isfinite(value):
-        return "not a number" if math.isnan(value) else "-inf" if value < 0 else "inf"
-    return f"{value:.4g}"
-
-
-def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for first, *others in rows:
-        cells = [first.ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True))]
-        yield "  ".join(cells).rstrip()
+def _wrapped(text: str, margin: int) -> str:
+    """Wrap a text, with a margin before its lines that is wider after the first one."""
+    first, rest = " " * margin, " " * (margin + 2)
+    return fill(text, 100, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False)
 
 
 def _for_json(value: Any) -> Any:

@@ -1,6 +1,6 @@
-"""Watched runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
+"""Recorded runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
 
-Every run has an end, whatever the model does. At its *limit* of decisions, an exit is raised at the next decision. When
+Every run has an end, whatever the model does. At its limit of decisions, an exit is raised at the next decision. When
 its time is up, an exit is raised in whatever Python code the model is executing.
 """
 
@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar
@@ -24,8 +24,10 @@ import numpy as np
 
 from ..errors import error_text
 from ..simulation import RULE
-from .fingerprint import Fingerprint, alike, brief, shown
-from .inside import MASK, Plan, SimulationExit, make_simulation, outside_simulation, plain_loop, watching_rules
+from .fingerprint import Fingerprint, alike, brief, describe_differences, fingerprint
+from .internals import MASK, Plan, SimulationExit, outside_simulation, set_up, watching_rules
+
+Result = TypeVar("Result")
 
 
 class Cut(SimulationExit):
@@ -34,16 +36,6 @@ class Cut(SimulationExit):
 
 class TimeUp(SimulationExit):
     """Raised in a run whose time is up."""
-
-
-Result = TypeVar("Result")
-Look = Callable[[Any], Fingerprint | None]
-"""A function that returns the fingerprint of a simulation."""
-
-# -- time -----------------------------------------------------------------------------------------
-
-_AGAIN: Final = 0.5
-"""The time in seconds after which the exit is raised again in a model that swallowed it."""
 
 
 def within(deadline: float, function: Callable[[], Result]) -> Result:
@@ -62,7 +54,7 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
         pause = deadline - time.monotonic()
         while not over.wait(max(0.0, pause)):
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(TimeUp))
-            pause = _AGAIN
+            pause = 0.5  # raise it again in a model that swallows it
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
     try:
@@ -85,21 +77,20 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
 # -- global generators ----------------------------------------------------------------------------
 
 
-def global_generators() -> tuple[Any, Any]:
-    """Return the states of Python's and NumPy's global generators."""
-    return random.getstate(), np.random.get_state(legacy=False)
-
-
-def set_global_generators(states: tuple[Any, Any]) -> None:
-    """Restore states that ``global_generators`` returned."""
-    random.setstate(states[0])
-    np.random.set_state(states[1])
-
-
 def seed_global_generators(seed: int) -> None:
-    """Seed both generators, so that runs of a model that draws from them can be compared."""
+    """Seed Python's and NumPy's global generators, so that runs of a model that draws from them can be compared."""
     random.seed(seed)
     np.random.seed(seed % 2**32)
+
+
+def global_generators() -> dict[str, Any]:
+    """Return the states of both."""
+    return {"Python's random": random.getstate(), "numpy.random": np.random.get_state(legacy=False)}
+
+
+def drawn_since(states: dict[str, Any]) -> set[str]:
+    """Return the names of the global generators whose states have changed."""
+    return {name for name, state in global_generators().items() if not alike(state, states[name])}
 
 
 @contextmanager
@@ -120,95 +111,99 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
             warnings.simplefilter("ignore")
             yield caught
     finally:
-        set_global_generators(states)
+        random.setstate(states["Python's random"])
+        np.random.set_state(states["numpy.random"])
 
 
-# -- runs of the model's own rules ----------------------------------------------------------------
+# -- runs -----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Step:
+    """What an agent got at its turn."""
+
+    observation: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
 
 
 @dataclass
 class Run:
-    """The result of a run.
+    """A run, and what it has shown so far.
 
-    Attributes:
-        decisions: The decisions: the point's name, and what its rule returned.
-        fingerprint: What the simulation held at its end, or when it was cut.
-        cut: Whether it was cut at its limit.
-        error: The exception that it raised.
-        result: What ``run`` returned, in a plain run.
-        drawn: The global generators from which it has drawn.
+    Its entries are the decisions in plain runs and with RULE (the point's name, and what its rule returned), and the
+    steps in episodes of random actions (the agent's name, and a ``Step``).
     """
 
-    decisions: list[list[Any]] = field(default_factory=list)
-    fingerprint: Fingerprint | None = None
-    cut: bool = False
+    entries: list[tuple[str, Any]] = field(default_factory=list)
+    actions: list[Any] = field(default_factory=list)  # the random ones
+    simulation: Any = None
+    fingerprint: Fingerprint | None = None  # of the simulation at its end, or when it was cut
+    cut: bool = False  # whether it has reached its limit of decisions
     error: BaseException | None = None
-    result: Any = None
-    drawn: set[str] = field(default_factory=set)
+    result: Any = None  # what the simulation's run() returned, in a plain run
+    drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
+    seconds: float = 0.0
+    latest: float = field(default_factory=time.monotonic)  # the time of the latest step
 
     @property
     def calls(self) -> list[str]:
         """The names of the points that were called, in that order."""
-        return [name for name, _ in self.decisions]
+        return [name for name, _ in self.entries]
+
+    def play(self, deadline: float, function: Callable[[], None]) -> Run:
+        """Call a function that plays this run; note its error and the global generators."""
+        states = global_generators()
+        try:
+            within(deadline, function)
+        except (Exception, SystemExit) as error:
+            if not self.cut:
+                self.error = error
+        self.drawn = drawn_since(states)
+        return self
 
     def difference(self, other: Run, here: str = "first", there: str = "then") -> str:
-        """Describe the first difference from the decisions of another run; empty if there is none."""
-        for number, (left, right) in enumerate(zip(self.decisions, other.decisions, strict=False), 1):
-            if left[0] != right[0]:
-                return f"decision {number} is {here} of {left[0]}, {there} of {right[0]}"
-            if not alike(left[1], right[1]):
-                return f"decision {number}, of {left[0]}, is {here} {shown(left[1])}, {there} {shown(right[1])}"
-        if len(self.decisions) != len(other.decisions):
-            return f"there are {here} {len(self.decisions)} decisions, {there} {len(other.decisions)}"
+        """Describe the first difference from the entries of another run; empty if there is none."""
+        for number, (one, another) in enumerate(zip(self.entries, other.entries, strict=False), 1):
+            if one[0] != another[0]:
+                return f"step {number} is {here} of {one[0]}, {there} of {another[0]}"
+            name, value = one
+            parts = fingerprint(name, value).differences(fingerprint(name, another[1]))
+            if parts:
+                return f"in step {number}, {describe_differences(parts, here, there)}"
+        if other.error is not None:
+            return f"the second one raises {describe_with_place(other.error)}"
+        if len(self.entries) != len(other.entries):
+            return f"there are {here} {len(self.entries)} steps, {there} {len(other.entries)}"
         return ""
 
 
-class _Watch:
-    """Watches one run, until a limit of decisions.
+Look = Callable[[Any], Fingerprint | None]
+"""A function that returns the fingerprint of a simulation."""
 
-    Attributes:
-        run: The result.
-        simulation: The simulation that runs.
-    """
 
-    def __init__(self, limit: int, look: Look) -> None:
-        self.run = Run()
-        self.simulation: Any = None
-        self._limit, self._look = limit, look
+def _recorder(run: Run, limit: int, look: Look) -> Callable[[str], Callable[[Any], None]]:
+    """Return a function that records the decisions of a run, and cuts it at a limit."""
 
-    def over(self, plan: Plan, play: Callable[[], Any]) -> Run:
-        """Watch what a function plays, and record whatever it raises."""
-        run, before = self.run, global_generators()
-        with watching_rules(plan, self._begin):
-            try:
-                run.result = play()
-                run.fingerprint = self._look(self.simulation)
-            except Cut:
-                pass
-            except (Exception, SystemExit) as error:
-                if not run.cut:
-                    run.error = error
-        sources = zip(("Python's random", "numpy.random"), before, global_generators(), strict=True)
-        run.drawn = {name for name, one, other in sources if not alike(one, other)}
-        return run
-
-    def _begin(self, name: str) -> Callable[[Any], None]:
-        run = self.run
-        if len(run.decisions) >= self._limit:
+    def begin(name: str) -> Callable[[Any], None]:
+        if len(run.entries) >= limit:
             if not run.cut:
-                run.cut = True
-                run.fingerprint = self._look(self.simulation)
+                run.cut, run.fingerprint = True, look(run.simulation)
             raise Cut
-        note = [name, "left without a decision"]
-        run.decisions.append(note)
+        place = len(run.entries)
+        run.entries.append((name, "left without a decision"))
 
         def end(value: Any) -> None:
-            note[1] = brief(value)
+            run.entries[place] = name, brief(value)
 
         return end
 
+    return begin
 
-def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look, profile: Any = None) -> Run:
+
+def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look) -> Run:
     """Run a simulation's own loop; only the results of its rules are recorded.
 
     Args:
@@ -217,56 +212,37 @@ def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look, pr
         limit: The number of decisions after which it is cut.
         deadline: The time at which it is interrupted.
         look: Returns the fingerprint of the simulation at the end.
-        profile: A profiler for all calls meanwhile, as ``sys.setprofile`` takes it.
     """
-    watch, before = _Watch(limit, look), sys.getprofile()
+    run = Run()
 
-    def play() -> Any:
-        watch.simulation = make_simulation(plan.source)
-        sys.setprofile(before if profile is None else profile)
-        try:
-            reset(watch.simulation, seed)
-            return main(watch.simulation)
-        finally:
-            sys.setprofile(before)
+    def play() -> None:
+        with set_up(plan, seed) as (simulation, start):
+            run.simulation, begun = simulation, time.perf_counter()
+            run.result = start()
+            run.seconds = time.perf_counter() - begun
+            run.fingerprint = look(simulation)
 
-    with plain_loop(plan, watched=True) as (reset, main):
-        return watch.over(plan, lambda: within(deadline, play))
-
-
-def seconds_of_plain_run(plan: Plan, seed: int, deadline: float) -> float:
-    """Run a simulation's own loop without any recording. Return its duration in seconds."""
-
-    def play() -> float:
-        simulation = make_simulation(plan.source)
-        reset(simulation, seed)
-        start = time.perf_counter()
-        main(simulation)
-        return time.perf_counter() - start
-
-    with plain_loop(plan, watched=False) as (reset, main):
-        return within(deadline, play)
+    with watching_rules(plan, _recorder(run, limit, look)):
+        return run.play(deadline, play)
 
 
 def rule_run(plan: Plan, env: Any, seed: int, limit: int, deadline: float, look: Look) -> Run:
-    """Run an environment of a plan, of any view, with ``RULE`` throughout, and watch it."""
+    """Run an environment of a plan, of any view, with ``RULE`` throughout; the other arguments as for ``plain_run``."""
+    run = Run(simulation=env.simulation)
 
     def play() -> None:
-        env.reset(seed=seed)
-        play_rules(env)
+        begun = time.perf_counter()
+        play_rules(env, seed)
+        run.seconds = time.perf_counter() - begun
+        run.fingerprint = look(run.simulation)
 
-    watch = _Watch(limit, look)
-    watch.simulation = env.simulation
-    return watch.over(plan, lambda: within(deadline, play))
+    with watching_rules(plan, _recorder(run, limit, look)):
+        return run.play(deadline, play)
 
 
-def play_rules(env: Any, selected: dict[str, None] | None = None) -> None:
-    """Play an environment of any view with ``RULE`` throughout, after its reset.
-
-    Args:
-        env: The environment.
-        selected: A dict that collects the agents that the AEC view selects.
-    """
+def play_rules(env: Any, seed: int, selected: dict[str, None] | None = None) -> None:
+    """Play an episode in any view with ``RULE`` throughout; collect the agents that the AEC view selects."""
+    env.reset(seed=seed)
     if not hasattr(env, "agents"):
         while not any(env.step(RULE)[2:4]):
             pass
@@ -281,53 +257,41 @@ def play_rules(env: Any, selected: dict[str, None] | None = None) -> None:
         env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
 
 
-# -- episodes of random actions -------------------------------------------------------------------
+def random_steps(run: Run, env: Any, seed: int, salt: int = 0) -> Iterator[None]:
+    """Play an episode of an AEC environment, one step at a time, with random legal actions.
 
-
-@dataclass
-class Step:
-    """What an agent got at its turn, and what it did (None if its episode has ended)."""
-
-    agent: str
-    told: tuple[Any, float, bool, bool, dict[str, Any]]
-    action: Any
-
-    def difference(self, other: Step) -> str:
-        """Describe the difference from a step of another episode; empty if there is none."""
-        if self.agent != other.agent:
-            return f"the agent is first {self.agent}, then {other.agent}"
-        names = ("observation", "reward", "terminated", "truncated", "info")
-        for name, here, there in zip(names, self.told, other.told, strict=True):
-            if not alike(here, there):
-                return f"the {name} of {self.agent} is first {shown(here)}, then {shown(there)}"
-        return "" if alike(brief(self.action), brief(other.action)) else f"the action of {self.agent} differs"
-
-
-def random_steps(env: Any, seed: int, salt: int = 0) -> Iterator[Step]:
-    """Play an episode of an AEC environment with random legal actions, which depend on seed, agent and salt alone."""
+    The actions depend on seed, agent and salt alone. Steps and actions are recorded in a run.
+    """
     env.reset(seed=seed)
     spaces: dict[str, Any] = {}
     while env.agents:
         agent = env.agent_selection
-        told = env.last()
+        step = Step(*env.last())
+        run.entries.append((agent, step))
+        run.latest = time.monotonic()
         action = None
-        if not (told[2] or told[3]):
+        if not (step.terminated or step.truncated):
             if agent not in spaces:
                 spaces[agent] = copy.deepcopy(env.action_space(agent))
                 spaces[agent].seed(crc32(f"{seed} {agent} {salt}".encode(errors="surrogatepass")))
-            mask = told[4].get(MASK)
-            action = spaces[agent].sample() if mask is None else spaces[agent].sample(mask)
-        yield Step(agent, told, action)
+            action = spaces[agent].sample(step.info.get(MASK))
+            run.actions.append(action)
+        yield
         env.step(action)
+
+
+def play_out(steps: Iterable[Any]) -> None:
+    """Play all steps of an episode, or of several in turns."""
+    for _ in steps:
+        pass
 
 
 # -- where errors and differences come from -------------------------------------------------------
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
-_CLOCKS: Final = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
 
 
-def culprit(error: BaseException) -> str:
+def place_of(error: BaseException) -> str:
     """Return where an error was raised, outside of this library: file, line and function; empty if nowhere."""
     place, trace = "", error.__traceback__
     while trace is not None:
@@ -338,10 +302,10 @@ def culprit(error: BaseException) -> str:
     return place
 
 
-def error_in_words(error: BaseException, most: int = 300) -> str:
-    """Describe an error: its kind, the first lines of its text, and where it was raised."""
-    text, place = " ".join(error_text(error).split()), culprit(error)
-    text = text if len(text) <= most else f"{text[: most - 4]} ..."
+def describe_with_place(error: BaseException) -> str:
+    """Describe an error: its class, the beginning of its text, and where it was raised."""
+    text, place = " ".join(error_text(error).split()), place_of(error)
+    text = text if len(text) <= 400 else f"{text[:396]} ..."
     return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
 
 
@@ -354,32 +318,38 @@ def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> lis
     found: dict[str, None] = {}
     library = random.__file__.rpartition("random.py")[0]
     shared: Any = random.random.__self__  # type: ignore[attr-defined]
-    seeding = random.Random.seed.__code__
+    clocks = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
 
-    def asked(what: str, frame: Any) -> None:
+    def add(source: str, frame: Any) -> None:
+        """Add a source, with the place in the model or a package from which the standard library called it."""
         while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
             path = frame.f_code.co_filename
             if ("site-packages" in path or not path.startswith(library)) and not path.startswith("<"):
                 if "numpy" not in path:
-                    found[f"{what} at {path}:{frame.f_lineno}, in {frame.f_code.co_name}"] = None
+                    found[f"{source} at {path}:{frame.f_lineno}, in {frame.f_code.co_name}"] = None
                 return
             frame = frame.f_back
 
     def profile(frame: Any, event: str, argument: Any) -> None:
-        if event == "call" and frame.f_code is seeding and frame.f_locals.get("a", 0) is None:
-            asked("a random.Random is made without a seed", frame.f_back)
+        if event == "call" and frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
+            add("a random.Random is made without a seed", frame.f_back)
         if event != "c_call":
             return
         module, name = getattr(argument, "__module__", None), getattr(argument, "__name__", "")
         owner = getattr(argument, "__self__", None)
-        if module == "time" and name in _CLOCKS:
-            asked(f"the clock is read (time.{name})", frame)
+        if module == "time" and name in clocks:
+            add(f"the clock is read (time.{name})", frame)
         elif name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
-            asked(f"the clock is read (datetime.{name})", frame)
+            add(f"the clock is read (datetime.{name})", frame)
         elif name == "urandom":
-            asked("the operating system is asked for random bits (as by a generator without a seed)", frame)
+            add("the operating system is asked for random bits (as by a generator without a seed)", frame)
         elif owner is shared and name in ("random", "getrandbits"):
-            asked("Python's global generator is used", frame)
+            add("Python's global generator is used", frame)
 
-    plain_run(plan, seed, limit, deadline, lambda simulation: None, profile)
+    before = sys.getprofile()
+    sys.setprofile(profile)
+    try:
+        plain_run(plan, seed, limit, deadline, lambda simulation: None)
+    finally:
+        sys.setprofile(before)
     return list(found)

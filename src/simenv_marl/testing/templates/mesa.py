@@ -6,10 +6,7 @@
 Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Sequence
+import sys
 from typing import Any
 
 import mesa
@@ -19,7 +16,6 @@ from mesa.discrete_space import CellAgent, OrthogonalVonNeumannGrid
 
 from simenv_marl import SteppedSimulation, aec_env, difference, evaluate, make_step
 from simenv_marl.data import collect_episodes
-from simenv_marl.envs import SimulationAECEnv
 
 # -- 1. The model: Mesa's agents, and a rule of their own -----------------------------------------
 
@@ -93,7 +89,7 @@ move = make_step(
 # -- 3. The simulation: what an episode is --------------------------------------------------------
 
 
-class MyModelSimulation(SteppedSimulation):
+class MySimulation(SteppedSimulation):
     """A hundred days: each reset makes a model with its seed, and run steps it."""
 
     points = {Rabbit.choose_cell: move}  # the model's classes stay as they are
@@ -106,15 +102,12 @@ class MyModelSimulation(SteppedSimulation):
         return [(rabbit,) for rabbit in self.model.agents]
 
 
-# -- 4. The environment ---------------------------------------------------------------------------
+# -- 4. The environment, training, and what it is worth -------------------------------------------
 
 
-def env(**options: Any) -> SimulationAECEnv:
+def env(**options: Any) -> Any:
     """Make the environment: a ``pettingzoo.AECEnv``; use ``parallel_env`` for learners that act in rounds."""
-    return aec_env(MyModelSimulation, **options)
-
-
-# -- 5. Training, and what it is worth ------------------------------------------------------------
+    return aec_env(MySimulation, **options)
 
 
 def odds(weights: np.ndarray[Any, Any], seen: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -125,11 +118,7 @@ def odds(weights: np.ndarray[Any, Any], seen: np.ndarray[Any, Any]) -> np.ndarra
 
 
 def train(updates: int, meadows: int) -> Any:
-    """Train one policy for all rabbits, by policy gradients.
-
-    Returns:
-        A policy: a callable of the observations that returns the actions.
-    """
+    """Train one policy for all rabbits by policy gradients, and return it: a callable of one observation or many."""
     generator, weights = np.random.default_rng(1), np.zeros((12, 5))
 
     def explore(seen: np.ndarray[Any, Any]) -> Any:  # is asked for all rabbits of all meadows that wait for it
@@ -139,7 +128,7 @@ def train(updates: int, meadows: int) -> Any:
 
     for update in range(updates):
         seeds = range(update * meadows, (update + 1) * meadows)
-        found = collect_episodes(MyModelSimulation, {Rabbit.choose_cell: explore}, seeds=seeds)[Rabbit.choose_cell]
+        found = collect_episodes(MySimulation, {Rabbit.choose_cell: explore}, seeds=seeds)[Rabbit.choose_cell]
         returns, ended = found.rewards.copy(), found.terminations | found.truncations
         for row in range(len(returns) - 2, -1, -1):  # each life is a trajectory; they stand one after the other
             returns[row] += 0.0 if ended[row] else 0.8 * returns[row + 1]
@@ -150,22 +139,15 @@ def train(updates: int, meadows: int) -> Any:
     return lambda seen: odds(weights, seen).argmax(axis=-1)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, and print what the policy is worth on meadows that it was not trained on."""
-    parser = argparse.ArgumentParser(description="Train one policy for all rabbits; compare it with the model's rule.")
-    parser.add_argument("--quick", action="store_true", help="train for a moment only, to see that everything runs")
-    quick = parser.parse_args(arguments).quick
-    policy = train(*(2, 2) if quick else (12, 4))
-    contenders: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: policy}}  # {}: the model as it is
-    seeds = range(100_000, 100_005 if quick else 100_030)
+if __name__ == "__main__":
+    quick = "--quick" in sys.argv
+    trained = train(*(2, 2) if quick else (12, 4))
+    policies: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: trained}}  # {}: the model as it is
+    seeds = range(100_000, 100_005 if quick else 100_030)  # meadows that it was not trained on
     metric = {"alive": lambda simulation: len(simulation.model.agents)}
-    found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule", metric=metric, batched=True)
+    found = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", metric=metric, batched=True)
     for of, title in (("return", "What all rabbits have eaten"), ("alive", "Rabbits alive at the end")):
         print(f"{title}; differences are paired by seed, with 95 % intervals:")
         print(found.summary(of).round(1).to_string())
     print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.testing.templates.mesa:MyModelSimulation")
-
-
-if __name__ == "__main__":
-    main()
+    print("python -m simenv_marl check simenv_marl.testing.templates.mesa:MySimulation")

@@ -6,19 +6,16 @@ needs ``pip install "simenv-marl[experiments]" simpy cma``. ``--quick`` only sho
 Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 import random
-from collections.abc import Generator, Sequence
+import sys
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
 import cma
 import numpy as np
 import simpy
-from gymnasium import Env
 from gymnasium.spaces import Box, Discrete
 
 from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, make_step, single_env
@@ -37,7 +34,7 @@ class Job:
 
 
 class MyModel:
-    """A job shop with three machines. Jobs come at random, and visit the machines in orders of their own."""
+    """A job shop with three machines. Jobs come at random, and visit the machines in different orders."""
 
     machines = ("saw", "drill", "paint")
 
@@ -115,7 +112,7 @@ dispatch = make_step(
 # -- 3. The simulation: what an episode is --------------------------------------------------------
 
 
-class MyModelSimulation(SimulationInterface):
+class MySimulation(SimulationInterface):
     """A day of eight hours."""
 
     points = {MyModel.choose_job: dispatch}  # the model's class stays as it is
@@ -134,17 +131,14 @@ class MyModelSimulation(SimulationInterface):
         return float(self.model.clock.now)
 
 
-# -- 4. The environment ---------------------------------------------------------------------------
+# -- 4. The environment, training, and what it is worth -------------------------------------------
 
 OPTIONS: dict[str, Any] = {"skip_forced": True}  # one waiting job is no choice, and is not asked for
 
 
-def env(**options: Any) -> Env[Any, Any]:
+def env(**options: Any) -> Any:
     """Make the environment: a ``gymnasium.Env``, with ``action_masks()`` for learners that know masks."""
-    return single_env(MyModelSimulation, **(OPTIONS | options))
-
-
-# -- 5. Training, and what it is worth ------------------------------------------------------------
+    return single_env(MySimulation, **(OPTIONS | options))
 
 
 def policy_of(weights: Any) -> Any:
@@ -153,40 +147,29 @@ def policy_of(weights: Any) -> Any:
 
 
 def train(rounds: int, days: int) -> Any:
-    """Train by evolution (CMA-ES): five weights are few, and every candidate meets the same days.
-
-    Returns:
-        A policy: a callable of the observations that returns the actions.
-    """
+    """Train by evolution (CMA-ES), and return a policy. Every candidate meets the same days."""
     search = cma.CMAEvolutionStrategy(np.zeros(5), 1.0, {"seed": 1, "verbose": -9})
     for number in range(rounds):
         seeds = range(number * days, (number + 1) * days)
         weights, costs = search.ask(), []
         for candidate in weights:
-            found = collect_episodes(MyModelSimulation, {"dispatcher_0": policy_of(candidate)}, seeds=seeds, **OPTIONS)
+            found = collect_episodes(MySimulation, {"dispatcher_0": policy_of(candidate)}, seeds=seeds, **OPTIONS)
             rewards, times = found["dispatcher_0"].rewards, np.asarray(found["dispatcher_0"].times)
             costs.append(-float(np.sum(rewards * 0.9995**times)))  # discounted by the minute, not by the decision
         search.tell(weights, costs)
     return policy_of(search.result.xfavorite)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, and print what the dispatcher is worth on days that it was not trained on."""
-    parser = argparse.ArgumentParser(description="Train a dispatcher, and compare it with the model's own rule.")
-    parser.add_argument("--quick", action="store_true", help="train for a moment only, to see that everything runs")
-    quick = parser.parse_args(arguments).quick
-    contenders: dict[str, Any] = {
+if __name__ == "__main__":
+    quick = "--quick" in sys.argv
+    policies: dict[str, Any] = {
         "rule": {},  # the model as it is
         "shortest first": {"dispatcher_0": policy_of([0, -1, 0, 0, 0])},  # a rule of thumb
         "trained": {"dispatcher_0": train(*(2, 2) if quick else (20, 10))},
     }
-    seeds = range(100_000, 100_005 if quick else 100_050)
-    found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule", batched=True, **OPTIONS)
+    seeds = range(100_000, 100_005 if quick else 100_050)  # days that it was not trained on
+    found = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True, **OPTIONS)
     print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")
     print(found.summary().round(1).to_string())
     print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.testing.templates.simpy:MyModelSimulation")
-
-
-if __name__ == "__main__":
-    main()
+    print("python -m simenv_marl check simenv_marl.testing.templates.simpy:MySimulation")

@@ -15,7 +15,7 @@ from ...errors import OptionValueError, short_repr
 KINDS: Final = {
     "plain": "stable-baselines3",
     "simpy": "simpy cma",
-    "mesa": "mesa",
+    "mesa": "mesa cma",
 }
 """The kinds of templates, and the packages that each needs besides ``simenv-marl[experiments]``."""
 

@@ -18,7 +18,7 @@ from ..simulation import TRUNCATED
 from .checks import CHECKS, Report, Subject
 from .internals import Plan, fitting_views, make_environment
 from .report import SEVERITIES, CheckReport, Inspection, PointDescription, finding, order_of
-from .runs import Run, TimeUp, describe_with_place, plain_run, play_rules, quietly, seed_global_generators, within
+from .runs import Run, Runner, TimeUp, describe_with_place, play_rules, quietly, seed_global_generators, within
 
 _WARNINGS: Final = {
     "refuses to end": "refusal",
@@ -84,7 +84,15 @@ def check_simulation(
             return CheckReport(str(name), (finding("unmade", describe_with_place(error)),), ())
         for pattern in _WARNINGS:
             warnings.filterwarnings("always", f".*{pattern}")
-        subject = Subject(plan, tuple(map(int, chosen)), episodes, max_steps, time_limit, fingerprint)
+        subject = Subject(
+            plan=plan,
+            max_steps=max_steps,
+            seconds=time_limit / 4,
+            own=fingerprint,
+            seeds=tuple(map(int, chosen)),
+            episodes=episodes,
+            end=time.monotonic() + time_limit,
+        )
         _run_checks(subject, report)
     for warning in caught:
         message = str(warning.message)
@@ -143,13 +151,13 @@ def inspect_simulation(
     with quietly():
         plan = Plan.draw_up(simulation, points, options)
         seed_global_generators(seed)
-        run = plain_run(plan, seed, max_steps, time.monotonic() + time_limit, lambda simulation: None)
+        run = Runner(plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None).run_plainly(seed)
         agents: dict[str, None] = dict.fromkeys(plan.roster)
         if run.entries and not plan.complete and run.error is None:
             env = make_environment(plan.amended({"max_steps": max_steps}), "aec")
             seed_global_generators(seed)
             with suppress(Exception, SystemExit):  # report the agents that were seen until then
-                within(time.monotonic() + time_limit, lambda: play_rules(env, seed, agents))
+                within(time_limit, lambda: play_rules(env, seed, agents))
             env.close()
         views = fitting_views(plan)
     return Inspection(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
-from itertools import chain, count, islice, product, zip_longest
+from itertools import chain, count, islice, product
 from statistics import fmean
 from typing import Any, Final
 
@@ -16,44 +16,40 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 
 from ..errors import AgentError, InvalidActionError, SimEnvError, error_notes, error_text
 from ..simulation import RULE, takes
-from . import runs
-from .fingerprint import ABSENT, Difference, Fingerprint, alike, describe_differences, fingerprint, general
-from .internals import Plan, fitting_views, make_environment, make_simulation, outside_simulation, redefined
+from .fingerprint import ABSENT, alike, describe_differences, general
+from .internals import Plan, fitting_views, make_environment, make_simulation, redefined
 from .report import EpisodeStatistics, Finding, PointStatistics, Timing, finding, finding_names
-from .runs import Run, TimeUp, describe_with_place, play_out, random_steps, seed_global_generators, within
+from .runs import (
+    Run,
+    Runner,
+    TimeUp,
+    describe_with_place,
+    drawn_since,
+    global_generators,
+    place_of,
+    play_rules,
+    seed_global_generators,
+    within,
+)
 from .statistics import collecting
 
-SHARE: Final = 0.25
-"""The share of the time limit that a single run may take."""
 
-
-@dataclass
-class Subject:
+@dataclass(kw_only=True)
+class Subject(Runner):
     """A simulation with its decision points and options, the parameters of the check, and what is known so far."""
 
-    plan: Plan
     seeds: tuple[int, ...]
     episodes: int
-    max_steps: int
-    limit: float  # of time, in seconds
-    own: Callable[[Any], Any] | None  # the user's callable by which simulations are compared
+    end: float  # of the time limit, as time.monotonic()
     plain: dict[int, Run] = field(default_factory=dict)  # plain runs, by seed
     playable: bool = False  # whether plain runs decide something and end
     repeats: bool = True  # whether the same seed gives the same plain run
-    unstable: frozenset[str] = frozenset()  # parts that differ between plain runs of the same seed
     drawn: set[str] = field(default_factory=set)  # the global generators that it draws from
-
-    def __post_init__(self) -> None:
-        self._end = time.monotonic() + self.limit
 
     @property
     def late(self) -> bool:
         """Whether the time is up."""
-        return time.monotonic() >= self._end
-
-    def deadline(self) -> float:
-        """Return the deadline of a run that begins now: all have the same time, however late it is."""
-        return time.monotonic() + self.limit * SHARE
+        return time.monotonic() >= self.end
 
     @cached_property
     def views(self) -> tuple[str, ...]:
@@ -64,36 +60,6 @@ class Subject:
     def rules(self) -> dict[Any, Any] | None:
         """The option ``policies`` with the rule in place of each policy."""
         return dict.fromkeys(self.plan.options.policies or (), RULE) or None
-
-    def look(self, simulation: Any) -> Fingerprint:
-        """Return the fingerprint of a simulation: of the user's callable, of its ``state()``, or of its attributes."""
-        with outside_simulation():  # decision functions called there run their rule
-            if self.own is not None:
-                return fingerprint("fingerprint", self.own(simulation))
-            state = getattr(simulation, "state", None)
-            return fingerprint("state()", state()) if callable(state) else fingerprint("simulation", simulation)
-
-    def differences(self, run: Run, other: Run) -> list[Difference]:
-        """Return the parts in which the simulations differ after two runs."""
-        if run.fingerprint is None or other.fingerprint is None:
-            return []
-        return run.fingerprint.differences(other.fingerprint, self.unstable)
-
-    def run_plainly(self, seed: int) -> Run:
-        """Run it once without any environment."""
-        return runs.plain_run(self.plan, seed, self.max_steps, self.deadline(), self.look)
-
-    def play(self, env: Any, seed: int, salt: int = 0) -> Run:
-        """Play an episode of random legal actions."""
-        seed_global_generators(seed)
-        run = Run()
-        return run.play(self.deadline(), partial(play_out, random_steps(run, env, seed, salt)))
-
-    def chance(self) -> list[str]:
-        """Return the calls of the model that return something else each time. They only help with explanations."""
-        with suppress(Exception, SystemExit):
-            return runs.sources_of_chance(self.plan, self.seeds[0], self.deadline(), self.max_steps)
-        return []
 
 
 class Report:
@@ -119,7 +85,7 @@ class Report:
     def add_error(self, error: BaseException, where: str, name: str = "model_error") -> None:
         """Add the finding for an exception; the same one from the same place is reported once."""
         kind = type(error).__name__
-        key = kind, runs.place_of(error) or error_text(error)
+        key = kind, place_of(error) or error_text(error)
         if key in self._errors:
             return
         self._errors.add(key)
@@ -132,8 +98,8 @@ class Report:
 
     def add_unrepeatable(self, subject: Subject, evidence: str) -> None:
         """Add the finding that two runs of the same seed differ."""
-        sources = [source for source in subject.chance() if "global" not in source]
-        self.add("unrepeatable", "\n".join([evidence, *(f"in the model, {source}" for source in sources[:4])]))
+        sources = [f"in the model, {source}" for source in subject.sources_of_chance(subject.seeds[0])]
+        self.add("unrepeatable", "\n".join([evidence, *[source for source in sources if "global" not in source][:4]]))
 
     @contextmanager
     def opened(self, subject: Subject, view: str = "aec", plan: Plan | None = None, **options: Any) -> Iterator[Any]:
@@ -143,7 +109,7 @@ class Report:
             yield env
         finally:
             try:
-                within(subject.deadline(), env.close)
+                within(subject.seconds, env.close)
             except TimeUp:
                 self.add("unclosable")
             except (Exception, SystemExit) as error:
@@ -164,7 +130,7 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
             subject.drawn |= run.drawn
         where = f"in a plain run without any environment, seed {seed}"
         if isinstance(run.error, TimeUp):
-            where += f", after {len(run.entries)} decisions and {subject.limit * SHARE:.3g} seconds"
+            where += f", after {len(run.entries)} decisions and {subject.seconds:.3g} seconds"
             report.add("slow" if run.entries else "hanging", where)
             return
         if run.error is not None:
@@ -192,7 +158,7 @@ def check_repeated_run(subject: Subject, report: Report) -> None:
             return
     if subject.drawn:
         differs = first.difference(runs[1]) or subject.differences(first, runs[1])
-        sources = "; ".join(source for source in subject.chance() if "global" in source)
+        sources = "; ".join(source for source in subject.sources_of_chance(seed) if "global" in source)
         names = " and ".join(sorted(subject.drawn))
         report.add("unseeded_generators" if differs else "shared_generators", sources, names=names)
     parts = subject.differences(first, runs[0])
@@ -222,7 +188,7 @@ def check_views(subject: Subject, report: Report) -> None:
         seed_global_generators(seed)
         with report.opened(subject, view, driver=driver, policies=subject.rules, max_steps=None) as env:
             seed_global_generators(seed)
-            run = runs.rule_run(subject.plan, env, seed, subject.max_steps, subject.deadline(), subject.look)
+            run = subject.run_rules(env, seed)
         where = f"{view} view, driver {driver}, seed {seed}"
         if isinstance(run.error, TimeUp):
             report.add("slow", where)
@@ -272,12 +238,12 @@ def _mappings_at_fault(subject: Subject, report: Report, seed: int) -> list[str]
         def watching(*args: Any, **kwargs: Any) -> Any:
             if name in found or not simulations:
                 return mapping(*args, **kwargs)
-            before, states = subject.look(simulations[0]), runs.global_generators()
+            before, states = subject.look(simulations[0]), global_generators()
             value = mapping(*args, **kwargs)
             changed = before.differences(subject.look(simulations[0]), subject.unstable)
             if changed:
                 found[name] = f"the {name} changes {changed[0][0]}"
-            elif runs.drawn_since(states):
+            elif drawn_since(states):
                 found[name] = f"the {name} draws from a global generator"
             return value
 
@@ -292,14 +258,14 @@ def _mappings_at_fault(subject: Subject, report: Report, seed: int) -> list[str]
     def play(env: Any) -> None:
         simulations.append(env.simulation)
         seed_global_generators(seed)
-        runs.play_rules(env, seed)
+        play_rules(env, seed)
 
     plan = redefined(subject.plan, redefine)
     with (
         suppress(Exception, SystemExit),  # report the mappings that were seen until then
         report.opened(subject, plan=plan, policies=subject.rules, max_steps=50) as env,
     ):
-        within(subject.deadline(), partial(play, env))
+        within(subject.seconds, partial(play, env))
     return list(found.values())
 
 
@@ -318,10 +284,10 @@ def check_episodes(subject: Subject, report: Report) -> None:
         for number, seed in enumerate(seeds, 1):
             if subject.late or failures == 3:
                 break
-            run = subject.play(env, seed)
+            run = subject.run_randomly((env, seed))[0]
             where = f"in episode {number} of random legal actions, seed {seed}"
             if isinstance(run.error, TimeUp):
-                stalled = time.monotonic() - run.latest > subject.limit * SHARE / 2
+                stalled = time.monotonic() - run.latest > subject.seconds / 2
                 report.add("standstill" if stalled else "slow", f"{where}, after {len(run.entries)} steps")
                 failures = 3
             elif run.error is not None:
@@ -348,7 +314,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
             _compare_episodes(subject, report, env, known)
         if not report.has_errors:
             with suppress(TimeUp):
-                within(subject.deadline(), partial(env.reset, seed=subject.seeds[0]))
+                within(subject.seconds, partial(env.reset, seed=subject.seeds[0]))
             report.checked.append("an environment that is closed in mid-episode")
 
 
@@ -358,7 +324,7 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, known: dict[i
     new = partial(report.opened, subject, max_steps=subject.max_steps)
     with new() as fresh, new() as beside:
         for env in (fresh, used):
-            again = subject.play(env, seed)
+            again = subject.run_randomly((env, seed))[0]
             if isinstance(again.error, TimeUp) or subject.late:
                 return
             difference = first.difference(again)
@@ -366,7 +332,7 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, known: dict[i
                 report.add_unrepeatable(subject, f"two environments, seed {seed}, the same actions: {difference}")
                 return
             if difference:
-                left_over = within(subject.deadline(), partial(_left_over, subject, beside, used, seed))
+                left_over = within(subject.seconds, partial(_left_over, subject, beside, used, seed))
                 report.add("left_over", f"seed {seed}, the same actions: {difference}{left_over}")
                 return
         if not subject.drawn:
@@ -389,12 +355,11 @@ def _left_over(subject: Subject, new: Any, used: Any, seed: int) -> str:
 
 def _compare_side_by_side(subject: Subject, report: Report, envs: tuple[Any, Any], known: dict[int, Run]) -> None:
     """Step two environments in turns, and compare their episodes with those of each alone."""
-    seeds, turns = list(known)[:2], (Run(), Run())
-    games = [random_steps(*game) for game in zip(turns, envs, seeds, strict=False)]
-    turns[-1].play(subject.deadline(), partial(play_out, zip_longest(*games)))
-    if isinstance(turns[-1].error, TimeUp):
+    seeds = list(known)[:2]
+    runs = subject.run_randomly(*zip(envs, seeds, strict=False))
+    if isinstance(runs[-1].error, TimeUp):
         return
-    for seed, run in zip(seeds, turns, strict=False):
+    for seed, run in zip(seeds, runs, strict=True):
         difference = known[seed].difference(run)
         if difference:
             report.add("disturbance", f"seeds {', '.join(map(str, seeds))}: {difference}")
@@ -417,7 +382,7 @@ def _compare_seeds(subject: Subject, report: Report, known: dict[int, Run]) -> N
 
 def _compare_actions(subject: Subject, report: Report, env: Any, seed: int, first: Run) -> None:
     """Play other actions with the same seed, and report if they change nothing."""
-    other = subject.play(env, seed, salt=1)
+    other = subject.run_randomly((env, seed), salt=1)[0]
     if len(other.entries) > 1 and not alike(first.actions, other.actions) and not first.difference(other):
         report.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
 
@@ -445,7 +410,7 @@ def check_conformance(subject: Subject, report: Report) -> None:
         if subject.late or skipped:
             continue
         try:
-            within(subject.deadline(), partial(test, partial(make_environment, plan, view)))
+            within(subject.seconds, partial(test, partial(make_environment, plan, view)))
             passed.append(name)
         except (TimeUp, InvalidActionError):
             pass  # the test ignores masks, or masks that change within a round

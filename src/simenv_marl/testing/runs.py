@@ -13,8 +13,9 @@ import random
 import sys
 import threading
 import time
+import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar
@@ -24,7 +25,7 @@ import numpy as np
 
 from ..errors import error_text
 from ..simulation import RULE
-from .fingerprint import Fingerprint, alike, brief, describe_differences, fingerprint
+from .fingerprint import Difference, Fingerprint, alike, brief, describe_differences, fingerprint
 from .internals import MASK, Plan, SimulationExit, outside_simulation, set_up, watching_rules
 
 Result = TypeVar("Result")
@@ -38,16 +39,12 @@ class TimeUp(SimulationExit):
     """Raised in a run whose time is up."""
 
 
-def within(deadline: float, function: Callable[[], Result]) -> Result:
-    """Call a function, and raise ``TimeUp`` in it after a deadline, given as ``time.monotonic()``.
+def within(seconds: float, function: Callable[[], Result]) -> Result:
+    """Call a function, and raise ``TimeUp`` in it when the time is up.
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
-
-    Raises:
-        TimeUp: The function was interrupted, or it was too late to call it.
     """
-    if time.monotonic() >= deadline:
-        raise TimeUp
+    deadline = time.monotonic() + seconds
     thread, over = threading.get_ident(), threading.Event()
 
     def watch() -> None:
@@ -95,10 +92,10 @@ def drawn_since(states: dict[str, Any]) -> set[str]:
 
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Run a model that may print and warn; the global generators are left as they were.
+    """Ignore what a model prints, and its warnings; leave the global generators as they were.
 
     Yields:
-        The warnings that were not ignored.
+        The warnings for which a filter was added.
     """
     states, silenced = global_generators(), io.StringIO()
     try:
@@ -131,7 +128,7 @@ class Step:
 
 @dataclass
 class Run:
-    """A run, and what it has shown so far.
+    """What is recorded of a run.
 
     Its entries are the decisions in plain runs and with RULE (the point's name, and what its rule returned), and the
     steps in episodes of random actions (the agent's name, and a ``Step``).
@@ -153,11 +150,11 @@ class Run:
         """The names of the points that were called, in that order."""
         return [name for name, _ in self.entries]
 
-    def play(self, deadline: float, function: Callable[[], None]) -> Run:
-        """Call a function that plays this run; note its error and the global generators."""
+    def play(self, seconds: float, function: Callable[[], Any]) -> Run:
+        """Call a function that plays this run; record its error and the global generators."""
         states = global_generators()
         try:
-            within(deadline, function)
+            within(seconds, function)
         except (Exception, SystemExit) as error:
             if not self.cut:
                 self.error = error
@@ -166,11 +163,11 @@ class Run:
 
     def difference(self, other: Run, here: str = "first", there: str = "then") -> str:
         """Describe the first difference from the entries of another run; empty if there is none."""
-        for number, (one, another) in enumerate(zip(self.entries, other.entries, strict=False), 1):
-            if one[0] != another[0]:
-                return f"step {number} is {here} of {one[0]}, {there} of {another[0]}"
-            name, value = one
-            parts = fingerprint(name, value).differences(fingerprint(name, another[1]))
+        pairs = zip(self.entries, other.entries, strict=False)
+        for number, ((name, value), (other_name, other_value)) in enumerate(pairs, 1):
+            if name != other_name:
+                return f"step {number} is {here} of {name}, {there} of {other_name}"
+            parts = fingerprint(name, value).differences(fingerprint(name, other_value))
             if parts:
                 return f"in step {number}, {describe_differences(parts, here, there)}"
         if other.error is not None:
@@ -180,64 +177,111 @@ class Run:
         return ""
 
 
-Look = Callable[[Any], Fingerprint | None]
-"""A function that returns the fingerprint of a simulation."""
+@dataclass(kw_only=True)
+class Runner:
+    """Runs a simulation in different ways, within a number of decisions and of seconds."""
 
+    plan: Plan
+    max_steps: int
+    seconds: float
+    own: Callable[[Any], Any] | None = None  # the user's callable by which simulations are compared
+    unstable: frozenset[str] = frozenset()  # parts that are not compared
 
-def _recorder(run: Run, limit: int, look: Look) -> Callable[[str], Callable[[Any], None]]:
-    """Return a function that records the decisions of a run, and cuts it at a limit."""
+    def look(self, simulation: Any) -> Fingerprint:
+        """Return the fingerprint of a simulation: of the user's callable, of its ``state()``, or of its attributes."""
+        with outside_simulation():  # decision functions called there run their rule
+            if self.own is not None:
+                return fingerprint("fingerprint", self.own(simulation))
+            state = getattr(simulation, "state", None)
+            return fingerprint("state()", state()) if callable(state) else fingerprint("simulation", simulation)
 
-    def begin(name: str) -> Callable[[Any], None]:
-        if len(run.entries) >= limit:
-            if not run.cut:
-                run.cut, run.fingerprint = True, look(run.simulation)
-            raise Cut
-        place = len(run.entries)
-        run.entries.append((name, "left without a decision"))
+    def differences(self, run: Run, other: Run) -> list[Difference]:
+        """Return the parts in which the simulations differ after two runs."""
+        if run.fingerprint is None or other.fingerprint is None:
+            return []
+        return run.fingerprint.differences(other.fingerprint, self.unstable)
 
-        def end(value: Any) -> None:
-            run.entries[place] = name, brief(value)
+    def run_plainly(self, seed: int) -> Run:
+        """Run the simulation's own loop; only the results of its rules are recorded."""
+        run = Run()
 
-        return end
+        def start() -> None:
+            with set_up(self.plan, seed) as (simulation, main):
+                run.simulation, begun = simulation, time.perf_counter()
+                run.result = main()
+                run.seconds = time.perf_counter() - begun
+                run.fingerprint = self.look(simulation)
 
-    return begin
+        return self._record(run, start)
 
+    def run_rules(self, env: Any, seed: int) -> Run:
+        """Run an environment of any view with ``RULE`` throughout; the results of rules are recorded."""
+        run = Run(simulation=env.simulation)
 
-def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look) -> Run:
-    """Run a simulation's own loop; only the results of its rules are recorded.
-
-    Args:
-        plan: The plan of the simulation.
-        seed: The seed of the simulation.
-        limit: The number of decisions after which it is cut.
-        deadline: The time at which it is interrupted.
-        look: Returns the fingerprint of the simulation at the end.
-    """
-    run = Run()
-
-    def play() -> None:
-        with set_up(plan, seed) as (simulation, start):
-            run.simulation, begun = simulation, time.perf_counter()
-            run.result = start()
+        def start() -> None:
+            begun = time.perf_counter()
+            play_rules(env, seed)
             run.seconds = time.perf_counter() - begun
-            run.fingerprint = look(simulation)
+            run.fingerprint = self.look(run.simulation)
 
-    with watching_rules(plan, _recorder(run, limit, look)):
-        return run.play(deadline, play)
+        return self._record(run, start)
 
+    def _record(self, run: Run, start: Callable[[], None]) -> Run:
+        """Record the decisions of a run, and cut it at the limit."""
 
-def rule_run(plan: Plan, env: Any, seed: int, limit: int, deadline: float, look: Look) -> Run:
-    """Run an environment of a plan, of any view, with ``RULE`` throughout; the other arguments as for ``plain_run``."""
-    run = Run(simulation=env.simulation)
+        def begin(name: str) -> Callable[[Any], None]:
+            place = len(run.entries)
+            if place >= self.max_steps:
+                if not run.cut:
+                    run.cut, run.fingerprint = True, self.look(run.simulation)
+                raise Cut
+            run.entries.append((name, "left without a decision"))
 
-    def play() -> None:
-        begun = time.perf_counter()
-        play_rules(env, seed)
-        run.seconds = time.perf_counter() - begun
-        run.fingerprint = look(run.simulation)
+            def end(value: Any) -> None:
+                run.entries[place] = name, brief(value)
 
-    with watching_rules(plan, _recorder(run, limit, look)):
-        return run.play(deadline, play)
+            return end
+
+        with watching_rules(self.plan, begin):
+            return run.play(self.seconds, start)
+
+    def run_randomly(self, *games: tuple[Any, int], salt: int = 0) -> list[Run]:
+        """Play episodes with random legal actions, in turns; each in an AEC environment and with a seed.
+
+        The actions depend on seed, agent and salt alone. An error is that of the last run.
+        """
+        runs = [Run() for _ in games]
+
+        def start() -> None:
+            left = [_random_steps(run, env, seed, salt) for run, (env, seed) in zip(runs, games, strict=True)]
+            while left:
+                left = [steps for steps in left if next(steps, False)]
+
+        seed_global_generators(games[0][1])
+        runs[-1].play(self.seconds, start)
+        return runs
+
+    def sources_of_chance(self, seed: int) -> list[str]:
+        """Run the simulation, and find its sources of chance: clocks, entropy, global generators.
+
+        Returns:
+            Each as the end of a sentence, with the place of the call.
+        """
+        found: dict[str, None] = {}
+
+        def profile(frame: Any, event: str, argument: Any) -> None:
+            source = _source_of_chance(frame, event, argument)
+            place = _caller(frame) if source else None
+            if place:
+                found[f"{source} at {place}"] = None
+
+        before = sys.getprofile()
+        sys.setprofile(profile)
+        try:
+            self.run_plainly(seed)
+        finally:
+            sys.setprofile(before)
+        return list(found)
 
 
 def play_rules(env: Any, seed: int, selected: dict[str, None] | None = None) -> None:
@@ -257,49 +301,40 @@ def play_rules(env: Any, seed: int, selected: dict[str, None] | None = None) -> 
         env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
 
 
-def random_steps(run: Run, env: Any, seed: int, salt: int = 0) -> Iterator[None]:
-    """Play an episode of an AEC environment, one step at a time, with random legal actions.
-
-    The actions depend on seed, agent and salt alone. Steps and actions are recorded in a run.
-    """
+def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[bool]:
+    """Play one step at a time, and record it."""
     env.reset(seed=seed)
     spaces: dict[str, Any] = {}
     while env.agents:
         agent = env.agent_selection
-        step = Step(*env.last())
+        step, action = Step(*env.last()), None
         run.entries.append((agent, step))
         run.latest = time.monotonic()
-        action = None
         if not (step.terminated or step.truncated):
             if agent not in spaces:
                 spaces[agent] = copy.deepcopy(env.action_space(agent))
                 spaces[agent].seed(crc32(f"{seed} {agent} {salt}".encode(errors="surrogatepass")))
             action = spaces[agent].sample(step.info.get(MASK))
             run.actions.append(action)
-        yield
+        yield True
         env.step(action)
-
-
-def play_out(steps: Iterable[Any]) -> None:
-    """Play all steps of an episode, or of several in turns."""
-    for _ in steps:
-        pass
 
 
 # -- where errors and differences come from -------------------------------------------------------
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
+_LIBRARY: Final = random.__file__.rpartition("random.py")[0]
+_CLOCKS: Final = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
 
 
 def place_of(error: BaseException) -> str:
     """Return where an error was raised, outside of this library: file, line and function; empty if nowhere."""
-    place, trace = "", error.__traceback__
-    while trace is not None:
-        code = trace.tb_frame.f_code
-        if not code.co_filename.startswith((_PACKAGE, "<")) and "site-packages" not in code.co_filename:
-            place = f"{code.co_filename}:{trace.tb_lineno}, in {code.co_name}"
-        trace = trace.tb_next
-    return place
+    places = [
+        f"{frame.filename}:{frame.lineno}, in {frame.name}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename
+    ]
+    return places[-1] if places else ""
 
 
 def describe_with_place(error: BaseException) -> str:
@@ -309,47 +344,30 @@ def describe_with_place(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
 
 
-def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> list[str]:
-    """Run the simulation by itself, and find its sources of chance: clocks, entropy, global generators.
+def _source_of_chance(frame: Any, event: str, function: Any) -> str:
+    """Describe the source of chance that a call uses, as a profiler sees it; empty if it uses none."""
+    if event == "call" and frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
+        return "a random.Random is made without a seed"
+    if event != "c_call":
+        return ""
+    module, name = getattr(function, "__module__", None), getattr(function, "__name__", "")
+    owner = getattr(function, "__self__", None)
+    if module == "time" and name in _CLOCKS:
+        return f"the clock is read (time.{name})"
+    if name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
+        return f"the clock is read (datetime.{name})"
+    if name == "urandom":
+        return "the operating system is asked for random bits (as by a generator without a seed)"
+    if name in ("random", "getrandbits") and owner is getattr(random.random, "__self__", None):
+        return "Python's global generator is used"
+    return ""
 
-    Returns:
-        Each as the end of a sentence, with the place of the call.
-    """
-    found: dict[str, None] = {}
-    library = random.__file__.rpartition("random.py")[0]
-    shared: Any = random.random.__self__  # type: ignore[attr-defined]
-    clocks = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
 
-    def add(source: str, frame: Any) -> None:
-        """Add a source, with the place in the model or a package from which the standard library called it."""
-        while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
-            path = frame.f_code.co_filename
-            if ("site-packages" in path or not path.startswith(library)) and not path.startswith("<"):
-                if "numpy" not in path:
-                    found[f"{source} at {path}:{frame.f_lineno}, in {frame.f_code.co_name}"] = None
-                return
-            frame = frame.f_back
-
-    def profile(frame: Any, event: str, argument: Any) -> None:
-        if event == "call" and frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
-            add("a random.Random is made without a seed", frame.f_back)
-        if event != "c_call":
-            return
-        module, name = getattr(argument, "__module__", None), getattr(argument, "__name__", "")
-        owner = getattr(argument, "__self__", None)
-        if module == "time" and name in clocks:
-            add(f"the clock is read (time.{name})", frame)
-        elif name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
-            add(f"the clock is read (datetime.{name})", frame)
-        elif name == "urandom":
-            add("the operating system is asked for random bits (as by a generator without a seed)", frame)
-        elif owner is shared and name in ("random", "getrandbits"):
-            add("Python's global generator is used", frame)
-
-    before = sys.getprofile()
-    sys.setprofile(profile)
-    try:
-        plain_run(plan, seed, limit, deadline, lambda simulation: None)
-    finally:
-        sys.setprofile(before)
-    return list(found)
+def _caller(frame: Any) -> str:
+    """Return the place in the model, or in a package, from which the standard library was called; empty if nowhere."""
+    while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
+        path = frame.f_code.co_filename
+        if ("site-packages" in path or not path.startswith(_LIBRARY)) and not path.startswith("<"):
+            return "" if "numpy" in path else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"
+        frame = frame.f_back
+    return ""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib.resources import files
-from textwrap import fill, indent
+from textwrap import TextWrapper, indent
 from typing import Any, Final, Literal
 
 from ..errors import CheckFailedError
@@ -17,30 +17,19 @@ Severity = Literal["error", "warning", "note"]
 SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
 """The severities, the most important first."""
 
-_MOST_COMPONENTS: Final = 12
-
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding of a check.
+    """A finding of a check."""
 
-    Attributes:
-        severity: "error": results would be wrong. "warning": learning may suffer. "note": good to know.
-        title: The finding in one line.
-        explanation: What it means, and what to do.
-        evidence: Where and when it was seen; may be empty.
-    """
-
-    severity: Severity
-    title: str
-    explanation: str
-    evidence: str = ""
+    severity: Severity  #: "error": results would be wrong. "warning": learning may suffer. "note": good to know.
+    title: str  #: The finding in one line.
+    explanation: str  #: What it means, and what to do.
+    evidence: str = ""  #: Where and when it was seen; may be empty.
 
     def __str__(self) -> str:
-        lines = [f"{self.severity.upper():<9}{self.title}", _wrapped(self.explanation, 9)]
-        if self.evidence:
-            lines += [_wrapped(line, 9) for line in f"Seen: {self.evidence}".splitlines()]
-        return "\n".join(lines)
+        seen = f"\nSeen: {self.evidence}" if self.evidence else ""
+        return f"{self.severity.upper():<9}{self.title}\n{_wrapped(self.explanation + seen, 9)}"
 
 
 _TEXTS: Final[dict[Any, dict[str, str]]] = tomllib.loads(
@@ -69,23 +58,16 @@ def finding(name: str, evidence: str = "", **words: Any) -> Finding:
 
 @dataclass(frozen=True)
 class ComponentStatistics:
-    """The range of one component of an observation.
+    """The range of one component of an observation."""
 
-    Attributes:
-        name: The component: "[2]", "position[0]"; empty if there is only one.
-        low, high: Its bounds.
-        minimum, maximum, mean: The minimum, maximum and mean of its values.
-        at_bounds, beyond: The share of its values that were at a bound, and outside of the bounds (or nan).
-    """
-
-    name: str
-    low: float
-    high: float
+    name: str  #: The component: "[2]", "position[0]"; empty if there is only one.
+    low: float  #: Its lower bound.
+    high: float  #: Its upper bound.
     minimum: float
     maximum: float
     mean: float
-    at_bounds: float
-    beyond: float
+    at_bounds: float  #: The share of its values that were at a bound.
+    beyond: float  #: The share of its values that were outside of the bounds (or nan).
 
     @property
     def constant(self) -> bool:
@@ -101,29 +83,17 @@ class ComponentStatistics:
 
 @dataclass(frozen=True)
 class PointStatistics:
-    """Statistics of a decision point under random legal actions.
+    """Statistics of a decision point under random legal actions."""
 
-    Attributes:
-        point: Its dotted name.
-        agents: Its agents: a name, or a description.
-        observation_space, action_space: Its spaces, as text.
-        observations: The number of observations.
-        components: The ranges of the observations' components.
-        decisions: The number of its calls, in all episodes.
-        never_legal: The actions that were never legal, if it has a mask.
-        rewards: The number of rewards.
-        reward_minimum, reward_maximum, reward_mean: The minimum, maximum and mean of the rewards.
-    """
-
-    point: str
-    agents: str
+    point: str  #: Its dotted name.
+    agents: str  #: Its agents: a name, or a description.
     observation_space: str
     action_space: str
-    observations: int
-    components: tuple[ComponentStatistics, ...]
-    decisions: int
-    never_legal: tuple[int, ...]
-    rewards: int
+    observations: int  #: The number of observations.
+    components: tuple[ComponentStatistics, ...]  #: The ranges of the observations' components.
+    decisions: int  #: The number of its calls, in all episodes.
+    never_legal: tuple[int, ...]  #: The actions that were never legal, if it has a mask.
+    rewards: int  #: The number of rewards.
     reward_minimum: float
     reward_maximum: float
     reward_mean: float
@@ -132,33 +102,24 @@ class PointStatistics:
         rewards = f"{self.reward_minimum:.4g} to {self.reward_maximum:.4g}, mean {self.reward_mean:.4g}"
         lines = [
             f"{self.agents}, at {self.point}",
-            f"  {self.decisions} decisions, {f'rewards {rewards}' if self.rewards else 'no rewards'}",
-            f"  actions {self.action_space}, observations {self.observation_space}",
-            *(f"    {component}" for component in self.components[:_MOST_COMPONENTS]),
+            f"{self.decisions} decisions, {f'rewards {rewards}' if self.rewards else 'no rewards'}",
+            f"actions {self.action_space}, observations {self.observation_space}",
+            *map(str, self.components[:12]),
         ]
-        if len(self.components) > _MOST_COMPONENTS:
-            lines.append(f"    ... and {len(self.components) - _MOST_COMPONENTS} more")
-        return "\n".join(lines)
+        return "\n  ".join(lines if len(self.components) <= 12 else [*lines, "..."])
 
 
 @dataclass(frozen=True)
 class EpisodeStatistics:
-    """Statistics of the episodes of random legal actions.
+    """Statistics of the episodes of random legal actions. Lengths are in decisions."""
 
-    Attributes:
-        episodes: The number of episodes.
-        shortest, longest, mean: Their lengths in decisions.
-        terminated, truncated, cut: The number of episodes that terminated, that reached the simulation's own limit, and
-            that reached ``max_steps``.
-    """
-
-    episodes: int = 0
+    episodes: int = 0  #: The number of episodes.
     shortest: int = 0
     longest: int = 0
     mean: float = 0.0
-    terminated: int = 0
-    truncated: int = 0
-    cut: int = 0
+    terminated: int = 0  #: The number of episodes that terminated.
+    truncated: int = 0  #: The number of episodes that reached the simulation's own limit.
+    cut: int = 0  #: The number of episodes that reached ``max_steps``.
 
     def __str__(self) -> str:
         if not self.episodes:
@@ -185,25 +146,15 @@ class Timing:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The result of ``check_simulation``. Its ``str`` is a text for people.
+    """The result of ``check_simulation``. Its ``str`` is a text for people."""
 
-    Attributes:
-        simulation: What was checked.
-        findings: The findings, the most important first.
-        checked: What was examined, in words.
-        observations: The statistics under random legal actions, by decision point.
-        episodes: The statistics of these episodes.
-        calls: The order in which the decision points were called in a plain run, compressed.
-        timing: The time per decision; None if it was not measured.
-    """
-
-    simulation: str
-    findings: tuple[Finding, ...]
-    checked: tuple[str, ...]
-    observations: tuple[PointStatistics, ...] = ()
-    episodes: EpisodeStatistics = field(default_factory=EpisodeStatistics)
-    calls: str = ""
-    timing: Timing | None = None
+    simulation: str  #: What was checked.
+    findings: tuple[Finding, ...]  #: The findings, the most important first.
+    checked: tuple[str, ...]  #: What was examined, in words.
+    observations: tuple[PointStatistics, ...] = ()  #: The statistics under random legal actions, by decision point.
+    episodes: EpisodeStatistics = EpisodeStatistics()  #: The statistics of these episodes.
+    calls: str = ""  #: The order in which the decision points were called in a plain run, compressed.
+    timing: Timing | None = None  #: The time per decision; None if it was not measured.
 
     @property
     def ok(self) -> bool:
@@ -232,10 +183,10 @@ class CheckReport:
         parts = [self._heading(), *map(str, self.findings)]
         if self.checked:
             parts.append("\n".join(["What was checked", *(_wrapped(line, 2) for line in self.checked)]))
-        points = [indent(str(point), "  ") for point in self.observations]
-        parts.append("\n".join([_wrapped(f"Episodes of random legal actions: {self.episodes}", 0), *points]))
+        episodes = _wrapped(f"Episodes of random legal actions: {self.episodes}", 0)
+        parts.append("\n".join([episodes, *(indent(str(point), "  ") for point in self.observations)]))
         if self.calls:
-            parts.append(f"Order of the decisions in a plain run\n{_wrapped(self.calls, 2)}")
+            parts.append(_wrapped(f"Order of the decisions in a plain run: {self.calls}", 0))
         if self.timing is not None:
             parts.append(f"Time: {self.timing}")
         return "\n\n".join(parts)
@@ -248,52 +199,30 @@ class CheckReport:
 
 @dataclass(frozen=True)
 class PointDescription:
-    """A decision point as an environment sees it.
+    """A decision point as an environment sees it."""
 
-    Attributes:
-        name: Its dotted name.
-        agents: Its agents: a name, or a description.
-        observation_space, action_space: Its spaces, as text.
-        details: Further properties: masks, choices, removals, policies.
-    """
-
-    name: str
-    agents: str
+    name: str  #: Its dotted name.
+    agents: str  #: Its agents: a name, or a description.
     observation_space: str
     action_space: str
-    details: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()  #: Further properties: masks, choices, removals, policies.
 
     def __str__(self) -> str:
-        lines = [
-            self.name,
-            f"  agent         {self.agents}",
-            f"  observations  {self.observation_space}",
-            f"  actions       {self.action_space}",
-        ]
-        return "\n".join(lines + [f"  {detail}" for detail in self.details])
+        spaces = f"observations  {self.observation_space}\n  actions       {self.action_space}"
+        return "\n  ".join([self.name, f"agent         {self.agents}", spaces, *self.details])
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """The result of ``inspect_simulation``. Its ``str`` is a text for people.
+    """The result of ``inspect_simulation``. Its ``str`` is a text for people."""
 
-    Attributes:
-        simulation: What was inspected.
-        points: Its decision points.
-        views: The views that its environments may have.
-        calls: The order in which the points were called in one plain episode, compressed: ``(a b){30} c``.
-        counts: The number of calls of each point.
-        ended: How that episode ended, in words.
-        agents: The agents of that episode in an environment, in the order in which they joined.
-    """
-
-    simulation: str
+    simulation: str  #: What was inspected.
     points: tuple[PointDescription, ...]
-    views: tuple[str, ...]
-    calls: str
-    counts: dict[str, int]
-    ended: str
-    agents: tuple[str, ...]
+    views: tuple[str, ...]  #: The views that its environments may have.
+    calls: str  #: The order in which the points were called in one plain episode, compressed: ``(a b){30} c``.
+    counts: dict[str, int]  #: The number of calls of each point.
+    ended: str  #: How that episode ended, in words.
+    agents: tuple[str, ...]  #: The agents of that episode in an environment, in the order in which they joined.
 
     def to_dict(self) -> dict[str, Any]:
         """Return the inspection as dicts, lists, strings and numbers, for JSON."""
@@ -301,58 +230,45 @@ class Inspection:
 
     def __str__(self) -> str:
         counts = ", ".join(f"{point} {number} times" for point, number in self.counts.items())
-        more = f" and {len(self.agents) - 8} more" if len(self.agents) > 8 else ""
-        episode = [
-            f"One episode with the model's own rules: {self.ended}",
-            _wrapped(f"calls    {counts or 'none'}", 2),
-            _wrapped(f"order    {self.calls or '-'}", 2),
-            _wrapped(f"agents   {', '.join(self.agents[:8]) or '-'}{more}", 2),
-        ]
+        agents = ", ".join(self.agents[:8]) + f" and {len(self.agents) - 8} more" * (len(self.agents) > 8)
+        episode = f"calls    {counts or 'none'}\norder    {self.calls or '-'}\nagents   {agents or '-'}"
         return "\n\n".join(
             [
                 f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}",
                 *map(str, self.points),
                 f"Possible views: {', '.join(self.views)}",
-                "\n".join(episode),
+                f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}",
             ]
         )
 
 
-def order_of(calls: Sequence[str], longest_block: int = 24, most_calls: int = 3000, most_terms: int = 30) -> str:
-    """Return the order in which decision points were called: the shortest unique names, and repetitions in braces.
-
-    Args:
-        calls: The dotted names of the points, in the order of their calls.
-        longest_block: The length of the longest blocks whose repetitions are found.
-        most_calls: The number of calls that are looked at.
-        most_terms: The number of terms that are written.
-    """
+def order_of(calls: Sequence[str]) -> str:
+    """Return the order in which decision points were called: the shortest unique names, and repetitions in braces."""
+    most_calls, most_terms = 3000, 30
     short = short_names(list(dict.fromkeys(calls)))
     terms = [short[name] for name in calls[:most_calls]]
-    for length in range(1, longest_block + 1):
-        terms = _folded(terms, length)
-    left = f"{len(terms) - most_terms} more such terms" if len(terms) > most_terms else ""
-    if not left and len(calls) > most_calls:
-        left = f"{len(calls) - most_calls} more calls"
-    return " ".join(terms[:most_terms]) + (f" ... and {left}" if left else "")
+    for length in range(1, 25):
+        terms = _fold(terms, length)
+    left = f" ... and {len(calls) - most_calls} more calls" if len(calls) > most_calls else ""
+    left = f" ... and {len(terms) - most_terms} more such terms" if len(terms) > most_terms else left
+    return " ".join(terms[:most_terms]) + left
 
 
-def _folded(terms: Sequence[str], length: int) -> list[str]:
-    """Return the terms, with repetitions of blocks of one length written as one term."""
-    made: list[str] = []
-    place = 0
+def _fold(terms: list[str], length: int) -> list[str]:
+    """Write repetitions of blocks of one length as one term."""
+    folded, place = [], 0
     while place < len(terms):
-        block = list(terms[place : place + length])
-        times = 1
-        while terms[place + times * length : place + (times + 1) * length] == block:
-            times += 1
-        if times == 1:
-            made.append(terms[place])
+        block, end = terms[place : place + length], place + length
+        while terms[end : end + length] == block:
+            end += length
+        if end == place + length:
+            folded.append(terms[place])
             place += 1
         else:
-            made.append(f"{block[0]}{{{times}}}" if length == 1 else f"({' '.join(block)}){{{times}}}")
-            place += times * length
-    return made
+            text = block[0] if length == 1 else f"({' '.join(block)})"
+            folded.append(f"{text}{{{(end - place) // length}}}")
+            place = end
+    return folded
 
 
 def short_names(points: Sequence[str]) -> dict[str, str]:
@@ -367,9 +283,9 @@ def short_names(points: Sequence[str]) -> dict[str, str]:
 
 
 def _wrapped(text: str, margin: int) -> str:
-    """Wrap a text, with a margin before its lines that is wider after the first one."""
-    first, rest = " " * margin, " " * (margin + 2)
-    return fill(text, 100, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False)
+    """Wrap the lines of a text, with a margin that is wider after the first line of each."""
+    wrapper = TextWrapper(100, " " * margin, " " * (margin + 2), break_long_words=False, break_on_hyphens=False)
+    return "\n".join(wrapper.fill(line) for line in text.splitlines())
 
 
 def _for_json(value: Any) -> Any:

@@ -43,7 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m simenv_marl", description=main.__doc__)
+    about = "Write a template to start from, check or inspect a simulation, or test a simulator in another process."
+    parser = argparse.ArgumentParser(prog="python -m simenv_marl", description=about)
     commands = parser.add_subparsers(dest="command", required=True, metavar="new | check | inspect | wire-check")
 
     def add(name: str, run: Callable[[argparse.Namespace], Any], text: str) -> Any:

@@ -104,7 +104,7 @@ def check_simulation(
         simulation=plan.name,
         findings=tuple(sorted(dict.fromkeys(report.findings), key=lambda f: SEVERITIES.index(f.severity))),
         checked=tuple(report.checked),
-        observations=report.points,
+        observations=report.observations,
         episodes=report.episodes,
         calls=order_of(plain.calls) if plain else "",
         timing=report.timing,

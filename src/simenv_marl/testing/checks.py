@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial, wraps
 from itertools import chain, count, islice, product
@@ -62,16 +62,16 @@ class Subject(Runner):
         return dict.fromkeys(self.plan.options.policies or (), RULE) or None
 
 
+@dataclass
 class Report:
-    """A report while it is written. The attributes are those of ``CheckReport``."""
+    """A report while it is written."""
 
-    def __init__(self) -> None:
-        self.findings: list[Finding] = []
-        self.checked: list[str] = []
-        self.points: tuple[PointStatistics, ...] = ()
-        self.episodes = EpisodeStatistics()
-        self.timing: Timing | None = None
-        self._errors: set[tuple[str, str]] = set()
+    findings: list[Finding] = field(default_factory=list)
+    checked: list[str] = field(default_factory=list)
+    observations: tuple[PointStatistics, ...] = ()
+    episodes: EpisodeStatistics = field(default_factory=EpisodeStatistics)
+    timing: Timing | None = None
+    errors: set[tuple[str, str]] = field(default_factory=set)  # by kind and place
 
     @property
     def has_errors(self) -> bool:
@@ -86,9 +86,9 @@ class Report:
         """Add the finding for an exception; the same one from the same place is reported once."""
         kind = type(error).__name__
         key = kind, place_of(error) or error_text(error)
-        if key in self._errors:
+        if key in self.errors:
             return
-        self._errors.add(key)
+        self.errors.add(key)
         if isinstance(error, AgentError) and "after its end" in error_text(error):
             name = "revival"
         elif isinstance(error, SimEnvError) and kind in finding_names():
@@ -108,12 +108,11 @@ class Report:
         try:
             yield env
         finally:
-            try:
-                within(subject.seconds, env.close)
-            except TimeUp:
+            closing = Run().play(subject.seconds, env.close)
+            if isinstance(closing.error, TimeUp):
                 self.add("unclosable")
-            except (Exception, SystemExit) as error:
-                self.add_error(error, "when an environment was closed in mid-episode")
+            elif closing.error is not None:
+                self.add_error(closing.error, "when an environment was closed in mid-episode")
 
 
 # -- the simulation by itself ---------------------------------------------------------------------
@@ -192,7 +191,7 @@ def check_views(subject: Subject, report: Report) -> None:
         where = f"{view} view, driver {driver}, seed {seed}"
         if isinstance(run.error, TimeUp):
             report.add("slow", where)
-            return
+            break
         if run.error is None:
             compared[driver].add(view)
             if not _is_alike(subject, report, seed, run, where):
@@ -255,17 +254,11 @@ def _mappings_at_fault(subject: Subject, report: Report, seed: int) -> list[str]
         changes = {name: watched(f"{name} of {bound.point.name}", m) for name, m in mappings.items() if callable(m)}
         return replace(bound.definition, **changes)
 
-    def play(env: Any) -> None:
+    plan = redefined(subject.plan, redefine)
+    with report.opened(subject, plan=plan, policies=subject.rules, max_steps=50) as env:
         simulations.append(env.simulation)
         seed_global_generators(seed)
-        play_rules(env, seed)
-
-    plan = redefined(subject.plan, redefine)
-    with (
-        suppress(Exception, SystemExit),  # report the mappings that were seen until then
-        report.opened(subject, plan=plan, policies=subject.rules, max_steps=50) as env,
-    ):
-        within(subject.seconds, partial(play, env))
+        Run().play(subject.seconds, partial(play_rules, env, seed))  # an error may end it early
     return list(found.values())
 
 
@@ -303,7 +296,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
             truncated = bool(run.entries) and run.entries[-1][1].truncated
             cut = truncated and lengths[-1] >= subject.max_steps
             ends["cut" if cut else "truncated" if truncated else "terminated"] += 1
-        report.points = tuple(collector.statistics() for collector in collectors)
+        report.observations = tuple(collector.statistics() for collector in collectors)
         if lengths:
             report.episodes = EpisodeStatistics(len(lengths), min(lengths), max(lengths), fmean(lengths), **ends)
             report.findings += [finding for collector in collectors for finding in collector.findings()]
@@ -313,8 +306,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
         if known and not failures and subject.repeats:
             _compare_episodes(subject, report, env, known)
         if not report.has_errors:
-            with suppress(TimeUp):
-                within(subject.seconds, partial(env.reset, seed=subject.seeds[0]))
+            Run().play(subject.seconds, partial(env.reset, seed=subject.seeds[0]))
             report.checked.append("an environment that is closed in mid-episode")
 
 
@@ -374,7 +366,7 @@ def _compare_seeds(subject: Subject, report: Report, known: dict[int, Run]) -> N
         parts = subject.differences(plain, subject.plain[other])
         if plain.difference(subject.plain[other]) or start.difference(Run(known[other].entries[:1])):
             return
-        if any(part[1:] != (seed, other) for part in parts):
+        if any((str(here), str(there)) != (str(seed), str(other)) for _, here, there in parts):
             return
     if others:
         report.add("same_seeds", f"seeds {', '.join(map(str, known))}")
@@ -409,16 +401,16 @@ def check_conformance(subject: Subject, report: Report) -> None:
         skipped = report.has_errors or view not in subject.views or (subject.drawn and "seed" in name)
         if subject.late or skipped:
             continue
-        try:
-            within(subject.seconds, partial(test, partial(make_environment, plan, view)))
+        error = Run().play(subject.seconds, partial(test, partial(make_environment, plan, view))).error
+        if error is None:
             passed.append(name)
-        except (TimeUp, InvalidActionError):
-            pass  # the test ignores masks, or masks that change within a round
-        except AssertionError as error:
+        elif isinstance(error, AssertionError):
             report.add("failed_test", describe_with_place(error), test=name)
-        except (Exception, SystemExit) as error:
-            if not (view == "joint" and isinstance(error, AgentError)):
-                report.add_error(error, f"in {name}")
+        # These tests ignore masks, or masks that change within a round; the joint view needs to know all agents.
+        elif not isinstance(error, (TimeUp, InvalidActionError)) and not (
+            view == "joint" and isinstance(error, AgentError)
+        ):
+            report.add_error(error, f"in {name}")
     if passed:
         report.checked.append(", ".join(passed))
 

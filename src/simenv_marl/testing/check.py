@@ -173,23 +173,19 @@ def inspect_simulation(
 
 def _describe_point(bound: Any) -> PointDescription:
     definition = bound.definition
-    details = []
-    if definition.action_mask_mapping is not None:
-        details.append("a mask says which actions are legal")
-    if definition.choices is not None:
-        details.append("the legal answers come with each call")
-    if definition.apply is not None:
-        details.append("actions are carried out in place of the rule")
-    if definition.removed_by:
-        details.append(f"agents end by {', '.join(definition.removed_by)}")
-    if definition.goal_space is not None:
-        details.append(f"has goals in {definition.goal_space}")
+    details = {
+        "a mask says which actions are legal": definition.action_mask_mapping is not None,
+        "the legal answers come with each call": definition.choices is not None,
+        "actions are carried out in place of the rule": definition.apply is not None,
+        f"agents end by {', '.join(definition.removed_by)}": definition.removed_by,
+        f"has goals in {definition.goal_space}": definition.goal_space is not None,
+    }
     return PointDescription(
         name=bound.point.name,
         agents=bound.agent or "agents named by each call",
         observation_space=str(definition.observation_space),
         action_space=str(definition.action_space),
-        details=tuple(details),
+        details=tuple(text for text, applies in details.items() if applies),
     )
 
 

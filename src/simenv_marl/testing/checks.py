@@ -296,10 +296,11 @@ def check_episodes(subject: Subject, report: Report) -> None:
             truncated = bool(run.entries) and run.entries[-1][1].truncated
             cut = truncated and lengths[-1] >= subject.max_steps
             ends["cut" if cut else "truncated" if truncated else "terminated"] += 1
-        report.observations = tuple(collector.statistics() for collector in collectors)
+        results = [collector.results() for collector in collectors]
+        report.observations = tuple(statistics for statistics, _ in results)
         if lengths:
             report.episodes = EpisodeStatistics(len(lengths), min(lengths), max(lengths), fmean(lengths), **ends)
-            report.findings += [finding for collector in collectors for finding in collector.findings()]
+            report.findings += chain.from_iterable(findings for _, findings in results)
             if ends["cut"] == len(lengths):
                 report.add("endless", most=subject.max_steps)
             report.checked.append(f"{len(lengths)} episodes of random legal actions in the AEC view")

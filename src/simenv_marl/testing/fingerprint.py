@@ -34,30 +34,19 @@ _ATOMS: Final = (int, float, complex, str, bytes, bool, type(None), range, type(
 _NAMED: Final = (type, FunctionType, BuiltinFunctionType, ModuleType)
 
 Difference = tuple[str, Any, Any]
-"""A path, the value here and the value there."""
+"""A path, the value here and the value there, of which one may be ``ABSENT``."""
 
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """All parts of a simulation at one moment.
+    """All parts of a simulation at one moment."""
 
-    Attributes:
-        parts: The parts, by path.
-        left_out: The kinds of objects that cannot be compared.
-        complete: Whether there were at most ``MOST_PARTS``.
-    """
-
-    parts: dict[str, Any]
-    left_out: frozenset[str]
-    complete: bool
+    parts: dict[str, Any]  # by path
+    left_out: frozenset[str]  # the kinds of objects that cannot be compared
+    complete: bool  # whether there were at most MOST_PARTS
 
     def differences(self, other: Fingerprint, ignored: frozenset[str] = frozenset()) -> list[Difference]:
-        """Return the differences: path, this value and the other value; ``ABSENT`` for a missing part.
-
-        Args:
-            other: The other fingerprint.
-            ignored: Paths that are not compared, as ``general`` writes them.
-        """
+        """Return the differences in all parts but those whose paths, as ``general`` writes them, are ignored."""
         found = []
         for path in dict.fromkeys([*self.parts, *other.parts]):
             here, there = self.parts.get(path, ABSENT), other.parts.get(path, ABSENT)
@@ -68,12 +57,7 @@ class Fingerprint:
 
 
 def fingerprint(name: str, root: Any) -> Fingerprint:
-    """Return the fingerprint of any object.
-
-    Args:
-        name: The beginning of all paths.
-        root: The object.
-    """
+    """Return the fingerprint of any object; all paths begin with its name."""
     parts: dict[str, Any] = {}
     left_out: set[str] = set()
     met: dict[int, str] = {}
@@ -105,11 +89,7 @@ def fingerprint(name: str, root: Any) -> Fingerprint:
 
 
 def _members(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield what a value holds, by path.
-
-    Raises:
-        Exception: That is unknown.
-    """
+    """Yield what a value holds, by path. Raises an exception if that is unknown."""
     if isinstance(value, random.Random):
         yield f"{path} (state of the generator)", str(value.getstate())
     elif isinstance(value, (np.random.Generator, np.random.RandomState)):
@@ -156,11 +136,7 @@ def _items(path: str, values: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _reduced(value: Any) -> Any:
-    """Return what a pickle of an object holds.
-
-    Raises:
-        Exception: It cannot be pickled.
-    """
+    """Return what a pickle of an object holds. Raises an exception if it cannot be pickled."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reduced = value.__reduce_ex__(4)

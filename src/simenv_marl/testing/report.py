@@ -44,13 +44,7 @@ def finding_names() -> set[str]:
 
 
 def finding(name: str, evidence: str = "", **words: Any) -> Finding:
-    """Make a finding from its text in ``findings.toml``.
-
-    Args:
-        name: The name of the finding there.
-        evidence: Where and when it was seen.
-        **words: The values of placeholders in title and explanation.
-    """
+    """Make a finding from its text in ``findings.toml``; words are the values of placeholders there."""
     severity = next(severity for severity in SEVERITIES if name in _TEXTS[severity])
     title, text = _TEXTS[severity][name].format(**words).split("\n", 1)
     return Finding(severity, title, " ".join(text.split()), evidence)

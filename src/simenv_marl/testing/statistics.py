@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import reduce, wraps
 from operator import getitem
@@ -28,11 +28,9 @@ _MOST_NUMBERS: Final = 5_000_000
 _LARGE: Final = 1e3
 _NARROW: Final = 0.01
 
-_Leaf = tuple[str, tuple[Any, ...], Any]
-"""A part of a space that is an array of numbers: its name, its path in an observation, and its space."""
 
-
-def _leaves(space: Any, name: str = "", path: tuple[Any, ...] = ()) -> Iterator[_Leaf]:
+def _leaves(space: Any, name: str = "", path: tuple[Any, ...] = ()) -> Iterator[tuple[str, tuple[Any, ...], Any]]:
+    """Yield the parts of a space that are arrays of numbers: name, path in an observation, and space."""
     if isinstance(space, spaces.Dict):
         for key, part in space.spaces.items():
             if key != MASK:
@@ -44,35 +42,25 @@ def _leaves(space: Any, name: str = "", path: tuple[Any, ...] = ()) -> Iterator[
         yield name, path, space
 
 
-def _bounds(space: Any) -> tuple[Any, Any]:
+def _bounds(space: Any) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the lower and the upper bounds of a leaf."""
     if isinstance(space, spaces.Box):
         return space.low, space.high
     if isinstance(space, spaces.MultiBinary):
         return np.zeros(space.shape), np.ones(space.shape)
-    return space.start, space.start + getattr(space, "nvec", getattr(space, "n", 0)) - 1
-
-
-def _flat(arrays: Iterable[Any]) -> NDArray[np.float64]:
-    return np.concatenate([np.zeros(0), *(np.asarray(array, np.float64).ravel() for array in arrays)])
+    return np.asarray(space.start), np.asarray(space.start + getattr(space, "nvec", getattr(space, "n", 0)) - 1)
 
 
 class PointCollector:
-    """Collects the statistics of one decision point. Its arrays have a column for each component of an observation."""
+    """Collects the statistics of one decision point."""
 
     def __init__(self, bound: Any) -> None:
         self.name, self.agents = bound.point.name, bound.agent or "agents named by each call"
         self.definition: Definition = bound.definition
         self._leaves = list(_leaves(self.definition.observation_space))
-        self._names, self._spaces = [], []  # of the components
-        for name, _, space in self._leaves:
-            for place in np.ndindex(*space.shape):
-                self._names.append(f"{name}{list(place)}" if place else name)
-                self._spaces.append(space)
-        self._low, self._high = (_flat(_bounds(space)[side] for _, _, space in self._leaves) for side in (0, 1))
-        self._raw: list[NDArray[np.float64]] = []  # as mappings returned them ...
-        self._cast: list[NDArray[np.float64]] = []  # ... and as their dtypes hold them
-        self.observations = self.decisions = 0
+        self._values: list[list[NDArray[Any]]] = [[] for _ in self._leaves]  # of each leaf, as mappings returned them
+        self._numbers = sum(int(np.prod(space.shape)) for _, _, space in self._leaves)
+        self._observations = self._decisions = 0
         self._unfit = ""
         self._legal: Any = None
         self._rewards: list[float] = []
@@ -102,22 +90,21 @@ class PointCollector:
 
     def _add_observation(self, observation: Any) -> None:
         """Record what a mapping returned. What the environment refuses is not counted."""
-        try:
-            parts = [np.asarray(reduce(getitem, path, observation)) for _, path, _ in self._leaves]
-        except (LookupError, TypeError, ValueError):
-            return
-        raw, cast = [], []
-        for part, (_, _, space) in zip(parts, self._leaves, strict=True):
+        parts = []
+        for _, path, space in self._leaves:
+            try:
+                part = np.array(reduce(getitem, path, observation))
+            except (LookupError, TypeError, ValueError):
+                return
             if part.dtype.kind not in "biuf" or part.shape != space.shape:
                 return
-            raw.append(part)
-            cast.append(part.astype(space.dtype))
-            if space.dtype.kind in "iub" and not (np.abs(part - cast[-1].astype(float)) < 1).all():
+            if space.dtype.kind in "iub" and not (np.abs(part - part.astype(space.dtype).astype(float)) < 1).all():
                 return
-        self.observations += 1
-        if len(self._cast) * len(self._names) < _MOST_NUMBERS:
-            self._raw.append(_flat(raw))
-            self._cast.append(_flat(cast))
+            parts.append(part)
+        self._observations += 1
+        if self._observations * self._numbers <= _MOST_NUMBERS:
+            for values, part in zip(self._values, parts, strict=True):
+                values.append(part)
 
     def add_episode(self, steps: Sequence[tuple[str, Step]]) -> None:
         """Record the steps of an episode. Before its first action an agent gets no reward."""
@@ -132,98 +119,98 @@ class PointCollector:
             met.add(agent)
             if step.terminated or step.truncated:
                 continue
-            self.decisions += 1
+            self._decisions += 1
             mask = step.info.get(MASK)
             if isinstance(mask, np.ndarray):
                 self._legal = mask.astype(bool) if self._legal is None else self._legal | mask.astype(bool)
 
-    def statistics(self) -> PointStatistics:
-        """Return the statistics."""
-        return PointStatistics(
+    def results(self) -> tuple[PointStatistics, list[Finding]]:
+        """Return the statistics, and what is wrong or worth knowing."""
+        components: list[ComponentStatistics] = []
+        noted: dict[str, list[str]] = {"outside": []}
+        for part, notes in self._components():
+            components.append(part)
+            for name, text in notes:
+                noted.setdefault(name, []).append(text)
+        if self._unfit and not noted["outside"]:
+            noted["outside"].append(f"the observation {self._unfit}")
+        start = int(getattr(self.definition.action_space, "start", 0))
+        never = () if self._legal is None else tuple((np.flatnonzero(~self._legal) + start).tolist())
+        if never:
+            noted["never_legal"] = [f"action {action}" for action in never]
+        rewards = self._rewards or [np.nan]
+        least, most, what = min(rewards), max(rewards), "Observations"
+        statistics = PointStatistics(
             point=self.name,
             agents=self.agents,
             observation_space=str(self.definition.observation_space),
             action_space=str(self.definition.action_space),
-            observations=self.observations,
-            components=tuple(self._components()),
-            decisions=self.decisions,
-            never_legal=self._never_legal(),
+            observations=self._observations,
+            components=tuple(components),
+            decisions=self._decisions,
+            never_legal=never,
             rewards=len(self._rewards),
-            reward_minimum=min(self._rewards, default=np.nan),
-            reward_maximum=max(self._rewards, default=np.nan),
-            reward_mean=fmean(self._rewards) if self._rewards else np.nan,
+            reward_minimum=least,
+            reward_maximum=most,
+            reward_mean=fmean(rewards),
         )
-
-    def _components(self) -> Iterator[ComponentStatistics]:
-        if not self._cast:
-            return
-        values, low, high = np.array(self._cast), self._low, self._high
-        at_bounds = (values == low) | (values == high)
-        beyond = ~((values >= low) & (values <= high))
-        columns = [low, high, values.min(0), values.max(0), values.mean(0), at_bounds.mean(0), beyond.mean(0)]
-        for name, row in zip(self._names, np.stack(columns, axis=1).tolist(), strict=True):
-            yield ComponentStatistics(name, *row)
-
-    def _never_legal(self) -> tuple[int, ...]:
-        if self._legal is None:
-            return ()
-        start = int(getattr(self.definition.action_space, "start", 0))
-        return tuple((np.flatnonzero(~self._legal) + start).tolist())
-
-    def findings(self) -> Iterator[Finding]:
-        """Yield what is wrong or worth knowing."""
         point = ".".join(self.name.split(".")[-2:])
-        if not self.decisions:
-            yield finding("never_called", point=point)
-            return
-        for name, texts in self._remarkable_components().items():
-            if name == "outside" and self._unfit:
-                texts = texts or [f"the observation {self._unfit}"]
-            if texts:
-                yield finding(name, _listed(texts), point=point, what="Observations")
-        if never := self._never_legal():
-            yield finding("never_legal", _listed([f"action {action}" for action in never]), point=point)
-        if len(self._rewards) > 1:
-            least, most = min(self._rewards), max(self._rewards)
-            if least == most:
-                name = "same_rewards" if least else "zero_rewards"
-                yield finding(name, f"{len(self._rewards)} rewards of {least:.6g}", point=point)
-            elif max(abs(least), abs(most)) > _LARGE:
-                yield finding("large", f"{least:.4g} to {most:.4g}", point=point, what="Rewards")
+        if not self._decisions:
+            return statistics, [finding("never_called", point=point)]
+        findings = [finding(name, _listed(texts), point=point, what=what) for name, texts in noted.items() if texts]
+        if len(rewards) > 1 and least == most:
+            name = "same_rewards" if least else "zero_rewards"
+            findings.append(finding(name, f"{len(rewards)} rewards of {least:.6g}", point=point))
+        elif max(abs(least), abs(most)) > _LARGE:
+            findings.append(finding("large", f"{least:.4g} to {most:.4g}", point=point, what="Rewards"))
+        return statistics, findings
 
-    def _remarkable_components(self) -> dict[str, list[str]]:
-        """Describe components by the name of the finding."""
-        names = ("outside", "lost_fractions", "rounded", "constant", "narrow", "large", "unbounded")
-        found: dict[str, list[str]] = {name: [] for name in names}
-        for column, part in enumerate(self._components()):
-            name, space, width = part.name or "the value", self._spaces[column], part.high - part.low
-            text = f"{name}: {part.minimum:.4g} to {part.maximum:.4g} (bounds {part.low:.4g} to {part.high:.4g})"
-            if part.beyond:
-                found["outside"].append(f"{text}, outside for {part.beyond:.0%} of the time")
-            loss = self._loss(column, space.dtype)
-            if loss:
-                found["rounded" if space.dtype.kind == "f" else "lost_fractions"].append(
-                    f"{name} {loss} ({space.dtype})"
+    def _components(self) -> Iterator[tuple[ComponentStatistics, list[tuple[str, str]]]]:
+        """Yield the components of observations, and what is remarkable: names of findings, with evidence."""
+        for (leaf, _, space), values in zip(self._leaves, self._values, strict=True):
+            low, high = _bounds(space)
+            for place in np.ndindex(*space.shape) if values else ():
+                raw = np.array([value[place] for value in values], float)
+                cast = raw.astype(space.dtype).astype(float)
+                part = ComponentStatistics(
+                    name=f"{leaf}{list(place)}" if place else leaf,
+                    low=float(low[place]),
+                    high=float(high[place]),
+                    minimum=float(cast.min()),
+                    maximum=float(cast.max()),
+                    mean=float(cast.mean()),
+                    at_bounds=float(((cast == low[place]) | (cast == high[place])).mean()),
+                    beyond=float((~((cast >= low[place]) & (cast <= high[place]))).mean()),
                 )
-            if len(self._cast) < _ENOUGH:
-                continue
-            if part.constant:
-                found["constant"].append(f"{name} = {part.minimum:.4g}")
-            elif isinstance(space, spaces.Box) and not part.beyond:
-                if np.isfinite(width) and part.maximum - part.minimum < _NARROW * width:
-                    found["narrow"].append(text)
-                if max(abs(part.minimum), abs(part.maximum)) > _LARGE:
-                    found["large"].append(text)
-            if isinstance(space, spaces.Box) and not np.isfinite(width):
-                found["unbounded"].append(text)
-        return found
+                yield part, [*_losses(part.name, space.dtype, raw, cast), *_ranges(part, space, len(cast))]
 
-    def _loss(self, column: int, dtype: Any) -> str:
-        """Describe how a cast has changed a number that the dtype cannot hold; empty if none has."""
-        raw, cast = (np.array([row[column] for row in rows]) for rows in (self._raw, self._cast))
-        unexpected = (raw == np.trunc(raw)) | ~np.isfinite(cast) if dtype.kind == "f" else True
-        places = np.flatnonzero((raw != cast) & np.isfinite(raw) & unexpected)
-        return f"was {raw[places[0]]:.10g} and became {cast[places[0]]:.10g}" if len(places) else ""
+
+def _losses(name: str, dtype: Any, raw: NDArray[Any], cast: NDArray[Any]) -> Iterator[tuple[str, str]]:
+    """Yield the first number that a dtype cannot hold. Fractions that are only rounded are not reported."""
+    unexpected = (raw == np.trunc(raw)) | ~np.isfinite(cast) if dtype.kind == "f" else True
+    places = np.flatnonzero((raw != cast) & np.isfinite(raw) & unexpected)
+    if len(places):
+        text = f"{name} was {raw[places[0]]:.10g} and became {cast[places[0]]:.10g} ({dtype})"
+        yield "rounded" if dtype.kind == "f" else "lost_fractions", text.strip()
+
+
+def _ranges(part: ComponentStatistics, space: Any, number: int) -> Iterator[tuple[str, str]]:
+    """Yield what is remarkable in the range of a component."""
+    name, width = part.name or "the value", part.high - part.low
+    text = f"{name}: {part.minimum:.4g} to {part.maximum:.4g} (bounds {part.low:.4g} to {part.high:.4g})"
+    if part.beyond:
+        yield "outside", f"{text}, outside for {part.beyond:.0%} of the time"
+    if number < _ENOUGH:
+        return
+    if part.constant:
+        yield "constant", f"{name} = {part.minimum:.4g}"
+    elif isinstance(space, spaces.Box) and not part.beyond:
+        if np.isfinite(width) and part.maximum - part.minimum < _NARROW * width:
+            yield "narrow", text
+        if max(abs(part.minimum), abs(part.maximum)) > _LARGE:
+            yield "large", text
+    if isinstance(space, spaces.Box) and not np.isfinite(width):
+        yield "unbounded", text
 
 
 def _listed(texts: Sequence[str]) -> str:

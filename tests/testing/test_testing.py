@@ -301,6 +301,17 @@ def test_a_model_that_is_always_seeded_alike():
     assert finding(report, "All seeds give the same episode").severity == "note"
 
 
+def test_seeds_that_only_attributes_show():
+    class Marked(Walk):
+        def reset(self, seed=None):
+            super().reset(7)
+            self.mark = np.full(3, float(seed))
+
+    report = checked(Marked)
+    assert report.ok, str(report)
+    assert not [title for title in titles(report) if "All seeds" in title]
+
+
 def test_a_model_that_takes_no_seed():
     class Seedless(Walk):
         def reset(self):

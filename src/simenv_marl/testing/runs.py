@@ -1,6 +1,6 @@
-"""Watched runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
+"""Recorded runs of a simulation: plain runs, runs with RULE throughout, and episodes of random actions.
 
-Every run has an end, whatever the model does. At its *limit* of decisions, an exit is raised at the next decision. When
+Every run has an end, whatever the model does. At its limit of decisions, an exit is raised at the next decision. When
 its time is up, an exit is raised in whatever Python code the model is executing.
 """
 
@@ -13,6 +13,7 @@ import random
 import sys
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -24,8 +25,10 @@ import numpy as np
 
 from ..errors import error_text
 from ..simulation import RULE
-from .fingerprint import Fingerprint, alike, brief, shown
-from .inside import MASK, Plan, SimulationExit, make_simulation, outside_simulation, plain_loop, watching_rules
+from .fingerprint import Difference, Fingerprint, alike, brief, describe_differences, fingerprint
+from .internals import MASK, Plan, SimulationExit, outside_simulation, set_up, watching_rules
+
+Result = TypeVar("Result")
 
 
 class Cut(SimulationExit):
@@ -36,33 +39,19 @@ class TimeUp(SimulationExit):
     """Raised in a run whose time is up."""
 
 
-Result = TypeVar("Result")
-Look = Callable[[Any], Fingerprint | None]
-"""A function that returns the fingerprint of a simulation."""
-
-# -- time -----------------------------------------------------------------------------------------
-
-_AGAIN: Final = 0.5
-"""The time in seconds after which the exit is raised again in a model that swallowed it."""
-
-
-def within(deadline: float, function: Callable[[], Result]) -> Result:
-    """Call a function, and raise ``TimeUp`` in it after a deadline, given as ``time.monotonic()``.
+def within(seconds: float, function: Callable[[], Result]) -> Result:
+    """Call a function, and raise ``TimeUp`` in it when the time is up.
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
-
-    Raises:
-        TimeUp: The function was interrupted, or it was too late to call it.
     """
-    if time.monotonic() >= deadline:
-        raise TimeUp
+    deadline = time.monotonic() + seconds
     thread, over = threading.get_ident(), threading.Event()
 
     def watch() -> None:
         pause = deadline - time.monotonic()
         while not over.wait(max(0.0, pause)):
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(TimeUp))
-            pause = _AGAIN
+            pause = 0.5  # raise it again in a model that swallows it
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
     try:
@@ -85,29 +74,28 @@ def within(deadline: float, function: Callable[[], Result]) -> Result:
 # -- global generators ----------------------------------------------------------------------------
 
 
-def global_generators() -> tuple[Any, Any]:
-    """Return the states of Python's and NumPy's global generators."""
-    return random.getstate(), np.random.get_state(legacy=False)
-
-
-def set_global_generators(states: tuple[Any, Any]) -> None:
-    """Restore states that ``global_generators`` returned."""
-    random.setstate(states[0])
-    np.random.set_state(states[1])
-
-
 def seed_global_generators(seed: int) -> None:
-    """Seed both generators, so that runs of a model that draws from them can be compared."""
+    """Seed Python's and NumPy's global generators, so that runs of a model that draws from them can be compared."""
     random.seed(seed)
     np.random.seed(seed % 2**32)
 
 
+def global_generators() -> dict[str, Any]:
+    """Return the states of both."""
+    return {"Python's random": random.getstate(), "numpy.random": np.random.get_state(legacy=False)}
+
+
+def drawn_since(states: dict[str, Any]) -> set[str]:
+    """Return the names of the global generators whose states have changed."""
+    return {name for name, state in global_generators().items() if not alike(state, states[name])}
+
+
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Run a model that may print and warn; the global generators are left as they were.
+    """Ignore what a model prints, and its warnings; leave the global generators as they were.
 
     Yields:
-        The warnings that were not ignored.
+        The warnings for which a filter was added.
     """
     states, silenced = global_generators(), io.StringIO()
     try:
@@ -120,153 +108,185 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
             warnings.simplefilter("ignore")
             yield caught
     finally:
-        set_global_generators(states)
+        random.setstate(states["Python's random"])
+        np.random.set_state(states["numpy.random"])
 
 
-# -- runs of the model's own rules ----------------------------------------------------------------
+# -- runs -----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Step:
+    """What an agent got at its turn."""
+
+    observation: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
 
 
 @dataclass
 class Run:
-    """The result of a run.
+    """What is recorded of a run.
 
-    Attributes:
-        decisions: The decisions: the point's name, and what its rule returned.
-        fingerprint: What the simulation held at its end, or when it was cut.
-        cut: Whether it was cut at its limit.
-        error: The exception that it raised.
-        result: What ``run`` returned, in a plain run.
-        drawn: The global generators from which it has drawn.
+    Its entries are the decisions in plain runs and with RULE (the point's name, and what its rule returned), and the
+    steps in episodes of random actions (the agent's name, and a ``Step``).
     """
 
-    decisions: list[list[Any]] = field(default_factory=list)
-    fingerprint: Fingerprint | None = None
-    cut: bool = False
+    entries: list[tuple[str, Any]] = field(default_factory=list)
+    actions: list[Any] = field(default_factory=list)  # the random ones
+    simulation: Any = None
+    fingerprint: Fingerprint | None = None  # of the simulation at its end, or when it was cut
+    cut: bool = False  # whether it has reached its limit of decisions
     error: BaseException | None = None
-    result: Any = None
-    drawn: set[str] = field(default_factory=set)
+    result: Any = None  # what the simulation's run() returned, in a plain run
+    drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
+    seconds: float = 0.0
+    latest: float = field(default_factory=time.monotonic)  # the time of the latest step
 
     @property
     def calls(self) -> list[str]:
         """The names of the points that were called, in that order."""
-        return [name for name, _ in self.decisions]
+        return [name for name, _ in self.entries]
+
+    def play(self, seconds: float, function: Callable[[], Any]) -> Run:
+        """Call a function that plays this run; record its error and the global generators."""
+        states = global_generators()
+        try:
+            within(seconds, function)
+        except (Exception, SystemExit) as error:
+            if not self.cut:
+                self.error = error
+        self.drawn = drawn_since(states)
+        return self
 
     def difference(self, other: Run, here: str = "first", there: str = "then") -> str:
-        """Describe the first difference from the decisions of another run; empty if there is none."""
-        for number, (left, right) in enumerate(zip(self.decisions, other.decisions, strict=False), 1):
-            if left[0] != right[0]:
-                return f"decision {number} is {here} of {left[0]}, {there} of {right[0]}"
-            if not alike(left[1], right[1]):
-                return f"decision {number}, of {left[0]}, is {here} {shown(left[1])}, {there} {shown(right[1])}"
-        if len(self.decisions) != len(other.decisions):
-            return f"there are {here} {len(self.decisions)} decisions, {there} {len(other.decisions)}"
+        """Describe the first difference from the entries of another run; empty if there is none."""
+        pairs = zip(self.entries, other.entries, strict=False)
+        for number, ((name, value), (other_name, other_value)) in enumerate(pairs, 1):
+            if name != other_name:
+                return f"step {number} is {here} of {name}, {there} of {other_name}"
+            parts = fingerprint(name, value).differences(fingerprint(name, other_value))
+            if parts:
+                return f"in step {number}, {describe_differences(parts, here, there)}"
+        if other.error is not None:
+            return f"the second one raises {describe_with_place(other.error)}"
+        if len(self.entries) != len(other.entries):
+            return f"there are {here} {len(self.entries)} steps, {there} {len(other.entries)}"
         return ""
 
 
-class _Watch:
-    """Watches one run, until a limit of decisions.
+@dataclass(kw_only=True)
+class Runner:
+    """Runs a simulation in different ways, within a number of decisions and of seconds."""
 
-    Attributes:
-        run: The result.
-        simulation: The simulation that runs.
-    """
+    plan: Plan
+    max_steps: int
+    seconds: float
+    own: Callable[[Any], Any] | None = None  # the user's callable by which simulations are compared
+    unstable: frozenset[str] = frozenset()  # parts that are not compared
 
-    def __init__(self, limit: int, look: Look) -> None:
-        self.run = Run()
-        self.simulation: Any = None
-        self._limit, self._look = limit, look
+    def look(self, simulation: Any) -> Fingerprint:
+        """Return the fingerprint of a simulation: of the user's callable, of its ``state()``, or of its attributes."""
+        with outside_simulation():  # decision functions called there run their rule
+            if self.own is not None:
+                return fingerprint("fingerprint", self.own(simulation))
+            state = getattr(simulation, "state", None)
+            return fingerprint("state()", state()) if callable(state) else fingerprint("simulation", simulation)
 
-    def over(self, plan: Plan, play: Callable[[], Any]) -> Run:
-        """Watch what a function plays, and record whatever it raises."""
-        run, before = self.run, global_generators()
-        with watching_rules(plan, self._begin):
-            try:
-                run.result = play()
-                run.fingerprint = self._look(self.simulation)
-            except Cut:
-                pass
-            except (Exception, SystemExit) as error:
+    def differences(self, run: Run, other: Run) -> list[Difference]:
+        """Return the parts in which the simulations differ after two runs."""
+        if run.fingerprint is None or other.fingerprint is None:
+            return []
+        return run.fingerprint.differences(other.fingerprint, self.unstable)
+
+    def run_plainly(self, seed: int) -> Run:
+        """Run the simulation's own loop; only the results of its rules are recorded."""
+        run = Run()
+
+        def start() -> None:
+            with set_up(self.plan, seed) as (simulation, main):
+                run.simulation, begun = simulation, time.perf_counter()
+                run.result = main()
+                run.seconds = time.perf_counter() - begun
+                run.fingerprint = self.look(simulation)
+
+        return self._record(run, start)
+
+    def run_rules(self, env: Any, seed: int) -> Run:
+        """Run an environment of any view with ``RULE`` throughout; the results of rules are recorded."""
+        run = Run(simulation=env.simulation)
+
+        def start() -> None:
+            begun = time.perf_counter()
+            play_rules(env, seed)
+            run.seconds = time.perf_counter() - begun
+            run.fingerprint = self.look(run.simulation)
+
+        return self._record(run, start)
+
+    def _record(self, run: Run, start: Callable[[], None]) -> Run:
+        """Record the decisions of a run, and cut it at the limit."""
+
+        def begin(name: str) -> Callable[[Any], None]:
+            place = len(run.entries)
+            if place >= self.max_steps:
                 if not run.cut:
-                    run.error = error
-        sources = zip(("Python's random", "numpy.random"), before, global_generators(), strict=True)
-        run.drawn = {name for name, one, other in sources if not alike(one, other)}
-        return run
+                    run.cut, run.fingerprint = True, self.look(run.simulation)
+                raise Cut
+            run.entries.append((name, "left without a decision"))
 
-    def _begin(self, name: str) -> Callable[[Any], None]:
-        run = self.run
-        if len(run.decisions) >= self._limit:
-            if not run.cut:
-                run.cut = True
-                run.fingerprint = self._look(self.simulation)
-            raise Cut
-        note = [name, "left without a decision"]
-        run.decisions.append(note)
+            def end(value: Any) -> None:
+                run.entries[place] = name, brief(value)
 
-        def end(value: Any) -> None:
-            note[1] = brief(value)
+            return end
 
-        return end
+        with watching_rules(self.plan, begin):
+            return run.play(self.seconds, start)
 
+    def run_randomly(self, *games: tuple[Any, int], salt: int = 0) -> list[Run]:
+        """Play episodes with random legal actions, in turns; each in an AEC environment and with a seed.
 
-def plain_run(plan: Plan, seed: int, limit: int, deadline: float, look: Look, profile: Any = None) -> Run:
-    """Run a simulation's own loop; only the results of its rules are recorded.
+        The actions depend on seed, agent and salt alone. An error is that of the last run.
+        """
+        runs = [Run() for _ in games]
 
-    Args:
-        plan: The plan of the simulation.
-        seed: The seed of the simulation.
-        limit: The number of decisions after which it is cut.
-        deadline: The time at which it is interrupted.
-        look: Returns the fingerprint of the simulation at the end.
-        profile: A profiler for all calls meanwhile, as ``sys.setprofile`` takes it.
-    """
-    watch, before = _Watch(limit, look), sys.getprofile()
+        def start() -> None:
+            left = [_random_steps(run, env, seed, salt) for run, (env, seed) in zip(runs, games, strict=True)]
+            while left:
+                left = [steps for steps in left if next(steps, False)]
 
-    def play() -> Any:
-        watch.simulation = make_simulation(plan.source)
-        sys.setprofile(before if profile is None else profile)
+        seed_global_generators(games[0][1])
+        runs[-1].play(self.seconds, start)
+        return runs
+
+    def sources_of_chance(self, seed: int) -> list[str]:
+        """Run the simulation, and find its sources of chance: clocks, entropy, global generators.
+
+        Returns:
+            Each as the end of a sentence, with the place of the call.
+        """
+        found: dict[str, None] = {}
+
+        def profile(frame: Any, event: str, argument: Any) -> None:
+            source = _source_of_chance(frame, event, argument)
+            place = _caller(frame) if source else None
+            if place:
+                found[f"{source} at {place}"] = None
+
+        before = sys.getprofile()
+        sys.setprofile(profile)
         try:
-            reset(watch.simulation, seed)
-            return main(watch.simulation)
+            self.run_plainly(seed)
         finally:
             sys.setprofile(before)
-
-    with plain_loop(plan, watched=True) as (reset, main):
-        return watch.over(plan, lambda: within(deadline, play))
+        return list(found)
 
 
-def seconds_of_plain_run(plan: Plan, seed: int, deadline: float) -> float:
-    """Run a simulation's own loop without any recording. Return its duration in seconds."""
-
-    def play() -> float:
-        simulation = make_simulation(plan.source)
-        reset(simulation, seed)
-        start = time.perf_counter()
-        main(simulation)
-        return time.perf_counter() - start
-
-    with plain_loop(plan, watched=False) as (reset, main):
-        return within(deadline, play)
-
-
-def rule_run(plan: Plan, env: Any, seed: int, limit: int, deadline: float, look: Look) -> Run:
-    """Run an environment of a plan, of any view, with ``RULE`` throughout, and watch it."""
-
-    def play() -> None:
-        env.reset(seed=seed)
-        play_rules(env)
-
-    watch = _Watch(limit, look)
-    watch.simulation = env.simulation
-    return watch.over(plan, lambda: within(deadline, play))
-
-
-def play_rules(env: Any, selected: dict[str, None] | None = None) -> None:
-    """Play an environment of any view with ``RULE`` throughout, after its reset.
-
-    Args:
-        env: The environment.
-        selected: A dict that collects the agents that the AEC view selects.
-    """
+def play_rules(env: Any, seed: int, selected: dict[str, None] | None = None) -> None:
+    """Play an episode in any view with ``RULE`` throughout; collect the agents that the AEC view selects."""
+    env.reset(seed=seed)
     if not hasattr(env, "agents"):
         while not any(env.step(RULE)[2:4]):
             pass
@@ -281,105 +301,73 @@ def play_rules(env: Any, selected: dict[str, None] | None = None) -> None:
         env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
 
 
-# -- episodes of random actions -------------------------------------------------------------------
-
-
-@dataclass
-class Step:
-    """What an agent got at its turn, and what it did (None if its episode has ended)."""
-
-    agent: str
-    told: tuple[Any, float, bool, bool, dict[str, Any]]
-    action: Any
-
-    def difference(self, other: Step) -> str:
-        """Describe the difference from a step of another episode; empty if there is none."""
-        if self.agent != other.agent:
-            return f"the agent is first {self.agent}, then {other.agent}"
-        names = ("observation", "reward", "terminated", "truncated", "info")
-        for name, here, there in zip(names, self.told, other.told, strict=True):
-            if not alike(here, there):
-                return f"the {name} of {self.agent} is first {shown(here)}, then {shown(there)}"
-        return "" if alike(brief(self.action), brief(other.action)) else f"the action of {self.agent} differs"
-
-
-def random_steps(env: Any, seed: int, salt: int = 0) -> Iterator[Step]:
-    """Play an episode of an AEC environment with random legal actions, which depend on seed, agent and salt alone."""
+def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[bool]:
+    """Play one step at a time, and record it."""
     env.reset(seed=seed)
     spaces: dict[str, Any] = {}
     while env.agents:
         agent = env.agent_selection
-        told = env.last()
-        action = None
-        if not (told[2] or told[3]):
+        step, action = Step(*env.last()), None
+        run.entries.append((agent, step))
+        run.latest = time.monotonic()
+        if not (step.terminated or step.truncated):
             if agent not in spaces:
                 spaces[agent] = copy.deepcopy(env.action_space(agent))
                 spaces[agent].seed(crc32(f"{seed} {agent} {salt}".encode(errors="surrogatepass")))
-            mask = told[4].get(MASK)
-            action = spaces[agent].sample() if mask is None else spaces[agent].sample(mask)
-        yield Step(agent, told, action)
+            action = spaces[agent].sample(step.info.get(MASK))
+            run.actions.append(action)
+        yield True
         env.step(action)
 
 
 # -- where errors and differences come from -------------------------------------------------------
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
+_LIBRARY: Final = random.__file__.rpartition("random.py")[0]
 _CLOCKS: Final = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
 
 
-def culprit(error: BaseException) -> str:
+def place_of(error: BaseException) -> str:
     """Return where an error was raised, outside of this library: file, line and function; empty if nowhere."""
-    place, trace = "", error.__traceback__
-    while trace is not None:
-        code = trace.tb_frame.f_code
-        if not code.co_filename.startswith((_PACKAGE, "<")) and "site-packages" not in code.co_filename:
-            place = f"{code.co_filename}:{trace.tb_lineno}, in {code.co_name}"
-        trace = trace.tb_next
-    return place
+    places = [
+        f"{frame.filename}:{frame.lineno}, in {frame.name}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename
+    ]
+    return places[-1] if places else ""
 
 
-def error_in_words(error: BaseException, most: int = 300) -> str:
-    """Describe an error: its kind, the first lines of its text, and where it was raised."""
-    text, place = " ".join(error_text(error).split()), culprit(error)
-    text = text if len(text) <= most else f"{text[: most - 4]} ..."
+def describe_with_place(error: BaseException) -> str:
+    """Describe an error: its class, the beginning of its text, and where it was raised."""
+    text, place = " ".join(error_text(error).split()), place_of(error)
+    text = text if len(text) <= 400 else f"{text[:396]} ..."
     return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
 
 
-def sources_of_chance(plan: Plan, seed: int, deadline: float, limit: int) -> list[str]:
-    """Run the simulation by itself, and find its sources of chance: clocks, entropy, global generators.
+def _source_of_chance(frame: Any, event: str, function: Any) -> str:
+    """Describe the source of chance that a call uses, as a profiler sees it; empty if it uses none."""
+    if event == "call" and frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
+        return "a random.Random is made without a seed"
+    if event != "c_call":
+        return ""
+    module, name = getattr(function, "__module__", None), getattr(function, "__name__", "")
+    owner = getattr(function, "__self__", None)
+    if module == "time" and name in _CLOCKS:
+        return f"the clock is read (time.{name})"
+    if name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
+        return f"the clock is read (datetime.{name})"
+    if name == "urandom":
+        return "the operating system is asked for random bits (as by a generator without a seed)"
+    if name in ("random", "getrandbits") and owner is getattr(random.random, "__self__", None):
+        return "Python's global generator is used"
+    return ""
 
-    Returns:
-        Each as the end of a sentence, with the place of the call.
-    """
-    found: dict[str, None] = {}
-    library = random.__file__.rpartition("random.py")[0]
-    shared: Any = random.random.__self__  # type: ignore[attr-defined]
-    seeding = random.Random.seed.__code__
 
-    def asked(what: str, frame: Any) -> None:
-        while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
-            path = frame.f_code.co_filename
-            if ("site-packages" in path or not path.startswith(library)) and not path.startswith("<"):
-                if "numpy" not in path:
-                    found[f"{what} at {path}:{frame.f_lineno}, in {frame.f_code.co_name}"] = None
-                return
-            frame = frame.f_back
-
-    def profile(frame: Any, event: str, argument: Any) -> None:
-        if event == "call" and frame.f_code is seeding and frame.f_locals.get("a", 0) is None:
-            asked("a random.Random is made without a seed", frame.f_back)
-        if event != "c_call":
-            return
-        module, name = getattr(argument, "__module__", None), getattr(argument, "__name__", "")
-        owner = getattr(argument, "__self__", None)
-        if module == "time" and name in _CLOCKS:
-            asked(f"the clock is read (time.{name})", frame)
-        elif name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
-            asked(f"the clock is read (datetime.{name})", frame)
-        elif name == "urandom":
-            asked("the operating system is asked for random bits (as by a generator without a seed)", frame)
-        elif owner is shared and name in ("random", "getrandbits"):
-            asked("Python's global generator is used", frame)
-
-    plain_run(plan, seed, limit, deadline, lambda simulation: None, profile)
-    return list(found)
+def _caller(frame: Any) -> str:
+    """Return the place in the model, or in a package, from which the standard library was called; empty if nowhere."""
+    while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
+        path = frame.f_code.co_filename
+        if ("site-packages" in path or not path.startswith(_LIBRARY)) and not path.startswith("<"):
+            return "" if "numpy" in path else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"
+        frame = frame.f_back
+    return ""

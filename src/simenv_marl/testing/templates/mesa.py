@@ -1,17 +1,15 @@
 """MyModel: rabbits in Mesa that are born and starve, and one policy, shared by all of them, that learns where to go.
 
 ``python -m simenv_marl.testing.templates.mesa`` trains the policy and compares it with the model's own rule. It needs
-``pip install "simenv-marl[experiments]" mesa``. ``--quick`` only shows that everything runs.
+``pip install "simenv-marl[experiments]" mesa cma``. ``--quick`` only shows that everything runs.
 
 Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
 """
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Sequence
+import sys
 from typing import Any
 
+import cma
 import mesa
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -19,7 +17,6 @@ from mesa.discrete_space import CellAgent, OrthogonalVonNeumannGrid
 
 from simenv_marl import SteppedSimulation, aec_env, difference, evaluate, make_step
 from simenv_marl.data import collect_episodes
-from simenv_marl.envs import SimulationAECEnv
 
 # -- 1. The model: Mesa's agents, and a rule of their own -----------------------------------------
 
@@ -73,15 +70,15 @@ class MyModel(mesa.Model):
 # -- 2. The decision: what each agent sees, what it can do, and what it is rewarded for -----------
 
 
-def observe(rabbit: Rabbit) -> list[float]:
-    """See its energy; of each place the grass, and the other rabbits there."""
+def observe(rabbit: Rabbit) -> list[list[float]]:
+    """See a row for each place that it can be in next: the grass, and the other rabbits there."""
     places = rabbit.places()
     others = [min(len(place.agents) - (place is rabbit.cell), 5) for place in places]
-    return [rabbit.energy / 4, *(rabbit.model.grass[place.coordinate] for place in places), *others]
+    return [[rabbit.model.grass[place.coordinate], number] for place, number in zip(places, others, strict=True)]
 
 
 move = make_step(
-    observation_space=Box(-1, 5, (11,), np.float32),
+    observation_space=Box(0, 5, (5, 2), np.float32),
     observation_space_mapping=observe,  # gets the arguments of the decision call
     action_space=Discrete(5),
     choices=lambda rabbit: rabbit.places(),  # the action is an index
@@ -93,7 +90,7 @@ move = make_step(
 # -- 3. The simulation: what an episode is --------------------------------------------------------
 
 
-class MyModelSimulation(SteppedSimulation):
+class MySimulation(SteppedSimulation):
     """A hundred days: each reset makes a model with its seed, and run steps it."""
 
     points = {Rabbit.choose_cell: move}  # the model's classes stay as they are
@@ -106,66 +103,39 @@ class MyModelSimulation(SteppedSimulation):
         return [(rabbit,) for rabbit in self.model.agents]
 
 
-# -- 4. The environment ---------------------------------------------------------------------------
+# -- 4. The environment, training, and what it is worth -------------------------------------------
 
 
-def env(**options: Any) -> SimulationAECEnv:
+def env(**options: Any) -> Any:
     """Make the environment: a ``pettingzoo.AECEnv``; use ``parallel_env`` for learners that act in rounds."""
-    return aec_env(MyModelSimulation, **options)
+    return aec_env(MySimulation, **options)
 
 
-# -- 5. Training, and what it is worth ------------------------------------------------------------
+def policy_of(weights: Any) -> Any:
+    """Make a policy that gives points to each place, and takes the place with the most; for one rabbit or many."""
+    return lambda seen: (seen @ np.asarray(weights)).argmax(-1)
 
 
-def odds(weights: np.ndarray[Any, Any], seen: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Work out how likely each place is, for one observation or for many: a softmax over linear scores."""
-    scores = seen @ weights[:-1] + weights[-1]
-    scores = np.exp(scores - scores.max(axis=-1, keepdims=True))
-    return np.asarray(scores / scores.sum(axis=-1, keepdims=True))
-
-
-def train(updates: int, meadows: int) -> Any:
-    """Train one policy for all rabbits, by policy gradients.
-
-    Returns:
-        A policy: a callable of the observations that returns the actions.
-    """
-    generator, weights = np.random.default_rng(1), np.zeros((12, 5))
-
-    def explore(seen: np.ndarray[Any, Any]) -> Any:  # is asked for all rabbits of all meadows that wait for it
-        chances = odds(weights, seen)
-        drawn = (chances.cumsum(axis=1) < generator.random((len(seen), 1))).sum(axis=1).clip(max=4)
-        return drawn, {"chances": chances}
-
-    for update in range(updates):
-        seeds = range(update * meadows, (update + 1) * meadows)
-        found = collect_episodes(MyModelSimulation, {Rabbit.choose_cell: explore}, seeds=seeds)[Rabbit.choose_cell]
-        returns, ended = found.rewards.copy(), found.terminations | found.truncations
-        for row in range(len(returns) - 2, -1, -1):  # each life is a trajectory; they stand one after the other
-            returns[row] += 0.0 if ended[row] else 0.8 * returns[row + 1]
-        advantages = (returns - returns.mean()) / returns.std()
-        slopes = (np.eye(5)[found.actions] - found.extras["chances"]) * advantages[:, None]
-        inputs = np.column_stack([found.observations, np.ones(len(returns))])
-        weights += 1.0 * inputs.T @ slopes / len(returns)
-    return lambda seen: odds(weights, seen).argmax(axis=-1)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, and print what the policy is worth on meadows that it was not trained on."""
-    parser = argparse.ArgumentParser(description="Train one policy for all rabbits; compare it with the model's rule.")
-    parser.add_argument("--quick", action="store_true", help="train for a moment only, to see that everything runs")
-    quick = parser.parse_args(arguments).quick
-    policy = train(*(2, 2) if quick else (12, 4))
-    contenders: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: policy}}  # {}: the model as it is
-    seeds = range(100_000, 100_005 if quick else 100_030)
-    metric = {"alive": lambda simulation: len(simulation.model.agents)}
-    found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule", metric=metric, batched=True)
-    for of, title in (("return", "What all rabbits have eaten"), ("alive", "Rabbits alive at the end")):
-        print(f"{title}; differences are paired by seed, with 95 % intervals:")
-        print(found.summary(of).round(1).to_string())
-    print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.testing.templates.mesa:MyModelSimulation")
+def train(rounds: int, meadows: int) -> Any:
+    """Train one policy for all rabbits by evolution (CMA-ES), and return it. Every candidate meets the same meadows."""
+    search = cma.CMAEvolutionStrategy(np.zeros(2), 1.0, {"seed": 1, "verbose": -9})
+    for number in range(rounds):
+        seeds = range(number * meadows, (number + 1) * meadows)
+        weights, costs = search.ask(), []
+        for candidate in weights:  # a policy is asked for all rabbits of all meadows that wait for it
+            found = collect_episodes(MySimulation, {Rabbit.choose_cell: policy_of(candidate)}, seeds=seeds)
+            costs.append(-float(found[Rabbit.choose_cell].rewards.sum()))
+        search.tell(weights, costs)
+    return policy_of(search.result.xfavorite)
 
 
 if __name__ == "__main__":
-    main()
+    quick = "--quick" in sys.argv
+    trained = train(*(2, 1) if quick else (4, 2))
+    policies: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: trained}}  # {}: the model as it is
+    seeds = range(100_000, 100_005 if quick else 100_030)  # meadows that it was not trained on
+    found = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
+    print("What all rabbits have eaten; differences are paired by seed, with 95 % intervals:")
+    print(found.summary().round(1).to_string())
+    print("Next: put your model into section 1, and run pytest. For a full report:")
+    print("python -m simenv_marl check simenv_marl.testing.templates.mesa:MySimulation")

@@ -6,19 +6,15 @@
 Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 import random
-from collections.abc import Sequence
+import sys
 from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
 from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, make_step, single_env
-from simenv_marl.envs import SimulationEnv
 
 # -- 1. The model: plain Python, with a main loop and a rule of its own ---------------------------
 
@@ -47,8 +43,7 @@ class MyModel:
 
     def update_hour(self) -> None:
         """Let one hour go by."""
-        wanted = min(max(self.choose_flow(), -self.power), self.power)
-        flow = min(max(wanted, -self.charge), self.capacity - self.charge)
+        flow = min(max(self.choose_flow(), -self.power, -self.charge), self.power, self.capacity - self.charge)
         self.charge += flow * (1 - self.losses) if flow > 0 else flow
         bought = self.use - self.sun + flow
         self.cost += bought * (self.price if bought > 0 else 0.05)  # what is fed into the grid earns little
@@ -78,7 +73,7 @@ flow = make_step(
 # -- 3. The simulation: what an episode is --------------------------------------------------------
 
 
-class MyModelSimulation(SimulationInterface):
+class MySimulation(SimulationInterface):
     """A week."""
 
     points = {MyModel.choose_flow: flow}  # the model's class stays as it is
@@ -98,23 +93,16 @@ class MyModelSimulation(SimulationInterface):
         return float(self.model.hour)
 
 
-# -- 4. The environment ---------------------------------------------------------------------------
+# -- 4. The environment, training, and what it is worth -------------------------------------------
 
 
-def env(**options: Any) -> SimulationEnv:
+def env(**options: Any) -> Any:
     """Make the environment: a ``gymnasium.Env``, as all of Gymnasium's learners and wrappers take it."""
-    return single_env(MyModelSimulation, **options)
-
-
-# -- 5. Training, and what it is worth ------------------------------------------------------------
+    return single_env(MySimulation, **options)
 
 
 def train(steps: int) -> Any:
-    """Train with PPO of Stable-Baselines3.
-
-    Returns:
-        A policy: a callable of the observation that returns an action.
-    """
+    """Train by PPO, and return a policy: a callable of the observation that returns an action."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 
@@ -124,20 +112,15 @@ def train(steps: int) -> Any:
     return lambda observation: int(learner.predict(observation, deterministic=True)[0])
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, and print how much the policy saves on weeks that it was not trained on."""
-    parser = argparse.ArgumentParser(description="Train an agent, and compare it with the model's own rule.")
-    parser.add_argument("--quick", action="store_true", help="train for a moment only, to see that everything runs")
-    quick = parser.parse_args(arguments).quick
-    policy = train(1500 if quick else 100_000)
-    contenders: dict[str, Any] = {"rule": {}, "trained": {"battery_0": policy}}  # {}: the model as it is
-    seeds = range(100_000, 100_005 if quick else 100_030)
-    found = evaluate(MyModelSimulation, contenders, seeds=seeds, baseline="rule")
+if __name__ == "__main__":
+    quick = "--quick" in sys.argv
+    policies: dict[str, Any] = {
+        "rule": {},
+        "trained": {"battery_0": train(1500 if quick else 100_000)},
+    }  # {}: the model as it is
+    seeds = range(100_000, 100_005 if quick else 100_030)  # weeks that it was not trained on
+    found = evaluate(MySimulation, policies, seeds=seeds, baseline="rule")
     print("Minus the costs of a week; differences are paired by seed, with 95 % intervals:")
     print(found.summary().round(2).to_string())
     print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.testing.templates.plain:MyModelSimulation")
-
-
-if __name__ == "__main__":
-    main()
+    print("python -m simenv_marl check simenv_marl.testing.templates.plain:MySimulation")

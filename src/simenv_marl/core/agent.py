@@ -16,6 +16,7 @@ from ..errors import MaskError, RewardError, short_repr
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
 from .actions import MASK
+from .asking import AskingPolicy
 from .driver import WAIT
 from .point import Point
 from .spaces import duplicate
@@ -152,6 +153,11 @@ class Agent:
             InvalidActionError: The action is not legal.
         """
         return action if action is RULE else self.point.checked(action, self.name, self.mask)
+
+    @property
+    def is_planner(self) -> bool:
+        """Whether the policy gets the environment."""
+        return isinstance(self.policy, AskingPolicy)
 
     # -- infos ------------------------------------------------------------------------------------
 

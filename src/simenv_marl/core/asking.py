@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
+from importlib import import_module
 from typing import Any, Final
 from weakref import ref
 
@@ -95,6 +96,7 @@ class AskingPolicy:
         episode = session.episode
         if episode.plan.solo or PLANNING.get():
             return self._by_base(observation, info, (episode.consulted or episode.pending).name)
+        import_module(f"{__name__.partition('.')[0]}.envs.asked")  # which sets ``make``
         return self.answer(observation, info, AskingPolicy.make(session))
 
     def _by_base(self, observation: Any, info: Any, agent: str) -> Any:

@@ -42,7 +42,6 @@ from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL, only_choice
 from .agent import Agent
-from .asking import AskingPolicy
 from .context import ExclusiveLock
 from .driver import WAIT, Driver
 from .plan import DeferredPolicy, Plan
@@ -330,7 +329,7 @@ class Episode(Run):
         if is_deferred and not self.plan.solo:
             self.pending = agent
             return WAIT
-        if isinstance(policy, AskingPolicy):
+        if agent.is_planner:
             agent.consultations += 1
             agent.keep(self, args, kwargs)
         if self.script:

@@ -182,7 +182,7 @@ class Plan:
             if policy is not RULE or excepted:  # otherwise the rule decides
                 self._prepare(named, agent, policy)
             else:
-                self.unmatched_names.discard(agent)  # type: ignore[arg-type]
+                self.unmatched_names.discard(agent)
         events: dict[DecisionPoint, Any] = {point.point: point for point in self.points}
         for point in self.points:
             for other in aliases(point.point):

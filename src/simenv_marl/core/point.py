@@ -319,7 +319,7 @@ class Removal:
                 found = point.agent or point.name_agent(args[0])
                 named.append((point, episode.named_before(point, args[0]) if found is None else found))
         for point, name in named:
-            agent = episode.agents.get(name)  # type: ignore[call-overload]
+            agent = episode.agents.get(name)
             if agent is not None and agent.point is point:
                 episode.end_agent(agent)
         return RULE

@@ -105,10 +105,10 @@ def learners_plan(
     keys = {key: entry.place for key, entry in entries.items() if isinstance(entry, PolicyKey)}
     others = PolicyKey(len(entries), BatchPolicy(_follow_rule)) if all_points else None
     options = {**options, "policies": entries}
-    plan = Plan.draw_up(simulation, points, options, unanswered=True, rewarded=True, others=others)
+    plan = Plan.draw_up(simulation, points, options, unattended=True, rewarded=True, others=others)
     for key in left:
         for point in plan.points:
-            if not point.recorded and is_answered_by(plan, point, keys[key]):
+            if point.report is None and is_answered_by(plan, point, keys[key]):
                 raise DefinitionError(
                     f"the actions of the rule of {point.point.name} are not known; give its make_step a"
                     " rule_action_mapping, which maps the rule's decision to an action"

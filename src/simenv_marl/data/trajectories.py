@@ -15,9 +15,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..core.agent import Agent
-from ..core.bound import BoundPoint
 from ..core.episode import Episode
 from ..core.plan import Plan
+from ..core.point import Point
 from ..core.spaces import blank
 from ..core.stacking import Stacker, joined, stack_masks, stacker, taken
 from ..errors import AgentError, OptionValueError, short_repr
@@ -196,7 +196,7 @@ class _DecisionLog:
     The point is one of those at which the group decides; None if it is not known, and there are no decisions.
     """
 
-    def __init__(self, point: BoundPoint | None) -> None:
+    def __init__(self, point: Point | None) -> None:
         self.name = "" if point is None else point.point.name
         self.observation_space = None if point is None else point.definition.observation_space
         self.action_space = None if point is None else point.definition.action_space
@@ -337,7 +337,7 @@ class Recorder:
         return records
 
 
-def is_answered_by(plan: Plan, point: BoundPoint, place: int) -> bool:
+def is_answered_by(plan: Plan, point: Point, place: int) -> bool:
     """Return whether it is known beforehand that the policy at this place answers at a decision point."""
     policy = point.policy if point.agent is None else plan.policies.get(point.agent, point.policy)
     return isinstance(policy, PolicyKey) and policy.place == place

@@ -54,6 +54,8 @@ def _info(agent: Agent | None, info: dict[str, Any]) -> dict[str, Any]:
 class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
     """A parallel environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``."""
 
+    agents: list[str]
+
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment; return the observations and infos of all possible agents."""
         observations, infos = super().reset(seed=seed, options=options)

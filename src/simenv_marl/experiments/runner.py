@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from ..core.agent import Agent
-from ..core.episode import Episode, When
+from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.session import Session
 from ..data.collect import learners_plan
@@ -252,15 +252,15 @@ def _run_alone(session: Session, seed: int, place: int, finish: Callable[..., An
     """Run an episode whose policies answer one decision at a time."""
     try:
         with outside_simulation():
-            episode = session.start(seed, None, When.DECISION)
+            episode = session.start(seed, None)
             own_random = session.plan.options.global_rng
             tally.moved(episode)
             while (agent := episode.pending) is not None:
                 tally.count(place, agent)
-                if agent.looks:
+                if agent.is_planner:
                     agent.consultations += 1
                 try:
-                    with episode.at_work() if own_random else nullcontext():
+                    with episode.context() if own_random else nullcontext():
                         action = agent.policy(agent.observation, agent.info)
                 except BaseException as error:
                     episode.fail(error)

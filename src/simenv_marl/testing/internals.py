@@ -9,13 +9,13 @@ from typing import Any, Final
 from greenlet import getcurrent
 
 from ..core.actions import MASK
-from ..core.contexts import at_work
+from ..core.context import environment_context
+from ..core.driver import SimulationExit
 from ..core.plan import Plan
 from ..core.rng import GlobalRandom
-from ..core.switch import SimulationExit
 from ..decision import DecisionPoint, Definition
 from ..envs.make import VIEWS, view_class
-from ..hooks.places import Held
+from ..hooks.patches import Installation
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import make_simulation, resetter
 
@@ -68,7 +68,7 @@ def set_up(plan: Plan, seed: int) -> Iterator[tuple[Any, Callable[[], Any]]]:
         The simulation, and a function that resets it and runs its main loop.
     """
     rng = GlobalRandom() if plan.options.global_rng else None
-    held = Held(plan.patches)
+    held = Installation(plan.patches)
 
     def start() -> Any:
         if rng is not None:
@@ -81,11 +81,11 @@ def set_up(plan: Plan, seed: int) -> Iterator[tuple[Any, Callable[[], Any]]]:
             _PLAIN_RUNS.pop()
 
     try:
-        with at_work(plan.plugins, rng):
+        with environment_context(plan.plugins, rng):
             simulation = make_simulation(plan.source)
             yield simulation, start
     finally:
-        held.let_go()
+        held.uninstall()
 
 
 @contextmanager
@@ -112,9 +112,9 @@ def _watched(point: DecisionPoint, begin: Begin) -> Callable[..., Any]:
             return rule(*args, **kwargs)
         end = begin(point.name)
         value = rule(*args, **kwargs)
-        if point.kind == "generator":
+        if point.hook.kind == "generator":
             return generator(value, end)
-        if point.kind == "coroutine":
+        if point.hook.kind == "coroutine":
             return coroutine(value, end)
         end(value)
         return value

@@ -31,7 +31,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.core.reuse import processes_kept
+from simenv_marl.core.reuse import reuse_resources
 from simenv_marl.errors import (
     AgentError,
     BranchError,
@@ -462,7 +462,7 @@ def test_processes_that_are_kept_end_with_what_has_run(started):
 
 
 def test_a_block_that_was_interrupted_before_it_began_keeps_nothing(started):
-    processes_kept().__enter__()  # and it is never left
+    reuse_resources().__enter__()  # and it is never left
     simulate(started[0], seed=1)
     simulation = simulate(started[0], seed=1)
     assert simulation.result == by_its_rule(1)

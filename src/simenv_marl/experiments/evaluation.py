@@ -12,7 +12,7 @@ from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
 from ..core.processes import pack
-from ..core.reuse import processes_kept
+from ..core.reuse import reuse_resources
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.simulate import check_numbers, checked_seeds
 from ..many.spread import import_extra, progress_bar, spread
@@ -260,7 +260,7 @@ def evaluate(
     def is_narrow(outcomes: Mapping[str, Sequence[Outcome]]) -> bool:
         return width is not None and _widest(outcomes, team, baseline, confidence) <= width
 
-    with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar, processes_kept():
+    with progress_bar(len(found) * len(places), "episode") if progress else nullcontext() as bar, reuse_resources():
         outcomes = _play_all(list(found), places, width, play, is_narrow, bar)
     done = len(next(iter(outcomes.values())))
     return Evaluation(_frame(places[:done], outcomes, tuple(metrics), team), baseline, float(confidence))
@@ -334,7 +334,7 @@ def _play_part(
 ) -> list[Outcome]:
     """Play a part of a contender's episodes, in a worker."""
     (plan,) = _plans(contender, simulation, points, options, named).values()
-    with processes_kept():
+    with reuse_resources():
         return _play(plan, seeds, metrics, size, team)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ..core.options import EpisodeOptions
 from ..core.points import Points
 from ..core.processes import pack
-from ..core.reuse import processes_kept
+from ..core.reuse import reuse_resources
 from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
 from ..many.simulate import check_numbers
 from ..many.spread import import_extra, progress_bar, spread
@@ -176,7 +176,7 @@ def _compared(
 
 def _run_missing(arguments: Any, missing: list[Run], workers: int, at_once: int, total: int | None) -> None:
     """Do the missing runs, with a progress bar if ``total`` is given."""
-    with nullcontext() if total is None else progress_bar(total, "run", total - len(missing)) as bar, processes_kept():
+    with nullcontext() if total is None else progress_bar(total, "run", total - len(missing)) as bar, reuse_resources():
         for number in _work(arguments, missing, workers, at_once):
             if bar is not None:
                 bar.update(number)
@@ -306,7 +306,7 @@ def _do_part(*arguments: Any) -> None:
     """Do a part of the runs, in a worker."""
     *others, runs = arguments
     parent = _parents.setdefault(os.getpid(), os.getppid())
-    with processes_kept():
+    with reuse_resources():
         for _ in _do(*others, runs=runs):
             if os.getppid() != parent:  # the parent was killed, so that nothing waits for the results
                 return

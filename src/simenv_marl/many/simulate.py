@@ -10,7 +10,7 @@ from ..core.episode import When
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
-from ..core.reuse import processes_kept
+from ..core.reuse import reuse_resources
 from ..core.session import Session, checked_seed
 from ..errors import OptionValueError, close_after, short_repr
 from .batch import policy_keys, run
@@ -44,7 +44,7 @@ def simulate(
         BaseException: Any exception of the model, a mapping or a policy.
     """
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unanswered=True)
-    with processes_kept():  # policies may branch
+    with reuse_resources():  # policies may branch
         session = Session(plan)
         try:
             session.start(checked_seed(seed), None, When.NEVER)

@@ -6,7 +6,7 @@ from contextlib import suppress
 from math import inf
 from typing import Any
 
-from ..core.reuse import keep, take
+from ..core.reuse import acquire, release
 from ..decision import BY_NAME, Definition
 from ..errors import (
     BranchError,
@@ -148,7 +148,7 @@ class ProcessSimulation(SimulationInterface):
         self.result, link = None, self._link
         link.break_off()
         if link.child is None:
-            link.child = take(self._alike())
+            link.child = acquire(self._alike())
         child = link.child
         if child is not None and child.usable:
             try:
@@ -232,7 +232,7 @@ class ProcessSimulation(SimulationInterface):
         if last and link.child is not None:
             link.break_off()
             child, link.child = link.child, None
-            if not keep(self._alike(), child):
+            if not release(self._alike(), child):
                 child.end()
 
     @property

@@ -18,7 +18,7 @@ class Resource(Protocol):
     def close_input(self) -> None:
         """Ask the resource to end."""
 
-    def end(self) -> None:
+    def close(self) -> None:
         """Wait for the end of the resource."""
 
 
@@ -45,7 +45,7 @@ def reuse_resources() -> Iterator[None]:
         for resource in resources:  # first for all of them, so that they end at the same time
             resource.close_input()
         for resource in resources:
-            resource.end()
+            resource.close()
 
 
 def release(key: Hashable, resource: Resource) -> bool:

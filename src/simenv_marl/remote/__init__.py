@@ -13,7 +13,4 @@
 from .callbacks import CallbackGuard
 from .process import ProcessSimulation
 
-__all__ = [
-    "CallbackGuard",
-    "ProcessSimulation",
-]
+__all__ = ["CallbackGuard", "ProcessSimulation"]

@@ -30,15 +30,9 @@ class RemoteCall:
         self.time: float | None = None
 
     def __getitem__(self, name: str) -> Any:
-        try:
-            return self.__dict__[name]
-        except KeyError:
-            if name not in ("entity", "time"):
-                raise
+        if name in ("entity", "time") and name not in self.__dict__:
             return getattr(self, name)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.__dict__
+        return self.__dict__[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.__dict__)

@@ -6,15 +6,15 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import zip_longest
 from subprocess import DEVNULL, PIPE, TimeoutExpired, run
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from ..errors import ProcessDiedError, ProcessError, short_repr
 from ..simulation import RULE
 from .child import Child
-from .wire import DESCRIPTORS, LONGEST, encode, encode_answer
+from .wire import DESCRIPTORS, encode, encode_answer
 
 OK, NOTE, WRONG = "ok", "note", "wrong"
 
@@ -34,30 +34,19 @@ Outcome = tuple[str, str]
 """The verdict of a test, and what happened."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """The outcome of one test.
-
-    Attributes:
-        tried: What was tried.
-        verdict: "ok", "wrong", or "note" for what may be intended.
-        text: What happened.
-    """
+class Finding(NamedTuple):
+    """The outcome of one test: the verdict is "ok", "wrong", or "note" for what may be intended."""
 
     tried: str
     verdict: str
     text: str
 
 
-@dataclass
 class WireReport:
-    """The findings of ``check_wire``.
+    """The findings of ``check_wire``, one for each test, in the list ``findings``."""
 
-    Attributes:
-        findings: One for each test.
-    """
-
-    findings: list[Finding] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.findings: list[Finding] = []
 
     @property
     def ok(self) -> bool:
@@ -66,7 +55,7 @@ class WireReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as JSON data."""
-        return {"ok": self.ok, "findings": [asdict(finding) for finding in self.findings]}
+        return {"ok": self.ok, "findings": [finding._asdict() for finding in self.findings]}
 
     def __str__(self) -> str:
         lines = [f"{finding.verdict:5}  {finding.tried}: {finding.text}" for finding in self.findings]
@@ -117,7 +106,7 @@ class _Check:
         self._try("two episodes in a row with the same seed", self._repeat)
         for number in sorted({1, (self._decisions + 1) // 2, self._decisions}):
             self._try(f"stop in place of the answer to call {number}", partial(self._repeat, stop=number))
-        self._try("a line of 1 MiB", self._long_lines)
+        self._try("a line of 1 MiB", self._long_line)
         self._try("reseed", self._reseed)
         for what, line in INVALID.items():
             self._try(what, partial(self._refusal, line))
@@ -135,19 +124,14 @@ class _Check:
     def _child(self) -> closing[Child]:
         return closing(Child(self._command, self._timeout))
 
-    def _play(self, child: Child, *, stop: int = 0, reseed: tuple[int, int] = (0, 0), pad: int = 0) -> list[Any]:
-        """Play an episode by the rule.
+    def _play(
+        self, child: Child, *, start: bytes | None = None, stop: int = 0, reseed: tuple[int, int] = (0, 0)
+    ) -> list[dict[str, Any]]:
+        """Play an episode by the rule; return its frames.
 
-        Args:
-            child: The process.
-            stop: The number of the call at which to break it off.
-            reseed: The number of the call before whose answer to reseed, and the seed.
-            pad: The number of blanks in the first two lines.
-
-        Returns:
-            The frames that the process sent.
+        ``start`` replaces the usual line. ``stop`` is the call at which to break off, ``reseed`` a call and a seed.
         """
-        frames = [child.begin(_padded(self._start, pad))]
+        frames = [child.begin(start or self._start)]
         while "end" not in frames[-1]:
             if "decide" in frames[-1]:
                 number = child.number
@@ -155,17 +139,15 @@ class _Check:
                     child.break_off()
                     break
                 before = encode({"reseed": reseed[1]}) if number == reseed[0] else b""
-                child.answer(before + _padded(encode_answer(number, RULE), pad if number == 1 else 0))
+                child.answer(before + encode_answer(number, RULE))
             frames.append(child.next_frame())
         return frames
 
-    def _compare(self, frames: list[Any]) -> Outcome:
+    def _compare(self, frames: list[dict[str, Any]]) -> Outcome:
         """Compare an episode with the first one."""
-        for number, (one, other) in enumerate(zip(self._first, frames, strict=False)):
+        for number, (one, other) in enumerate(zip_longest(self._first, frames)):
             if one != other:
                 return WRONG, f"frame {number} is {short_repr(other)}, and in a new process it was {short_repr(one)}"
-        if len(frames) != len(self._first):
-            return WRONG, f"it sent {len(frames)} frames, and in a new process {len(self._first)}"
         return OK, "the same as in a new process"
 
     # -- tests ------------------------------------------------------------------------------------
@@ -184,10 +166,10 @@ class _Check:
         points = ", ".join(f"{point} {number}" for point, number in count.items())
         if not count:
             return WRONG, "it asked for no decision"
-        last = self._first[-1]
-        if "end" not in last:
+        end = self._first[-1].get("end")
+        if end is None:
             return NOTE, f"it was stopped after {self._most} decisions ({points})"
-        return OK, f"{self._decisions} decisions ({points}), result {short_repr(last['end'].get('result'))}"
+        return OK, f"{self._decisions} decisions ({points}), result {short_repr(end.get('result'))}"
 
     def _repeat(self, stop: int = 0) -> Outcome:
         with self._child() as child:
@@ -199,9 +181,9 @@ class _Check:
                     return NOTE, "it exits after an episode, and is started again for each"
                 raise
 
-    def _long_lines(self) -> Outcome:
+    def _long_line(self) -> Outcome:
         with self._child() as child:
-            return self._compare(self._play(child, pad=PADDING))
+            return self._compare(self._play(child, start=self._start.replace(b"\n", b" " * PADDING + b"\n")))
 
     def _reseed(self) -> Outcome:
         middle, futures = (self._decisions + 1) // 2, []
@@ -256,8 +238,3 @@ class _Check:
             last = done.stderr.decode(errors="replace").strip()[-300:]
             return NOTE, f"it has exited with code {done.returncode}: {last}"
         return OK, "it runs on its own rule, and exits with code 0"
-
-
-def _padded(line: bytes, blanks: int) -> bytes:
-    """Return a line with that number of blanks before its end."""
-    return line if not blanks else line[:-1] + b" " * min(blanks, LONGEST - len(line)) + b"\n"

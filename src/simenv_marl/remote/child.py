@@ -14,7 +14,7 @@ from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen, TimeoutExpired
 from time import monotonic, sleep
 from types import NoneType
-from typing import Any, Final, NoReturn, TypeGuard
+from typing import Any, Final, NoReturn
 
 from ..errors import (
     ProcessDiedError,
@@ -78,15 +78,15 @@ class Child:
         except BaseException:  # an interrupt, too
             self.close(patience=0.0)
             raise
-        version, points, can = hello.get("hello"), hello.get("points"), hello.get("can", [])
+        version, points, can = hello.get("hello"), hello.get("points", ()), hello.get("can", [])
         if version is None:
             self.refuse(hello, f"began with {short_repr(hello)}, not with a hello")
         if type(version) is not int or version != VERSION:
             self.fail(WireError(f"{self} speaks version {short_repr(version)} of the wire; this is version {VERSION}"))
-        if not _are_strings(points) or not _are_strings(can):
-            self.fail(
-                WireError(f'{self} has said {short_repr(hello)}; its "points" and "can" must be lists of strings')
-            )
+        for names in (points, can):
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                what = f'{short_repr(hello)}; its "points" and "can" must be lists of strings'
+                self.fail(WireError(f"{self} has said {what}"))
         self.points: frozenset[str] = frozenset(points)
         self.can: frozenset[str] = frozenset(can)
 
@@ -136,10 +136,9 @@ class Child:
         return frame
 
     def next_frame(self) -> dict[str, Any]:
-        """Wait for the next frame of the episode, and check it.
+        """Wait for the next frame of the episode, a "decide", "update", "remove" or "end", and check it.
 
-        Returns:
-            The frame of a "decide", "update", "remove" or "end". The item "entity" of the first three is set.
+        The first three always get an item "entity".
 
         Raises:
             ProcessDiedError, ProcessTimeoutError: As ``receive``.
@@ -215,7 +214,9 @@ class Child:
             self._wait(self._output, reading, begun, "half a line" if length else "nothing")
             chunk = os.read(reading, CHUNK)
             if not chunk:
-                self._died(half=length > 0)
+                self._wait_for_exit(GRACE)
+                where = " in the middle of a line" if length else ""
+                self.fail(ProcessDiedError(f"{self} has closed its pipe{where}, and {self._exit()}"))
             part, complete, self._rest = chunk.partition(b"\n")
             parts.append(part)
             length += len(part)
@@ -314,10 +315,9 @@ class Child:
             self._writing = -1
 
     def close(self, patience: float = GRACE) -> None:
-        """Close its pipes, and end it and its group. A fork of this process only closes its copies of the pipes.
+        """Close its pipes; after ``patience`` seconds at most, kill it and its group.
 
-        Args:
-            patience: The time in seconds that it has to end by itself.
+        A fork of this process only closes its copies of the pipes.
         """
         if self._closed:
             return
@@ -352,12 +352,6 @@ class Child:
             sleep(pause)
             pause = min(2 * pause, 0.02)
 
-    def _died(self, *, half: bool) -> NoReturn:
-        """Raise the error for a process that closed its pipe, maybe within a line."""
-        self._wait_for_exit(GRACE)
-        where = " in the middle of a line" if half else ""
-        self.fail(ProcessDiedError(f"{self} has closed its pipe{where}, and {self._exit()}"))
-
     def _exit(self) -> str:
         """Describe its exit."""
         code = self.exit_code()
@@ -369,7 +363,3 @@ class Child:
             return f"was killed by {signal.Signals(-code).name}"
         except ValueError:
             return f"was killed by signal {-code}"
-
-
-def _are_strings(value: Any) -> TypeGuard[list[str]]:
-    return isinstance(value, list) and all(isinstance(item, str) for item in value)

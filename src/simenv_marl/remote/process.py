@@ -74,11 +74,12 @@ class ProcessSimulation(SimulationInterface):
         self.timeout, self.env, self.cwd = float(timeout), None if env is None else dict(env), cwd
         self.points = _by_function(points)
         self.result: Any = None
-        self._begin_without_process()
-
-    def _begin_without_process(self) -> None:
         self._child: Child | None = None
-        self._finalizer: Any = None
+        self._finalizer: Any = None  # ends the process with the simulation
+        self._clear()
+
+    def _clear(self) -> None:
+        """Forget the latest episode."""
         self._frame: dict[str, Any] | None = None  # the first frame of an episode that does not run yet
         self._calls: dict[tuple[str, Any], RemoteCall] = {}  # the latest call of each entity at each point
         self._time: float | None = None
@@ -86,12 +87,11 @@ class ProcessSimulation(SimulationInterface):
 
     def __getstate__(self) -> dict[str, Any]:
         points = {getattr(function, BY_NAME): definition for function, definition in self.points.items()}
-        process = dict.fromkeys(["_child", "_finalizer", "_frame", "_calls"])
-        return {**vars(self), **process, "points": points}
+        return {**vars(self), "points": points, "_child": None, "_finalizer": None, "_frame": None, "_calls": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, points=_by_function(state["points"]))
-        self._begin_without_process()
+        self._clear()
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -108,10 +108,9 @@ class ProcessSimulation(SimulationInterface):
             UnknownPointError: It does not have the named points.
         """
         start = encode({"start": {"seed": seed, "options": options or {}}})
-        self.result, self._calls, self._time, self._seed = None, {}, None, None
-        if self._child is None:
-            self._use(acquire(self._key()))
-        child = self._child
+        self.result = None
+        self._clear()
+        child = self._child or acquire(self._key())
         if child is not None:
             child.break_off()
             try:
@@ -121,9 +120,7 @@ class ProcessSimulation(SimulationInterface):
             except ProcessDiedError:
                 if child.exit_code() != 0:
                     raise
-        child = Child(self.command, self.timeout, self.env, self.cwd)
-        self._use(child)
-        self._begin(child, start)
+        self._begin(Child(self.command, self.timeout, self.env, self.cwd), start)
 
     def _key(self) -> tuple[Any, ...]:
         """Return a value that is equal for processes that can replace each other."""
@@ -131,7 +128,7 @@ class ProcessSimulation(SimulationInterface):
         return tuple(self.command), self.timeout, env, self.cwd
 
     def _use(self, child: Child | None) -> None:
-        """Use a process, which ends with the simulation; None: hand over the current one."""
+        """Use a process, or none, from now on."""
         if self._finalizer is not None:
             self._finalizer.detach()
         self._child = child
@@ -139,6 +136,7 @@ class ProcessSimulation(SimulationInterface):
 
     def _begin(self, child: Child, start: bytes) -> None:
         """Begin an episode in a process with a line, and wait for the first frame."""
+        self._use(child)
         missing = [name for name in self._functions() if name not in child.points]
         if missing:
             has = ", ".join(sorted(child.points)) or "none"
@@ -249,11 +247,7 @@ class ProcessSimulation(SimulationInterface):
 
 
 def _words(command: Any) -> list[str]:
-    """Return the program and its arguments.
-
-    Raises:
-        OptionValueError: They are invalid.
-    """
+    """Return the program and its arguments, as strings."""
     words = [command] if isinstance(command, (str, os.PathLike)) else command
     if not isinstance(words, Sequence) or not words or not all(isinstance(word, (str, os.PathLike)) for word in words):
         raise OptionValueError(
@@ -263,11 +257,7 @@ def _words(command: Any) -> list[str]:
 
 
 def _by_function(points: Any) -> dict[Any, Definition]:
-    """Return the definitions by the decision functions of their names.
-
-    Raises:
-        DefinitionError: ``points`` is not a dict from names to definitions.
-    """
+    """Return the definitions by the decision functions of their names."""
     if not isinstance(points, Mapping) or not points:
         raise DefinitionError(
             f"points must be a dict from the process's names to definitions, not {short_repr(points)}"

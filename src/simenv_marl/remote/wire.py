@@ -62,15 +62,7 @@ def encode_answer(number: int, value: Any) -> bytes:
 
 
 def _to_json(value: Any, where: str = "") -> Any:
-    """Convert a value to JSON data: arrays become lists, and numbers that are not finite become objects.
-
-    Args:
-        value: Numbers, strings, booleans, None, arrays, lists, tuples, and dicts with strings as keys.
-        where: The path in the frame, for the error.
-
-    Raises:
-        WireError: It contains something else.
-    """
+    """Convert a value to JSON data; ``where`` is its path in the frame, for the error."""
     if value is None or isinstance(value, (str, bool, int)):
         return value
     if isinstance(value, float):

@@ -208,22 +208,20 @@ class Child:
             WireError: It sent something that is not a frame.
         """
         begun, reading = monotonic(), self._reading
-        part, complete, self._rest = self._rest.partition(b"\n")
-        parts, length = [part], len(part)
+        line, complete, self._rest = self._rest.partition(b"\n")
         while not complete:
-            self._wait(self._output, reading, begun, "half a line" if length else "nothing")
+            self._wait(self._output, reading, begun, "half a line" if line else "nothing")
             chunk = os.read(reading, CHUNK)
             if not chunk:
                 self._wait_for_exit(GRACE)
-                where = " in the middle of a line" if length else ""
+                where = " in the middle of a line" if line else ""
                 self.fail(ProcessDiedError(f"{self} has closed its pipe{where}, and {self._exit()}"))
             part, complete, self._rest = chunk.partition(b"\n")
-            parts.append(part)
-            length += len(part)
-            if length >= LONGEST:
+            line += part
+            if len(line) >= LONGEST:
                 self.fail(WireError(f"{self} has sent a line of more than {LONGEST:,} bytes"))
         try:
-            return decode(b"".join(parts))
+            return decode(line)
         except WireError as error:
             self.fail(WireError(f"{self} has sent {error}"))
 

@@ -92,8 +92,10 @@ def decode(line: bytes) -> dict[str, Any]:
         WireError: The line is not a JSON object in UTF-8.
     """
     try:
-        text = line.decode()
-        frame = (_WITH_OBJECTS if '"float"' in text else _DECODER).decode(text)
+        text = line.decode().strip()
+        frame, end = (_WITH_OBJECTS if '"float"' in text else _DECODER).raw_decode(text)
+        if end < len(text):
+            raise ValueError(f"more follows after {end} characters")
     except (ValueError, RecursionError) as error:
         raise WireError(f"a line that is not JSON in UTF-8 ({describe_error(error)}): {short_repr(line)}") from None
     if not isinstance(frame, dict):

@@ -173,7 +173,8 @@ class ProcessSimulation(SimulationInterface):
                     child.answer(encode_answer(child.number, RULE))
                 frame = child.next_frame()
         except BaseException:
-            child.break_off()
+            if self._child is child:  # otherwise it may serve another simulation already
+                child.break_off()
             raise
         self.result = frame["end"].get("result")
         return TRUNCATED if frame["end"].get("truncated") else None

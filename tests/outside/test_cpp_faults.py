@@ -112,4 +112,4 @@ def test_arrays_and_nested_values_are_decisions(probe):
 
 def process(env):
     """The number of the process of an environment."""
-    return env.simulation._link.child._process.number
+    return env.simulation._child.pid

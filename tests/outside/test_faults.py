@@ -19,7 +19,7 @@ from simenv_marl.errors import (
     WireError,
     WrongThreadError,
 )
-from simenv_marl.remote.child import _Process
+from simenv_marl.remote.child import Child
 from tests.outside.reservoirs import BOTH, INFLOW, PRICE, broken, by_its_rule, reservoirs
 from tests.outside.test_process import all_told, child, ruled
 from tests.processes import alone, descriptors, runs
@@ -91,7 +91,7 @@ def test_in_mid_episode(what):
     number = child(env)
     env.step(RULE)
     env.step(RULE)
-    env.unwrapped.simulation._link.child.timeout = patience(what)
+    env.unwrapped.simulation._child.timeout = patience(what)
     with pytest.raises(kind, match=f"(?s){text}") as caught:
         env.step(RULE)
     assert "there are many words" in str(caught.value)
@@ -112,7 +112,7 @@ def test_at_once(what):
     for _ in range(2):
         with pytest.raises(kind, match=f"(?s){text}"):
             env.reset(seed=1)
-        left = env.unwrapped.simulation._link.child
+        left = env.unwrapped.simulation._child
         assert left is None or not left.usable
     env.close()
 
@@ -161,10 +161,10 @@ def test_a_process_that_does_not_read_is_told_of():
     env = single_env(broken("in mid-episode", "silence", points={"reservoir.inflow": INFLOW}), agent="a")
     env.reset(seed=1)
     simulation = env.unwrapped.simulation
-    simulation._link.child.timeout = 0.3
+    simulation._child.timeout = 0.3
     os.kill(child(env), signal.SIGSTOP)
     with pytest.raises(ProcessTimeoutError, match="sent nothing and read nothing"):
-        simulation._link.child.send(bytes(1 << 20))
+        simulation._child.send(bytes(1 << 20))
     with pytest.raises(ProcessError):
         env.step(np.ones(1))
     env.close()
@@ -193,7 +193,7 @@ def test_a_process_that_writes_much_on_its_standard_error_is_not_held_up():
 
 
 def test_words_without_end_do_not_put_off_the_limit(monkeypatch):
-    monkeypatch.setattr(_Process, "listen", lambda process: True)  # so that there is always more
+    monkeypatch.setattr(Child, "_read_stderr", lambda process: True)  # so that there is always more
     with pytest.raises(ProcessTimeoutError, match="sent nothing"):
         broken("at once", "silence", timeout=1.0).reset()
 
@@ -243,7 +243,7 @@ def fail_many_times() -> None:
         env.reset(seed=1)
         env.step(RULE)
         env.step(RULE)
-        env.unwrapped.simulation._link.child.timeout = 0.3
+        env.unwrapped.simulation._child.timeout = 0.3
         with pytest.raises(ProcessError):
             env.step(RULE)
         env.close()

@@ -57,7 +57,7 @@ def by_rule(env: Any, seed: int, **options: Any) -> Any:
 
 def number(env: Any) -> int:
     """That of the process in which its simulator runs."""
-    found: int = env.simulation._link.child._process.number
+    found: int = env.simulation._child.pid
     return found
 
 

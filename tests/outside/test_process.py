@@ -31,7 +31,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.core.reuse import processes_kept
+from simenv_marl.core.reuse import reuse_resources
 from simenv_marl.errors import (
     AgentError,
     BranchError,
@@ -80,8 +80,8 @@ def make_env():
 
 def child(env):
     """The number of the process of an environment's simulation; None if it has none."""
-    found = env.unwrapped.simulation._link.child
-    return None if found is None else found._process.number
+    found = env.unwrapped.simulation._child
+    return None if found is None else found.pid
 
 
 def all_told(env, seed, choose):
@@ -171,7 +171,7 @@ def test_it_runs_without_an_environment():
         simulation.run()
     simulation.reset(4, {"truncated": True})
     assert simulation.run() is TRUNCATED
-    number = simulation._link.child._process.number
+    number = simulation._child.pid
     simulation.close()
     assert not runs(number)
 
@@ -232,7 +232,7 @@ def test_policies_answer_by_agent_and_by_point():
     simulation = simulate(reservoirs(), {"broker.price": half, "a": lambda observation: np.zeros(1)}, seed=1)
     assert simulation.result["price"] == 0.5
     assert len(seen) == 4
-    assert simulation._link.child is None
+    assert simulation._child is None
     assert simulate(reservoirs(), seed=1).result == by_its_rule(1)
     env = aec_env(reservoirs(), "reservoir.inflow", policies={"broker.price": lambda observation: 2})  # was not named
     all_told(env, 1, ruled)
@@ -403,7 +403,7 @@ def _played_out_plainly(env):
 def test_a_process_that_cannot_reseed_says_so(make_env):
     env = make_env(single_env, broken("in mid-episode", "exit"), "reservoir.inflow", agent="a")
     env.reset(seed=1)
-    env.unwrapped.simulation._link.child.can = frozenset()
+    env.unwrapped.simulation._child.can = frozenset()
     with pytest.raises(BranchError, match="reseed"):
         env.unwrapped.simulation.reseed(3)
 
@@ -449,7 +449,7 @@ def test_processes_that_are_kept_end_with_what_has_run(started):
     numbers = []
 
     def notice(simulation):
-        numbers.append(simulation._link.child._process.number)
+        numbers.append(simulation._child.pid)
         return 1 / (3 - len(numbers))
 
     with pytest.raises(ZeroDivisionError):
@@ -462,13 +462,13 @@ def test_processes_that_are_kept_end_with_what_has_run(started):
 
 
 def test_a_block_that_was_interrupted_before_it_began_keeps_nothing(started):
-    processes_kept().__enter__()  # and it is never left
+    reuse_resources().__enter__()  # and it is never left
     simulate(started[0], seed=1)
     simulation = simulate(started[0], seed=1)
     assert simulation.result == by_its_rule(1)
     simulation = reservoirs()
     simulation.reset(1)
-    number = simulation._link.child._process.number
+    number = simulation._child.pid
     simulation.close()
     assert not runs(number)
 
@@ -578,7 +578,7 @@ def test_a_fork_ends_no_process_of_its_parent(make_env):
         code = 1
         try:
             simulation = env.unwrapped.simulation
-            simulation._link.child.end()
+            simulation._child.close()
             del simulation
             env.close()
             code = 0
@@ -596,7 +596,7 @@ def test_the_process_ends_with_the_one_that_has_started_it():
     script = (
         "import os; from tests.outside.reservoirs import reservoirs; from simenv_marl import aec_env;"
         "env = aec_env(reservoirs()); env.reset(seed=1);"
-        "print(env.unwrapped.simulation._link.child._process.number, flush=True); os._exit(1)"
+        "print(env.unwrapped.simulation._child.pid, flush=True); os._exit(1)"
     )
     told_ = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=60, cwd=Path.cwd())
     number = int(told_.stdout)

@@ -13,13 +13,6 @@ int loop(callback each, int times, const int *stopped)
     return number;
 }
 
-/* Call back until the callback says so, which need not ever be. */
-void loop_until_told(callback each)
-{
-    while (each(0) >= 0)
-        ;
-}
-
 /* Call back so often, with an interrupt that comes just before one of the calls. */
 void loop_interrupted(callback each, int times, int at)
 {

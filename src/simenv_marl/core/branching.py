@@ -28,7 +28,7 @@ from ..errors import (
 )
 from .forking import Standing, end_with
 from .processes import pack_error, pack_plainly, unpack, unpack_error
-from .reuse import processes_kept
+from .reuse import reuse_resources
 from .rng import is_seed, process_kept, seed_process
 
 Result = TypeVar("Result")
@@ -100,7 +100,7 @@ def branch(
             ' method="replay"'
         )
     if obstacles or not forks or method == "replay":
-        with processes_kept():
+        with reuse_resources():
             return [_replayed(env, view, function, number) for number in range(n)]
     return _forked(env, _standing_alike(function, Standing(loops)), n, time_limit)
 

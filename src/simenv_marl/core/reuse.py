@@ -1,14 +1,14 @@
-"""Keeps processes while many simulations run one after the other, to reuse them for equal simulations."""
+"""Reuses resources, such as processes, for equal simulations that run one after the other."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable
-from contextvars import ContextVar, Token
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Final, Protocol
-from weakref import ref
 
 
-class Reusable(Protocol):
+class Resource(Protocol):
     """A resource that can serve several simulations, one after the other."""
 
     @property
@@ -18,65 +18,50 @@ class Reusable(Protocol):
     def close_input(self) -> None:
         """Ask the resource to end."""
 
-    def end(self) -> None:
+    def close(self) -> None:
         """Wait for the end of the resource."""
 
 
-Kept = dict[Hashable, list[Any]]
-"""Kept processes, by the arguments that started them."""
+_POOL: Final[ContextVar[dict[Hashable, list[Resource]] | None]] = ContextVar("simenv_marl.reuse", default=None)
+"""The free resources, by the arguments that made them. None outside a block of ``reuse_resources``."""
 
 
-class processes_kept:  # noqa: N801 - it is used as a function
-    """Keep the processes of closed simulations for new ones, until the end of the block.
+@contextmanager
+def reuse_resources() -> Iterator[None]:
+    """Reuse the resources of closed simulations for new ones, until the end of the block.
 
     Starting a process often takes longer than an episode. Within another such block this does nothing.
     """
-
-    __slots__ = ("__weakref__", "_token", "kept")
-
-    def __init__(self) -> None:
-        self.kept: Kept = {}
-        self._token: Token[ref[processes_kept] | None] | None = None
-
-    def __enter__(self) -> None:
-        if _block() is None:
-            self._token = _BLOCK.set(ref(self))
-
-    def __exit__(self, *raised: object) -> None:
-        if self._token is None:
-            return
-        _BLOCK.reset(self._token)
-        children = [child for alike in self.kept.values() for child in alike]
-        for child in children:  # first for all of them, so that they end at the same time
-            child.close_input()
-        for child in children:
-            child.end()
+    if _POOL.get() is not None:
+        yield
+        return
+    pool: dict[Hashable, list[Resource]] = {}
+    token = _POOL.set(pool)
+    try:
+        yield
+    finally:
+        _POOL.reset(token)
+        resources = [resource for alike in pool.values() for resource in alike]
+        for resource in resources:  # first for all of them, so that they end at the same time
+            resource.close_input()
+        for resource in resources:
+            resource.close()
 
 
-_BLOCK: Final[ContextVar[ref[processes_kept] | None]] = ContextVar("simenv_marl.processes_kept", default=None)
-"""The current block. Weak: after an interrupt before it was entered, a block is never left."""
-
-
-def _block() -> processes_kept | None:
-    found = _BLOCK.get()
-    return None if found is None else found()
-
-
-def keep(key: Hashable, child: Reusable) -> bool:
-    """Keep a process if a block is active; return whether it is kept."""
-    block = _block()
-    if block is None or not child.usable:
+def release(key: Hashable, resource: Resource) -> bool:
+    """Leave a resource to later simulations; return False if it is not usable, or if there is no block."""
+    pool = _POOL.get()
+    if pool is None or not resource.usable:
         return False
-    block.kept.setdefault(key, []).append(child)
+    pool.setdefault(key, []).append(resource)
     return True
 
 
-def take(key: Hashable) -> Any:
-    """Return a kept process that was started in the same way; None if there is none."""
-    block = _block()
-    alike = [] if block is None else block.kept.get(key, [])
+def acquire(key: Hashable) -> Any:
+    """Return a usable resource that was released under an equal key; None if there is none."""
+    alike = (_POOL.get() or {}).get(key, [])
     while alike:
-        child = alike.pop()
-        if child.usable:
-            return child
+        resource = alike.pop()
+        if resource.usable:
+            return resource
     return None

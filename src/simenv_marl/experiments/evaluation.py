@@ -15,7 +15,7 @@ from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
 from ..core.processes import pack
-from ..core.reuse import processes_kept
+from ..core.reuse import reuse_resources
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.spread import import_extra, progress_bar, spread
 from .runner import (
@@ -257,7 +257,7 @@ def evaluate(
         pack((simulation, runner))
     columns, rows = (*RUN_COLUMNS, *runner.metrics), {name: list[Any]() for name in by_name}
     done = 0
-    with progress_bar(len(plans) * len(all_seeds), "episode") if progress else nullcontext() as bar, processes_kept():
+    with progress_bar(len(plans) * len(all_seeds), "episode") if progress else nullcontext() as bar, reuse_resources():
         while True:
             batch = all_seeds[done : _next_check(done, len(all_seeds), width)]
             for name, plan in plans.items():
@@ -293,7 +293,7 @@ def _run_part(simulation: Any, runner: Runner, name: str, seeds: list[int], plan
     def report(seed: int, outcome: Outcome) -> None:
         rows[seed] = [(name, seed, *row) for row in runner.rows(outcome)]
 
-    with processes_kept():
+    with reuse_resources():
         runner.run(plan or runner.plan(simulation, name), seeds, report)
     return [row for seed in seeds for row in rows[seed]]
 

@@ -17,7 +17,7 @@ from ..core.plan import Plan
 from ..core.points import Points
 from ..core.processes import pack
 from ..core.provenance import as_json, describe, source_name
-from ..core.reuse import processes_kept
+from ..core.reuse import reuse_resources
 from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
 from ..many.spread import import_extra, progress_bar, spread
 from .runner import (
@@ -232,7 +232,7 @@ def _prepare(make: Any, runner: Runner, key: str, contender: str) -> tuple[Plan,
 
 def _run_part(make: Any, runner: Runner, folder: Path, session: str, runs: Sequence[Run], bar: Any = None) -> None:
     """Do runs and store their results."""
-    with closing(Writer(folder, session)) as writer, processes_kept():
+    with closing(Writer(folder, session)) as writer, reuse_resources():
         for (key, contender), group in groupby(runs, lambda run: run[:2]):
             _run_seeds(make, runner, writer, key, contender, [seed for *_, seed in group], bar)
 

@@ -20,7 +20,7 @@ from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.episode import Episode
 from ..core.plan import DeferredPolicy, Plan
 from ..core.point import Point
-from ..core.reuse import processes_kept
+from ..core.reuse import reuse_resources
 from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.spaces import duplicate
@@ -274,7 +274,7 @@ def run(
     Raises:
         BaseException: Any exception of a model, a mapping, a policy or ``finish``. All simulations are unwound.
     """
-    with outside_simulation(), processes_kept():
+    with outside_simulation(), reuse_resources():
         _Batches(plan, seeds, size, finish, watcher).run()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
-from ..core.reuse import processes_kept
+from ..core.reuse import reuse_resources
 from ..core.session import Session, checked_seed
 from ..errors import OptionValueError, close_after, short_repr
 from .batch import policy_keys, run
@@ -43,7 +43,7 @@ def simulate(
         BaseException: Any exception of the model, a mapping or a policy.
     """
     plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unattended=True)
-    with processes_kept():  # policies may branch
+    with reuse_resources():  # policies may branch
         session = Session(plan)
         try:
             session.start(checked_seed(seed), None)

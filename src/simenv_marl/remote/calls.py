@@ -30,15 +30,9 @@ class RemoteCall:
         self.time: float | None = None
 
     def __getitem__(self, name: str) -> Any:
-        try:
-            return self.__dict__[name]
-        except KeyError:
-            if name not in ("entity", "time"):
-                raise
+        if name in ("entity", "time") and name not in self.__dict__:
             return getattr(self, name)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.__dict__
+        return self.__dict__[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.__dict__)
@@ -58,36 +52,28 @@ class RemoteCall:
         return f"RemoteCall({self.point}, entity={self.entity!r}, time={self.time!r}{arguments})"
 
 
-class Point(NamedTuple):
-    """The functions that represent a decision point of a simulator.
-
-    Attributes:
-        decide: Its decision function. Called with a ``RemoteCall``, it returns the decision, or ``RULE``.
-        remove: Called with the latest call of an entity that is gone: it ends the entity's agent.
-    """
+class PointFunctions(NamedTuple):
+    """The functions that represent a decision point of a simulator."""
 
     decide: Callable[[RemoteCall], Any]
+    """The decision function: it returns the decision, or ``RULE``."""
+
     remove: Callable[[RemoteCall], None]
+    """Ends the agent of an entity that is gone."""
 
 
 @cache
-def point_named(name: str) -> Point:
+def point_functions(name: str) -> PointFunctions:
     """Return the functions that represent decision points of that name, in all simulators."""
-
-    def decide(call: RemoteCall) -> Any:
-        return RULE
-
-    def remove(call: RemoteCall) -> None:
-        pass
-
-    deciding, removing = _hook(decide, name), _hook(remove, f"{name} (removed)")
-    functions = Point(deciding.stand_in(), removing.stand_in())
-    point_for(deciding).removed_by[functions.remove] = None
+    decide_hook = _named_hook(lambda call: RULE, name)
+    remove_hook = _named_hook(lambda call: None, f"{name} (removed)")
+    functions = PointFunctions(decide_hook.stand_in(), remove_hook.stand_in())
+    point_for(decide_hook).removed_by[functions.remove] = None
     return functions
 
 
-def _hook(function: Any, name: str) -> Hook:
-    """Return the hook of a function that is found by a name of its own."""
+def _named_hook(function: Any, name: str) -> Hook:
+    """Return the hook of a function that is found by a name, not in a module."""
     setattr(function, BY_NAME, name)
     function.__name__, function.__qualname__ = name.rpartition(".")[2], name
     hook = Hook(function, name)

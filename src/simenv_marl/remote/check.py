@@ -5,46 +5,48 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from contextlib import closing
 from functools import partial
+from itertools import zip_longest
 from subprocess import DEVNULL, PIPE, TimeoutExpired, run
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from ..errors import ProcessDiedError, ProcessError, ProcessTimeoutError, short_repr
+from ..errors import ProcessDiedError, ProcessError, short_repr
+from ..simulation import RULE
 from .child import Child
-from .wire import DESCRIPTORS, LONGEST, STOP, encode
+from .wire import DESCRIPTORS, encode, encode_answer
 
 OK, NOTE, WRONG = "ok", "note", "wrong"
 
 PADDING: Final = 1 << 20
-"""How many blanks make a line long: longer than any pipe's buffer."""
+"""The number of blanks in a long line, which is longer than any pipe's buffer."""
+
+INVALID: Final = {
+    "an answer with the number of another call": encode({"act": 10**6, "rule": True}),
+    "a frame that does not exist": encode({"desire": 1}),
+    "a line that is not JSON": b"hello?\n",
+    "half a line, then the end of its input": b'{"act',
+    "the end of its input in mid-episode": b"",
+}
+"""What a simulator must refuse in place of an answer. Its input ends after a line without an end."""
+
+Outcome = tuple[str, str]
+"""The verdict of a test, and what happened."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What has come out of one thing that was tried.
-
-    Attributes:
-        tried: What was tried.
-        verdict: "ok", "wrong", or "note" for what may be meant to be so.
-        text: What was seen.
-    """
+class Finding(NamedTuple):
+    """The outcome of one test: the verdict is "ok", "wrong", or "note" for what may be intended."""
 
     tried: str
     verdict: str
     text: str
 
 
-@dataclass
 class WireReport:
-    """What ``check_wire`` has found.
+    """The findings of ``check_wire``, one for each test, in the list ``findings``."""
 
-    Attributes:
-        findings: One for each thing that was tried.
-    """
-
-    findings: list[Finding] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.findings: list[Finding] = []
 
     @property
     def ok(self) -> bool:
@@ -52,8 +54,8 @@ class WireReport:
         return all(finding.verdict != WRONG for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as JSON has it."""
-        return {"ok": self.ok, "findings": [asdict(finding) for finding in self.findings]}
+        """Return the report as JSON data."""
+        return {"ok": self.ok, "findings": [finding._asdict() for finding in self.findings]}
 
     def __str__(self) -> str:
         lines = [f"{finding.verdict:5}  {finding.tried}: {finding.text}" for finding in self.findings]
@@ -69,174 +71,126 @@ def check_wire(
     decisions: int = 1000,
     timeout: float = 30.0,
 ) -> WireReport:
-    """Play with a simulator, and say what it does wrong.
+    """Run episodes of a simulator, and report its errors in the use of the protocol.
 
-    Episodes by its rule, one after the other and in a process of their own; episodes that are broken off; long lines;
-    ``reseed``; frames that it must refuse; an input that is closed; and a run without an environment.
+    The check runs episodes by the simulator's rule, in one process and in new ones; breaks episodes off; sends long
+    lines, ``reseed`` and invalid frames; closes the input; and runs the simulator without an environment.
 
     Args:
         command: The program and its arguments.
-        options: What ``start`` is to bring.
-        seed: Of the episodes.
-        decisions: After how many decisions an episode that does not end is broken off.
-        timeout: For how many seconds to wait for each line.
+        options: The options that ``start`` brings.
+        seed: The seed of the episodes.
+        decisions: The number of decisions after which an episode is broken off.
+        timeout: The time to wait for each line, in seconds.
     """
-    return _Check(list(command), {"seed": seed, "options": dict(options or {})}, decisions, timeout).made()
+    start = encode({"start": {"seed": seed, "options": dict(options or {})}})
+    return _Check(list(command), start, decisions, timeout).run()
 
 
 class _Check:
-    """One check of a simulator."""
+    """A check of one simulator."""
 
-    def __init__(self, command: list[str], start: dict[str, Any], most: int, timeout: float) -> None:
-        self._command, self._most, self._timeout = command, most, timeout
-        self._start = encode({"start": start})
+    def __init__(self, command: list[str], start: bytes, most: int, timeout: float) -> None:
+        self._command, self._start, self._most, self._timeout = command, start, most, timeout
         self._report = WireReport()
-        self._first: list[dict[str, Any]] = []  # what an episode by its rule is, in a new process
+        self._first: list[dict[str, Any]] = []  # the frames of an episode by the rule, in a new process
+        self._decisions = 0  # of that episode
 
-    def made(self) -> WireReport:
-        """Try everything."""
+    def run(self) -> WireReport:
+        """Run all tests; if a simulator fails one of the first two, only these."""
         self._try("starts, and says hello", self._hello)
         if self._report.ok:
             self._try("an episode by its own rule", self._episode)
         if not self._report.ok:
             return self._report
-        self._try("two episodes in a row with the same seed", self._two)
-        for number in sorted({1, (self._decisions + 1) // 2, self._decisions} - {0}):
-            self._try(f"stop in place of the answer to call {number}", partial(self._stop, number))
-        self._try("a line of 1 MiB", self._long)
+        self._try("two episodes in a row with the same seed", self._repeat)
+        for number in sorted({1, (self._decisions + 1) // 2, self._decisions}):
+            self._try(f"stop in place of the answer to call {number}", partial(self._repeat, stop=number))
+        self._try("a line of 1 MiB", self._long_line)
         self._try("reseed", self._reseed)
-        for what, line in (
-            ("an answer with the number of another call", encode({"act": 10**6, "rule": True})),
-            ("a frame that does not exist", encode({"desire": 1})),
-            ("a line that is not JSON", b"hello?\n"),
-            ("half a line, then the end of its input", b'{"act'),
-            ("the end of its input in mid-episode", b""),
-        ):
+        for what, line in INVALID.items():
             self._try(what, partial(self._refusal, line))
-        self._try("the end of its input between episodes", self._idle)
-        self._try("a run without an environment", self._alone)
+        self._try("the end of its input between episodes", self._end_of_input)
+        self._try("a run without an environment", self._plain_run)
         return self._report
 
-    def _try(self, tried: str, attempt: Callable[[], tuple[str, str]]) -> None:
+    def _try(self, tried: str, test: Callable[[], Outcome]) -> None:
         try:
-            verdict, text = attempt()
+            verdict, text = test()
         except ProcessError as error:
             verdict, text = WRONG, str(error)
         self._report.findings.append(Finding(tried, verdict, text))
 
-    @property
-    def _decisions(self) -> int:
-        return sum("decide" in frame for frame in self._first)
+    def _child(self) -> closing[Child]:
+        return closing(Child(self._command, self._timeout))
 
-    @contextmanager
-    def _child(self) -> Any:
-        child = Child(self._command, self._timeout)
-        try:
-            yield child
-        finally:
-            child.end()
+    def _play(
+        self, child: Child, *, start: bytes | None = None, stop: int = 0, reseed: tuple[int, int] = (0, 0)
+    ) -> list[dict[str, Any]]:
+        """Play an episode by the rule; return its frames.
 
-    def _play(self, child: Child, *, stop: int = 0, reseed: tuple[int, int] = (0, 0), pad: int = 0) -> list[Any]:
-        """Play an episode by the rule.
-
-        Args:
-            child: The process.
-            stop: In place of the answer to which call to break it off.
-            reseed: Before the answer to which call to send a reseed, and with which seed.
-            pad: How many blanks to put into the first two lines.
-
-        Returns:
-            The frames that came.
+        ``start`` replaces the usual line. ``stop`` is the call at which to break off, ``reseed`` a call and a seed.
         """
-        frames, number = [], 0
-        child.send(_padded(self._start, pad))
-        while True:
-            frame = child.receive()
-            child.may_exit = False
-            frames.append(frame)
-            if "end" in frame:
-                child.check_end(frame["end"])
-                child.may_exit = True
-                return frames
-            if "decide" not in frame:
-                if "error" in frame:
-                    child.fail(ProcessError(f"it has sent {short_repr(frame)}"))
-                if not {"remove", "update"} & frame.keys():
-                    child.fail(ProcessError(f"it sent {short_repr(frame)}, which is not a frame of the wire"))
-                child.check_named(frame, frame.get("update", frame.get("remove")))
-                continue
-            number += 1
-            if type(frame["decide"]) is not int or frame["decide"] != number:
-                child.fail(ProcessError(f"call {number} was due, but it sent {short_repr(frame)}"))
-            child.check_named(frame, frame.get("entity"))
-            if number == stop or number == self._most:
-                child.send(STOP)
-                child.may_exit = True
-                return frames
-            before = encode({"reseed": reseed[1]}) if number == reseed[0] else b""
-            child.send(before + _padded(encode({"act": number, "rule": True}), pad if number == 1 else 0))
+        frames = [child.begin(start or self._start)]
+        while "end" not in frames[-1]:
+            if "decide" in frames[-1]:
+                number = child.number
+                if number in (stop, self._most):
+                    child.break_off()
+                    break
+                before = encode({"reseed": reseed[1]}) if number == reseed[0] else b""
+                child.answer(before + encode_answer(number, RULE))
+            frames.append(child.next_frame())
+        return frames
 
-    # -- what is tried ----------------------------------------------------------------------------
-
-    def _hello(self) -> tuple[str, str]:
-        with self._child() as child:
-            points = ", ".join(sorted(child.points))
-            return (OK, f"points {points}; can {', '.join(sorted(child.can)) or 'nothing else'}") if points else (
-                WRONG, "it has no points"
-            )  # fmt: skip
-
-    def _episode(self) -> tuple[str, str]:
-        with self._child() as child:
-            self._first = self._play(child)
-            count = Counter(frame["point"] for frame in self._first if "decide" in frame)
-            told = ", ".join(f"{point} {number}" for point, number in count.items())
-            if not count:
-                return WRONG, "it asked for no decision"
-            if "end" not in self._first[-1]:
-                return NOTE, f"it was stopped after {self._most} decisions ({told})"
-            return (
-                OK,
-                f"{self._decisions} decisions ({told}), result {short_repr(self._first[-1]['end'].get('result'))}",
-            )
-
-    def _two(self) -> tuple[str, str]:
-        with self._child() as child:
-            self._play(child)
-            return self._again(child)
-
-    def _again(self, child: Child) -> tuple[str, str]:
-        """Play an episode in a process that has played one, unless it has exited after that."""
-        try:
-            return self._compared(self._play(child))
-        except ProcessDiedError:
-            if child.may_exit and child.exit_code() == 0:
-                return NOTE, "it exits after an episode, and is started again for each"
-            raise
-
-    def _compared(self, frames: list[Any]) -> tuple[str, str]:
-        for number, (one, other) in enumerate(zip(self._first, frames, strict=False)):
+    def _compare(self, frames: list[dict[str, Any]]) -> Outcome:
+        """Compare an episode with the first one."""
+        for number, (one, other) in enumerate(zip_longest(self._first, frames)):
             if one != other:
                 return WRONG, f"frame {number} is {short_repr(other)}, and in a new process it was {short_repr(one)}"
-        if len(frames) != len(self._first):
-            return WRONG, f"it sent {len(frames)} frames, and in a new process {len(self._first)}"
         return OK, "the same as in a new process"
 
-    def _stop(self, number: int) -> tuple[str, str]:
-        with self._child() as child:
-            self._play(child, stop=number)
-            return self._again(child)
+    # -- tests ------------------------------------------------------------------------------------
 
-    def _long(self) -> tuple[str, str]:
+    def _hello(self) -> Outcome:
         with self._child() as child:
-            return self._compared(self._play(child, pad=PADDING))
+            if not child.points:
+                return WRONG, "it has no points"
+            can = ", ".join(sorted(child.can)) or "nothing else"
+            return OK, f"points {', '.join(sorted(child.points))}; can {can}"
 
-    def _reseed(self) -> tuple[str, str]:
+    def _episode(self) -> Outcome:
         with self._child() as child:
-            if "reseed" not in child.can:
-                return NOTE, 'the "can" of its hello does not list "reseed": no branches with other futures'
+            self._first, self._decisions = self._play(child), child.number
+        count = Counter(frame["point"] for frame in self._first if "decide" in frame)
+        points = ", ".join(f"{point} {number}" for point, number in count.items())
+        if not count:
+            return WRONG, "it asked for no decision"
+        end = self._first[-1].get("end")
+        if end is None:
+            return NOTE, f"it was stopped after {self._most} decisions ({points})"
+        return OK, f"{self._decisions} decisions ({points}), result {short_repr(end.get('result'))}"
+
+    def _repeat(self, stop: int = 0) -> Outcome:
+        with self._child() as child:
+            self._play(child, stop=stop)
+            try:
+                return self._compare(self._play(child))
+            except ProcessDiedError:
+                if child.number == 0 and child.exit_code() == 0:
+                    return NOTE, "it exits after an episode, and is started again for each"
+                raise
+
+    def _long_line(self) -> Outcome:
+        with self._child() as child:
+            return self._compare(self._play(child, start=self._start.replace(b"\n", b" " * PADDING + b"\n")))
+
+    def _reseed(self) -> Outcome:
         middle, futures = (self._decisions + 1) // 2, []
         for seed in (11, 11, 12):
             with self._child() as child:
+                if "reseed" not in child.can:
+                    return NOTE, 'the "can" of its hello does not list "reseed": no branches with other futures'
                 futures.append(self._play(child, reseed=(middle, seed)))
         one, again, other = futures
         if one != again:
@@ -245,36 +199,36 @@ class _Check:
             return NOTE, "two seeds have led to the same future; is nothing in the model random?"
         return OK, f"at call {middle}, two seeds lead to two futures, and the same seed to the same future"
 
-    def _refusal(self, line: bytes) -> tuple[str, str]:
+    def _refusal(self, line: bytes) -> Outcome:
         with self._child() as child:
-            child.send(self._start)
-            while "decide" not in child.receive():
-                pass
-            child.send(line)
+            frame = child.begin(self._start)
+            while "decide" not in frame:
+                frame = child.next_frame()
+            child.answer(line)
             if not line.endswith(b"\n"):
                 child.close_input()
-            try:
-                frame = child.receive()
-            except ProcessTimeoutError:
-                return WRONG, f"it neither sends an error nor ends within {self._timeout:g} s"
-            except ProcessDiedError:
-                return OK, "it ends"
-            if "error" in frame:
-                return OK, f"it sends the error {short_repr(frame['error'])}"
-            return WRONG, f"it continues with {short_repr(frame)}"
+            last = self._last_frame(child)
+        if last is None:
+            return OK, "it ends"
+        if "error" in last:
+            return OK, f"it sends the error {short_repr(last['error'])}"
+        return WRONG, f"it continues with {short_repr(last)}"
 
-    def _idle(self) -> tuple[str, str]:
+    def _end_of_input(self) -> Outcome:
         with self._child() as child:
             self._play(child)
             child.close_input()
-            try:
-                return WRONG, f"it sends {short_repr(child.receive())}"
-            except ProcessTimeoutError:
-                return WRONG, f"it does not end within {self._timeout:g} s"
-            except ProcessDiedError:
-                return OK, "it ends"
+            last = self._last_frame(child)
+        return (OK, "it ends") if last is None else (WRONG, f"it sends {short_repr(last)}")
 
-    def _alone(self) -> tuple[str, str]:
+    def _last_frame(self, child: Child) -> dict[str, Any] | None:
+        """Return what a process that should end sends before; None if it ends at once."""
+        try:
+            return child.receive()
+        except ProcessDiedError:
+            return None
+
+    def _plain_run(self) -> Outcome:
         env = {name: value for name, value in os.environ.items() if name != DESCRIPTORS}
         try:
             done = run(self._command, env=env, stdin=DEVNULL, stdout=DEVNULL, stderr=PIPE, timeout=self._timeout)
@@ -284,8 +238,3 @@ class _Check:
             last = done.stderr.decode(errors="replace").strip()[-300:]
             return NOTE, f"it has exited with code {done.returncode}: {last}"
         return OK, "it runs on its own rule, and exits with code 0"
-
-
-def _padded(line: bytes, blanks: int) -> bytes:
-    """A line with so many blanks before its end."""
-    return line if not blanks else line[:-1] + b" " * min(blanks, LONGEST - len(line)) + b"\n"

@@ -2,11 +2,11 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from math import inf
 from typing import Any
+from weakref import finalize
 
-from ..core.reuse import keep, take
+from ..core.reuse import acquire, release
 from ..decision import BY_NAME, Definition
 from ..errors import (
     BranchError,
@@ -14,7 +14,6 @@ from ..errors import (
     OptionValueError,
     ProcessDiedError,
     ProcessError,
-    SimEnvError,
     SimulationError,
     UnknownPointError,
     WireError,
@@ -22,54 +21,9 @@ from ..errors import (
     short_repr,
 )
 from ..simulation import RULE, TRUNCATED, SimulationInterface
-from .calls import RemoteCall, point_named
+from .calls import RemoteCall, point_functions
 from .child import Child
-from .wire import STOP, answer, encode
-
-
-class _Link:
-    """The process of a simulation, and the state of its episode. Never copied.
-
-    Attributes:
-        child: The process; None until one was started.
-        state: "idle" between episodes, "waits" for the answer to a call, "busy" with its model, or "stopped".
-        first: The first frame of an episode that has begun and does not run yet.
-        number: The number of the latest call.
-        calls: The latest call of each entity at each point.
-        time: The latest time of the process; None if it told none.
-        seed: The seed with which it has to reseed before it goes on; None if it need not.
-    """
-
-    __slots__ = ("calls", "child", "first", "number", "seed", "state", "time")
-
-    def __init__(self) -> None:
-        self.child: Child | None = None
-        self.state = "idle"
-        self.begin(None)
-
-    def begin(self, first: dict[str, Any] | None) -> None:
-        """Begin an episode with its first frame."""
-        self.first, self.number = first, 0
-        self.seed: int | None = None
-        self.calls: dict[tuple[str, Any], RemoteCall] = {}
-        self.time: float | None = None
-        if first is not None:
-            self.state = "waits" if "decide" in first else "idle" if "end" in first else "busy"
-            if type(first.get("time")) in (float, int):
-                with suppress(OverflowError):  # reported when the frame is read
-                    self.time = float(first["time"])
-
-    def break_off(self) -> None:
-        """End a running episode: a waiting process unwinds, a busy one is ended."""
-        child, state = self.child, self.state
-        if child is None or not child.usable:
-            return
-        if state == "waits":
-            self.state, child.may_exit = "stopped", True
-            with suppress(SimEnvError):  # it is ended then, and the next episode starts a new one
-                child.send(STOP)
-        elif state == "busy":
-            child.end(patience=0.0)
+from .wire import encode, encode_answer
 
 
 class ProcessSimulation(SimulationInterface):
@@ -120,15 +74,24 @@ class ProcessSimulation(SimulationInterface):
         self.timeout, self.env, self.cwd = float(timeout), None if env is None else dict(env), cwd
         self.points = _by_function(points)
         self.result: Any = None
-        self._link = _Link()
+        self._child: Child | None = None
+        self._finalizer: Any = None  # ends the process with the simulation
+        self._clear()
+
+    def _clear(self) -> None:
+        """Forget the latest episode."""
+        self._frame: dict[str, Any] | None = None  # the first frame of an episode that does not run yet
+        self._calls: dict[tuple[str, Any], RemoteCall] = {}  # the latest call of each entity at each point
+        self._time: float | None = None
+        self._seed: int | None = None  # the seed to send with the next answer
 
     def __getstate__(self) -> dict[str, Any]:
         points = {getattr(function, BY_NAME): definition for function, definition in self.points.items()}
-        return {**vars(self), "points": points, "_link": None}
+        return {**vars(self), "points": points, "_child": None, "_finalizer": None, "_frame": None, "_calls": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self.points, self._link = _by_function(state["points"]), _Link()
+        vars(self).update(state, points=_by_function(state["points"]))
+        self._clear()
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -145,47 +108,45 @@ class ProcessSimulation(SimulationInterface):
             UnknownPointError: It does not have the named points.
         """
         start = encode({"start": {"seed": seed, "options": options or {}}})
-        self.result, link = None, self._link
-        link.break_off()
-        if link.child is None:
-            link.child = take(self._alike())
-        child = link.child
-        if child is not None and child.usable:
+        self.result = None
+        self._clear()
+        child = self._child or acquire(self._key())
+        if child is not None:
+            child.break_off()
             try:
-                self._begin(child, start)
-                return
+                if child.usable:
+                    self._begin(child, start)
+                    return
             except ProcessDiedError:
-                if not child.may_exit or child.exit_code() != 0:
+                if child.exit_code() != 0:
                     raise
-        link.child, link.state = Child(self.command, self.timeout, self.env, self.cwd), "idle"
-        self._begin(link.child, start)
+        self._begin(Child(self.command, self.timeout, self.env, self.cwd), start)
 
-    def _alike(self) -> tuple[Any, ...]:
-        """Return the values that are equal for processes that can replace each other."""
+    def _key(self) -> tuple[Any, ...]:
+        """Return a value that is equal for processes that can replace each other."""
         env = None if self.env is None else tuple(sorted(self.env.items()))
         return tuple(self.command), self.timeout, env, self.cwd
 
+    def _use(self, child: Child | None) -> None:
+        """Use a process, or none, from now on."""
+        if self._finalizer is not None:
+            self._finalizer.detach()
+        self._child = child
+        self._finalizer = None if child is None else finalize(self, child.close)
+
     def _begin(self, child: Child, start: bytes) -> None:
-        """Send the line that starts an episode, and wait for the first frame."""
-        link = self._link
-        stopped, link.state = link.state == "stopped", "busy"
+        """Begin an episode in a process with a line, and wait for the first frame."""
+        self._use(child)
+        missing = [name for name in self._functions() if name not in child.points]
+        if missing:
+            has = ", ".join(sorted(child.points)) or "none"
+            child.fail(UnknownPointError(f"{child} has no decision point {', '.join(missing)}; it has {has}"))
         try:
-            missing = [name for name in self._names() if name not in child.points]
-            if missing:
-                has = ", ".join(sorted(child.points)) or "none"
-                child.fail(UnknownPointError(f"{child} has no decision point {', '.join(missing)}; it has {has}"))
-            child.check_silent()
-            child.send(start)
-            first = child.receive()
-            if stopped and "end" in first:
-                child.refuse(
-                    first, f'has sent {short_repr(first)} after "stop"; it must be silent until the next start'
-                )
-            child.may_exit = False
-            link.begin(first)
+            self._frame = child.begin(start)
         except BaseException:
-            link.break_off()
+            child.break_off()
             raise
+        self._time = child.time
 
     def run(self) -> Any:
         """Run the episode in the process; its calls become calls of the points' decision functions.
@@ -199,28 +160,24 @@ class ProcessSimulation(SimulationInterface):
             ProcessDiedError, ProcessTimeoutError: It has ended, or does not answer.
             SimulationError: No episode was begun.
         """
-        link = self._link
-        child, frame, link.first = link.child, link.first, None
+        child, frame, self._frame = self._child, self._frame, None
         if child is None or frame is None:
             raise SimulationError("run() runs each episode once: call reset() first")
-        functions = dict(zip(self._names(), self.points, strict=True))
+        functions = self._functions()
         try:
             while "end" not in frame:
-                if "decide" in frame:
-                    line = self._answered(child, frame, functions)
-                    link.state = "busy"
-                    child.send(line)
-                elif "update" in frame:
-                    self._update(child, frame)
-                elif "remove" in frame:
-                    self._remove(child, frame)
-                else:
-                    child.refuse(frame, f"has sent {short_repr(frame)}, which is not a frame of the wire")
-                frame = child.receive()
-            return self._end(child, frame["end"])
+                self._time = child.time
+                if frame["point"] in functions:
+                    self._handle(child, frame, functions[frame["point"]])
+                elif "decide" in frame:
+                    child.answer(encode_answer(child.number, RULE))
+                frame = child.next_frame()
         except BaseException:
-            link.break_off()
+            if self._child is child:  # otherwise it may serve another simulation already
+                child.break_off()
             raise
+        self.result = frame["end"].get("result")
+        return TRUNCATED if frame["end"].get("truncated") else None
 
     def close(self, last: bool = True) -> None:
         """End the process, if no other episode follows.
@@ -228,20 +185,19 @@ class ProcessSimulation(SimulationInterface):
         Args:
             last: Whether no other episode follows.
         """
-        link = self._link
-        if last and link.child is not None:
-            link.break_off()
-            child, link.child = link.child, None
-            if not keep(self._alike(), child):
-                child.end()
+        child = self._child
+        if last and child is not None:
+            self._use(None)
+            child.break_off()
+            if not release(self._key(), child):
+                child.close()
 
     @property
     def time(self) -> Callable[[], float]:
         """A method that returns the process's time. The attribute is missing if the process tells no time."""
-        link = self._link
-        if link.time is None:
+        if self._time is None:
             raise AttributeError("the process has not sent a time")
-        return lambda: link.time  # type: ignore[return-value]
+        return lambda: self._time  # type: ignore[return-value]
 
     def reseed(self, seed: int) -> None:
         """Ask the process to reseed its generators, so that it draws new random numbers from here on.
@@ -249,77 +205,50 @@ class ProcessSimulation(SimulationInterface):
         Raises:
             BranchError: The process did not announce "reseed".
         """
-        child = self._link.child
+        child = self._child
         if child is None or "reseed" not in child.can:
             raise BranchError(f'{child or "a process that was not started"} has not announced "reseed" in its hello')
-        self._link.seed = int(seed)
+        self._seed = int(seed)
 
     # -- frames -----------------------------------------------------------------------------------
 
-    def _answered(self, child: Child, frame: dict[str, Any], functions: dict[str, Any]) -> bytes:
-        """Get the decision of a call; return the lines that answer it."""
-        link, number = self._link, frame["decide"]
-        if type(number) is not int or number != link.number + 1:
-            child.fail(WireError(f"{child} has made call {short_repr(number)} where call {link.number + 1} was due"))
-        entity = frame.get("entity")
-        name, time = child.check_named(frame, entity)
-        if time is not None:
-            link.time = time
-        link.number, link.state = number, "waits"
-        function = functions.get(name)
-        if function is None:
-            return answer(number, RULE)
-        call = link.calls.get((name, entity))
+    def _handle(self, child: Child, frame: dict[str, Any], function: Callable[[RemoteCall], Any]) -> None:
+        """Handle a frame of an entity at a point, given the point's decision function."""
+        key = frame["point"], frame["entity"]
+        call = self._calls.get(key)
         if call is None:
-            call = link.calls[name, entity] = RemoteCall(name, entity)
-        call.__dict__, call.time = frame.get("args") or {}, link.time
+            if "decide" not in frame:
+                return  # an entity without a call so far
+            call = self._calls[key] = RemoteCall(*key)
+        if "decide" in frame:
+            call.__dict__, call.time = frame.get("args") or {}, child.time
+            child.answer(self._decide(child.number, call, function))
+        elif "update" in frame:
+            call.__dict__, call.time = frame.get("args") or {}, child.time
+        else:
+            del self._calls[key]
+            point_functions(call.point).remove(call)
+
+    def _decide(self, number: int, call: RemoteCall, function: Callable[[RemoteCall], Any]) -> bytes:
+        """Get the decision of a call; return the lines that answer it."""
         value = function(call)
         try:
-            line = answer(number, value)
+            line = encode_answer(number, value)
         except WireError as error:
             annotate(error, f"simenv_marl: in the decision of {call.entity!r} at {call.point}")
             raise
-        if link.seed is None:
+        if self._seed is None:
             return line
-        seed, link.seed = link.seed, None
+        seed, self._seed = self._seed, None
         return encode({"reseed": seed}) + line
 
-    def _update(self, child: Child, frame: dict[str, Any]) -> None:
-        """Update the arguments of an entity's latest call."""
-        call = self._link.calls.get(self._named(child, frame, frame["update"]))
-        if call is not None:
-            call.__dict__, call.time = frame.get("args") or {}, self._link.time
-
-    def _remove(self, child: Child, frame: dict[str, Any]) -> None:
-        """End the agent of an entity that is gone."""
-        call = self._link.calls.pop(self._named(child, frame, frame["remove"]), None)
-        if call is not None:
-            point_named(call.point).remove(call)
-
-    def _named(self, child: Child, frame: dict[str, Any], entity: Any) -> tuple[str, Any]:
-        """Return the point and the entity of a frame, and record its time."""
-        name, time = child.check_named(frame, entity)
-        if time is not None:
-            self._link.time = time
-        return name, entity
-
-    def _end(self, child: Child, end: Any) -> Any:
-        """Record the end of the episode."""
-        child.check_end(end)
-        self._link.state, child.may_exit = "idle", True
-        self.result = end.get("result")
-        return TRUNCATED if end.get("truncated") else None
-
-    def _names(self) -> list[str]:
-        return [getattr(function, BY_NAME) for function in self.points]
+    def _functions(self) -> dict[str, Any]:
+        """Return the decision functions of the points, by name."""
+        return {getattr(function, BY_NAME): function for function in self.points}
 
 
 def _words(command: Any) -> list[str]:
-    """Return the program and its arguments.
-
-    Raises:
-        OptionValueError: They are invalid.
-    """
+    """Return the program and its arguments, as strings."""
     words = [command] if isinstance(command, (str, os.PathLike)) else command
     if not isinstance(words, Sequence) or not words or not all(isinstance(word, (str, os.PathLike)) for word in words):
         raise OptionValueError(
@@ -329,11 +258,7 @@ def _words(command: Any) -> list[str]:
 
 
 def _by_function(points: Any) -> dict[Any, Definition]:
-    """Return the definitions by the decision functions of their names.
-
-    Raises:
-        DefinitionError: ``points`` is not a dict from names to definitions.
-    """
+    """Return the definitions by the decision functions of their names."""
     if not isinstance(points, Mapping) or not points:
         raise DefinitionError(
             f"points must be a dict from the process's names to definitions, not {short_repr(points)}"
@@ -344,4 +269,4 @@ def _by_function(points: Any) -> dict[Any, Definition]:
                 f"points must be a dict from the process's names to what make_step returns, not {short_repr(name)}:"
                 f" {short_repr(definition)}"
             )
-    return {point_named(name).decide: definition for name, definition in points.items()}
+    return {point_functions(name).decide: definition for name, definition in points.items()}

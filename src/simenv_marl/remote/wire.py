@@ -24,7 +24,7 @@ DESCRIPTORS: Final = "SIMENV_MARL_FDS"
 LONGEST: Final = 16 << 20
 """The largest number of bytes in a line."""
 
-NOT_FINITE: Final = {"nan": nan, "inf": inf, "-inf": -inf}
+_NOT_FINITE: Final = {"nan": nan, "inf": inf, "-inf": -inf}
 
 STOP: Final = b'{"stop":true}\n'
 
@@ -36,7 +36,7 @@ def encode(frame: Mapping[str, Any]) -> bytes:
         WireError: Something in it cannot be sent, or it is too long.
     """
     try:
-        line = _ENCODER.encode(sendable(frame)).encode() + b"\n"
+        line = _ENCODER.encode(_to_json(frame)).encode() + b"\n"
     except WireError:
         raise
     except (ValueError, RecursionError) as error:
@@ -46,12 +46,8 @@ def encode(frame: Mapping[str, Any]) -> bytes:
     return line
 
 
-def answer(number: int, value: Any) -> bytes:
-    """Return the line that answers a call.
-
-    Args:
-        number: The number of the call.
-        value: The decision; ``RULE`` leaves it to the process.
+def encode_answer(number: int, value: Any) -> bytes:
+    """Return the line that answers a call with a decision; ``RULE`` leaves it to the process.
 
     Raises:
         WireError: As ``encode``.
@@ -65,31 +61,23 @@ def answer(number: int, value: Any) -> bytes:
     return encode({"act": number, "value": value})
 
 
-def sendable(value: Any, where: str = "") -> Any:
-    """Convert a value to JSON data: arrays become lists, and numbers that are not finite become objects.
-
-    Args:
-        value: Numbers, strings, booleans, None, arrays, lists, tuples, and dicts with strings as keys.
-        where: The path in the frame, for the error.
-
-    Raises:
-        WireError: It contains something else.
-    """
+def _to_json(value: Any, where: str = "") -> Any:
+    """Convert a value to JSON data; ``where`` is its path in the frame, for the error."""
     if value is None or isinstance(value, (str, bool, int)):
         return value
     if isinstance(value, float):
         return float(value) if isfinite(value) else {"float": repr(float(value))}
     if isinstance(value, (np.ndarray, np.generic)):
-        return sendable(value.tolist(), where)
+        return _to_json(value.tolist(), where)
     if isinstance(value, (list, tuple)):
-        return [sendable(item, f"{where}[{place}]") for place, item in enumerate(value)]
+        return [_to_json(item, f"{where}[{place}]") for place, item in enumerate(value)]
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
                 raise WireError(
                     f"{short_repr(key)} cannot be a key in a message to a process; keys must be strings{_at(where)}"
                 )
-        return {key: sendable(item, f"{where}[{key!r}]") for key, item in value.items()}
+        return {key: _to_json(item, f"{where}[{key!r}]") for key, item in value.items()}
     raise WireError(f"{short_repr(value)} cannot be sent to a process: it is not JSON{_at(where)}")
 
 
@@ -104,10 +92,9 @@ def decode(line: bytes) -> dict[str, Any]:
         WireError: The line is not a JSON object in UTF-8.
     """
     try:
-        text = line.decode()
-        decoder = _WITH_OBJECTS if '"float"' in text else _DECODER
-        frame, end = decoder.raw_decode(text) if text[:1] == "{" else (decoder.decode(text), len(text))
-        if end < len(text) and not text[end:].isspace():
+        text = line.decode().strip()
+        frame, end = (_WITH_OBJECTS if '"float"' in text else _DECODER).raw_decode(text)
+        if end < len(text):
             raise ValueError(f"more follows after {end} characters")
     except (ValueError, RecursionError) as error:
         raise WireError(f"a line that is not JSON in UTF-8 ({describe_error(error)}): {short_repr(line)}") from None
@@ -119,7 +106,7 @@ def decode(line: bytes) -> dict[str, Any]:
 def _number(found: dict[str, Any]) -> Any:
     """Return the non-finite number that an object represents, or the object itself."""
     name = found.get("float")
-    return NOT_FINITE.get(name, found) if len(found) == 1 and isinstance(name, str) else found
+    return _NOT_FINITE.get(name, found) if len(found) == 1 and isinstance(name, str) else found
 
 
 def _refuse(constant: str) -> NoReturn:

@@ -196,7 +196,7 @@ def deciding(decide, interrupted=False):
     return script(main)
 
 
-@DRIVERS
+@pytest.mark.parametrize("driver", ["thread"])
 def test_an_interrupt_between_steps_is_the_users(driver):
     decide = decision()
     env = single_env(deciding(decide), decide, driver=driver)
@@ -249,7 +249,7 @@ def test_an_interrupt_while_the_model_computes_is_its_loops():
     assert env.simulation.log == [1, 2, "cancelled"]
 
 
-@DRIVERS
+@pytest.mark.parametrize("driver", ["thread"])
 def test_an_interrupt_of_a_loop_of_the_users_ends_that_and_not_the_model(driver):
     async def use():
         env.step(1)

@@ -33,7 +33,7 @@ PREAMBLE = """
         try:
             told.append(decide())
         except WrongThreadError as error:
-            told.append("another library's hub" in str(error) and "refused")
+            told.append("spawned with gevent" in str(error) and "refused")
         told.append(other())
 
     def waiting(simulation):
@@ -134,7 +134,7 @@ def test_what_a_model_spawns_on_the_hub_is_refused(how, first):
             try:
                 env.step(1)
             except WrongThreadError as error:
-                assert "another library's hub" in str(error)
+                assert "spawned with gevent" in str(error)
             else:
                 raise AssertionError(told)
             assert told == ["refused", "not active"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from os import getpid
 from threading import RLock
 from typing import Any
 
@@ -16,13 +17,16 @@ class ExclusiveLock:
 
     def __init__(self) -> None:
         self._lock: Any = RLock()  # ``_is_owned`` is private, but ``threading.Condition`` relies on it, too
+        self._process = getpid()
 
     @property
     def held(self) -> bool:
         """Whether the current thread uses the environment."""
-        return bool(self._lock._is_owned())
+        return bool(self._lock._is_owned()) and self._process == getpid()
 
     def __enter__(self) -> None:
+        if self._process != getpid():  # after a fork, the thread that held the lock may not exist
+            self._lock, self._process = RLock(), getpid()
         try:
             acquired = self._lock.acquire(blocking=False)
         except BaseException:  # an interrupt

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import copy_context
+from os import getpid
 from sys import modules
 from typing import Any, Final
 
@@ -29,7 +30,7 @@ def _root() -> greenlet:
 class GreenletDriver(Driver):
     """A driver that runs a simulation in a greenlet of the thread that begins the first job."""
 
-    __slots__ = ("_asker", "_body", "_direct", "_leave", "_loops", "_root", "resume")
+    __slots__ = ("_asker", "_body", "_direct", "_leave", "_loops", "_process", "_root", "resume")
 
     def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
         """Prepare a greenlet, as ``Driver`` does.
@@ -41,7 +42,7 @@ class GreenletDriver(Driver):
         """
         super().__init__(plugins, opened)
         self._direct = direct
-        self._root = _root()
+        self._root, self._process = _root(), getpid()
         self._loops = Loops()
         self._body: Any = greenlet(self._serve)
         self._asker: greenlet | None = None  # the model's own greenlet that waits for an answer
@@ -90,8 +91,8 @@ class GreenletDriver(Driver):
 
     @property
     def lost(self) -> bool:
-        """Whether the simulation's thread has ended, so that nothing can resume the simulation."""
-        return bool(self._root.dead)
+        """Whether the simulation's thread has ended, or does not exist in this forked process."""
+        return bool(self._root.dead) or (getpid() != self._process and not self.reachable)
 
     @property
     def usable(self) -> bool:

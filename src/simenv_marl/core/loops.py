@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from sys import modules
 from typing import Any, Final
 
@@ -40,7 +41,7 @@ class Loops:
     def enter(self) -> None:
         """Switch to the simulation's loop."""
         users, own = _present_loop(), self._own or _NO_LOOP
-        self.users = None if users[0] is None and own is _NO_LOOP else users
+        self.users = None if users == own == _NO_LOOP else users
         if self.users is not None:
             _set_loop(own)
 
@@ -54,15 +55,17 @@ class Loops:
 def silence_unwound_tasks() -> None:
     """Stop the running loop from reporting tasks that are unwound, because no code can await them any more."""
     loop = _present_loop()[0]
-    if loop is not None:
-        loop.set_exception_handler(_report_task)
+    before = None if loop is None else loop.get_exception_handler()
+    if loop is None or isinstance(before, partial):  # it was silenced in an earlier episode
+        return
+    loop.set_exception_handler(partial(_report_task, before or type(loop).default_exception_handler))
 
 
-def _report_task(loop: Any, context: dict[str, Any]) -> None:
+def _report_task(report: Callable[..., Any], loop: Any, context: dict[str, Any]) -> None:
     """Handle an exception of a loop, unless its task was unwound, or left over when the loop was closed."""
     error = context.get("exception")
     if not is_exit(error) and (error is not None or not loop.is_closed()):
-        loop.default_exception_handler(context)
+        report(loop, context)
 
 
 def _present_loop() -> tuple[Any, Any, int]:

@@ -19,8 +19,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import create_empty_array, create_shared_memory, read_from_shared_memory
 
+from ..core.packing import pack_error, pack_plainly
 from ..core.plan import Plan
-from ..core.processes import pack_error, pack_plainly
 from ..decision import decision_points
 from .batches import Batch
 from .rows import Row, SubEnvironments

@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate
 
-from ..core.processes import pack_plainly, unpack_error
+from ..core.packing import pack_plainly, unpack_error
 from ..errors import OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 from .rows import SubEnvironments, Told
 from .worker import EXIT, Recipe, is_shareable, share_memory, shared_batch, work

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.options import EpisodeOptions
+from ..core.packing import pack
 from ..core.plan import Plan
 from ..core.points import Points
-from ..core.processes import pack
 from ..core.reuse import processes_kept
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.simulate import check_numbers, checked_seeds

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 import numpy as np
 
 from ..core.options import EpisodeOptions
+from ..core.packing import pack
 from ..core.points import Points
-from ..core.processes import pack
 from ..core.reuse import processes_kept
 from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
 from ..many.simulate import check_numbers

@@ -12,7 +12,7 @@ from math import ceil
 from types import FunctionType
 from typing import Any, Final
 
-from ..core.processes import pack, pack_error, unpack, unpack_error
+from ..core.packing import pack, pack_error, unpack, unpack_error
 from ..errors import MissingExtraError
 
 EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots"}

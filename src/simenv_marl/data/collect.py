@@ -9,8 +9,8 @@ from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
 from ..many.batch import BatchPolicy, PolicyKey, Watcher, policy_keys, run
+from ..many.parallel import progress_bar, spread
 from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
-from ..many.spread import progress_bar, spread
 from ..simulation import RULE
 from .trajectories import Ledger, Trajectories, merged
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionValueError, short_repr
-from ..many.spread import import_extra
+from ..many.parallel import import_extra
 from .plot_data import (
     CHARTED,
     ENDS,

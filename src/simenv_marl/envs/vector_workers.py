@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import chain
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import BaseContext
 from time import monotonic
 from typing import Any, Final
 
@@ -257,16 +258,6 @@ class WorkerPool:
                 raise error
         return [(worker, result) for worker, (result, _) in zip(asked, answers, strict=True)]
 
-    def _move(
-        self, method: str, arguments: Callable[[Worker], tuple[Any, ...]], asked: Sequence[Worker]
-    ) -> list[tuple[Worker, Any]]:
-        """Do as ``_ask``. After an error, all sub-environments have failed."""
-        try:
-            return self._ask(method, arguments, asked)
-        except BaseException:
-            self.states[self.states != State.NEW] = State.FAILED
-            raise
-
     def _check_process(self) -> None:
         if os.getpid() != self._process:
             raise WorkerError(
@@ -284,11 +275,10 @@ class WorkerPool:
             worker: [number - worker.first for number in chosen if worker.first <= number < worker.end]
             for worker in self._workers
         }
-        answers = self._move(
-            "reset",
-            lambda each: (seeds[each.first : each.end], options, own[each]),
-            [worker for worker in self._workers if own[worker]],
-        )
+        asked = [worker for worker in self._workers if own[worker]]
+        before, self.states = self.states, np.where(self.states == State.NEW, State.NEW, State.FAILED)
+        answers = self._ask("reset", lambda each: (seeds[each.first : each.end], options, own[each]), asked)
+        self.states = before
         self.states[chosen] = State.RUNNING
         infos: Infos = []
         for worker, (observations, news) in answers:
@@ -303,7 +293,8 @@ class WorkerPool:
 
     def step(self, actions: Sequence[Any]) -> Results:
         """Do as ``SimulationBatch.step``."""
-        answers = self._move("step", lambda each: (actions[each.first : each.end],), self._workers)
+        self.states[:] = State.FAILED  # unless all workers answer
+        answers = self._ask("step", lambda each: (actions[each.first : each.end],), self._workers)
         infos: Infos = []
         parts = []
         for worker, (observations, *arrays, news) in answers:
@@ -381,16 +372,12 @@ def _join(space: spaces.Space[Any], parts: Sequence[Any], out: Any) -> Any:
 
 
 def _context(context: Any) -> Any:
-    if context is None:
-        context = "spawn"
-    if isinstance(context, str):
-        try:
-            return multiprocessing.get_context(context)
-        except ValueError:
-            raise OptionValueError(
-                f"context must be one of {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
-                f" of multiprocessing, not {short_repr(context)}"
-            ) from None
-    if not hasattr(context, "Process"):
-        raise OptionValueError(f"context must be a name or a context of multiprocessing, not {short_repr(context)}")
-    return context
+    if isinstance(context, BaseContext):
+        return context
+    try:
+        return multiprocessing.get_context("spawn" if context is None else context)
+    except (TypeError, ValueError):
+        raise OptionValueError(
+            f"context must be one of {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
+            f" of multiprocessing, not {short_repr(context)}"
+        ) from None

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionValueError, did_you_mean, short_repr
-from ..many.spread import import_extra
+from ..many.parallel import import_extra
 from .playing import TEAM
 from .statistics import check_confidence, interval, numbers
 

@@ -14,8 +14,8 @@ from ..core.plan import Plan
 from ..core.points import Points
 from ..core.reuse import processes_kept
 from ..errors import OptionValueError, did_you_mean, short_repr
+from ..many.parallel import import_extra, progress_bar, spread
 from ..many.simulate import check_numbers, checked_seeds
-from ..many.spread import import_extra, progress_bar, spread
 from .playing import (
     TEAM,
     Metrics,

@@ -18,8 +18,8 @@ from ..core.packing import pack
 from ..core.points import Points
 from ..core.reuse import processes_kept
 from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
+from ..many.parallel import import_extra, progress_bar, spread
 from ..many.simulate import check_numbers
-from ..many.spread import import_extra, progress_bar, spread
 from .evaluation import distinct_seeds, rows_of, typed
 from .playing import (
     COLUMNS,

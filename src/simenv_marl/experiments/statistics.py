@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionValueError, short_repr
-from ..many.spread import import_extra
+from ..many.parallel import import_extra
 
 RESAMPLES: Final = 5_000
 """The number of bootstrap samples for an interval; always the same samples, for reproducible intervals."""

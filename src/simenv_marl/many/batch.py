@@ -275,7 +275,7 @@ def run(
         BaseException: Any exception of a model, a mapping, a policy or ``finish``. All simulations are unwound.
     """
     with outside_simulation(), processes_kept():
-        _Batches(plan, seeds, size, finish, watcher).run()
+        _Simulations(plan, seeds, size, finish, watcher).run()
 
 
 def _checked(episode: Episode, action: Any) -> Any:
@@ -288,16 +288,12 @@ def _checked(episode: Episode, action: Any) -> Any:
         raise
 
 
-def _blame(number: int, error: BaseException) -> None:
-    """Do nothing: the notes of an error name its seed already."""
-
-
 CROWD: Final = 256
 """The number of simulations at first. With more, each has left the processor's caches when its turn comes again, and
 takes twice as long. If the policy takes longer than all simulations together, more simulations pay off."""
 
 
-class _Batches:
+class _Simulations:
     """The simulations that are running."""
 
     def __init__(
@@ -314,49 +310,45 @@ class _Batches:
         self._crowd = min(size, CROWD)
         self._next = 0
         self._sessions: dict[int, Session] = {}  # by the place of their seed
-        # Groups by the number of their waiting decisions: place i has those with 2**i to 2**(i + 1) - 1.
-        self._by_size: list[dict[Group, None]] = [{} for _ in range(size.bit_length())]
+        self._groups: dict[Group, None] = {}
 
     def run(self) -> None:
         try:
             self._refill()
             while self._sessions:
-                self._answer(self._largest())
+                # Waiting for large groups saves calls of policies.
+                self._answer(max(self._groups, key=lambda group: len(group.waiting)))
         except BaseException as error:
-            self._unwind(error)
+            for place, session in self._sessions.items():
+                try:
+                    session.close()
+                except BaseException as problem:
+                    where = f"unwinding the simulation of seed {self._seeds[place]}"
+                    annotate(error, f"simenv_marl: {where} raised {short_repr(problem)} as well")
             raise
-
-    def _largest(self) -> Group:
-        """Return a group that has more than half as many waiting decisions as any other.
-
-        Waiting for large groups saves calls of policies. Searching for the very largest group would take longer, the
-        more groups there are.
-        """
-        return next(iter(next(groups for groups in reversed(self._by_size) if groups)))
 
     def _answer(self, group: Group) -> None:
         """Have the decisions of a group answered, and run each simulation to its next decision."""
         waiting, group.waiting = group.waiting, []
         places, group.places = group.places, []
-        seen, group.observations = group.observations, []
-        del self._by_size[len(waiting).bit_length() - 1][group]
+        observations, group.observations = group.observations, []
         watcher, number, begun = self._watcher, len(waiting), perf_counter()
-        kept = None if watcher is None else group.stack(seen)
-        actions, extras = group.ask(group.stack(seen), waiting)
+        recorded = None if watcher is None else group.stack(observations)  # policies may change what they get
+        actions, extras = group.ask(group.stack(observations), waiting)
         asked = perf_counter()
         if watcher is not None:
-            watcher.asking(group, places, waiting, kept)
-        step_all(waiting, list(map(_checked, waiting, actions)), _blame)
+            watcher.asking(group, places, waiting, recorded)
+        step_all(waiting, list(map(_checked, waiting, actions)))
         waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
         for place in places:
-            self._settle(place, waiting.pop())
+            self._queue(place, waiting.pop())
         if watcher is not None:
             watcher.answered(group, actions, extras)
         if 2 * number > self._crowd < self._size and asked - begun > perf_counter() - asked:
             self._crowd = min(self._size, 2 * self._crowd)
         self._refill()
 
-    def _settle(self, place: int, episode: Episode) -> None:
+    def _queue(self, place: int, episode: Episode) -> None:
         """Queue an episode that waits at a decision, or end it if it is over."""
         if self._watcher is not None:
             self._watcher.moved(episode)
@@ -367,23 +359,13 @@ class _Batches:
         group = agent.group
         if group is None:
             group = agent.group = agent.policy.group(agent.point)
-        gathered = group.waiting
-        gathered.append(episode)
+            self._groups[group] = None
+        group.waiting.append(episode)
         group.places.append(place)
         # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
         group.observations.append(agent.observation)
         if self._watcher is None:
             agent.observation = None
-        many = len(gathered)
-        if not many & (many - 1):
-            self._grow(group, many)
-
-    def _grow(self, group: Group, number: int) -> None:
-        """Note that the number of waiting decisions of a group has reached a power of two."""
-        place = number.bit_length() - 1
-        if place:
-            del self._by_size[place - 1][group]
-        self._by_size[place][group] = None
 
     def _refill(self) -> None:
         """Start simulations until the limit is reached."""
@@ -396,7 +378,7 @@ class _Batches:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
             self._sessions[place] = session
-            self._settle(place, session.start(seed, None, self._when))
+            self._queue(place, session.start(seed, None, self._when))
 
     def _end(self, place: int) -> None:
         session = self._sessions[place]
@@ -410,17 +392,3 @@ class _Batches:
             annotate(error, f"simenv_marl: after the simulation's end; seed {self._seeds[place]}")
             raise
         del self._sessions[place]
-
-    def _unwind(self, error: BaseException) -> None:
-        """Unwind all suspended simulations after an error in one of them."""
-        for place, session in self._sessions.items():
-            try:
-                session.close()
-            except BaseException as problem:
-                annotate(
-                    error,
-                    f"simenv_marl: unwinding the simulation of seed {self._seeds[place]} raised"
-                    f" {short_repr(problem)} as"
-                    " well",
-                )
-        self._sessions.clear()

@@ -14,7 +14,7 @@ from ..core.reuse import processes_kept
 from ..core.session import Session, checked_seed
 from ..errors import OptionValueError, close_after, short_repr
 from .batch import policy_keys, run
-from .spread import progress_bar, spread
+from .parallel import progress_bar, spread
 
 
 def simulate(
@@ -112,44 +112,42 @@ def simulate_many(
     check_numbers(batch_size, workers)
     check_collect(collect)
     arguments = (simulation, checked_policies(policies), points, collect, int(batch_size), options)
-    # The plan is made here even if workers do the work: errors show up before any work starts.
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unanswered=True)
+    if workers:  # errors show up before any work starts
+        _draw_up(simulation, policies or {}, points, options)
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:
-            return _simulate(plan, collect, int(batch_size), checked, bar)
+            return _simulate(*arguments, checked, bar)
         results: list[Any] = []
-        for number, part in spread(_simulate_part, arguments, checked, int(workers), int(batch_size)):
+        for number, part in spread(_simulate, arguments, checked, int(workers), int(batch_size)):
             results += part
             if bar is not None:
                 bar.update(number)
         return results
 
 
-def _simulate_part(
+def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
+    return Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unanswered=True)
+
+
+def _simulate(
     simulation: Any,
     policies: Mapping[Any, Any],
     points: Any,
     collect: Callable[[Any], Any] | None,
     batch_size: int,
-    options: dict[str, Any],
+    options: Mapping[str, Any],
     seeds: list[int],
+    bar: Any = None,
 ) -> list[Any]:
-    """Simulate a part of the seeds, in a worker process."""
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unanswered=True)
-    return _simulate(plan, collect, batch_size, seeds, None)
-
-
-def _simulate(
-    plan: Plan, collect: Callable[[Any], Any] | None, batch_size: int, seeds: list[int], bar: Any
-) -> list[Any]:
+    """Simulate some of the seeds, in this process."""
     results: list[Any] = [None] * len(seeds)
 
-    def finish(place: int, simulation: Any) -> None:
-        results[place] = simulation if collect is None else collect(simulation)
+    def finish(place: int, ended: Any) -> None:
+        results[place] = ended if collect is None else collect(ended)
         if bar is not None:
             bar.update()
 
-    run(plan, seeds, batch_size, finish)
+    run(_draw_up(simulation, policies, points, options), seeds, batch_size, finish)
     return results
 
 

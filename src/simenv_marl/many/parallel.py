@@ -1,4 +1,4 @@
-"""Spreads the work on many simulations over processes, local or remote, with joblib."""
+"""Work on many simulations in several processes, local or remote, with joblib."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from importlib import import_module
 from math import ceil
 from types import FunctionType
 from typing import Any, Final
 
-from ..core.packing import pack, pack_error, unpack, unpack_error
+from ..core.packing import pack, pack_outcome, unpack, unpack_outcome
 from ..errors import MissingExtraError
 
 EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots"}
@@ -86,14 +85,36 @@ def spread(
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
     except ValueError:  # this backend returns nothing before all work is done
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
-    results = parallel(joblib.delayed(_work)(parcel, part) for part in parts)
-    with _closing(results):
-        remaining = iter(results)
-        for part in parts:
-            failed, result = next(remaining)
-            if failed:
-                raise unpack_error(result)
-            yield len(part), unpack(result)
+    outcomes = parallel(joblib.delayed(_work)(parcel, part) for part in parts)
+    try:
+        for part, outcome in zip(parts, outcomes, strict=True):
+            result, error = unpack_outcome(outcome)
+            if error is not None:
+                raise error
+            yield len(part), result
+    finally:
+        if hasattr(outcomes, "close"):  # cancels the remaining work when the caller stops reading results
+            with warnings.catch_warnings():  # joblib warns that it cancels
+                warnings.simplefilter("ignore")
+                outcomes.close()
+
+
+def _work(parcel: bytes, seeds: list[Any]) -> bytes:
+    """Run the function, in a worker. Its error is packed here because each backend would pass it on in its own way."""
+    return pack_outcome(pack, _call, parcel, seeds)
+
+
+def _call(parcel: bytes, seeds: list[Any]) -> Any:
+    work, arguments = _unpack_with_names(parcel)
+    return work(*arguments, seeds)
+
+
+# -- names of a script ----------------------------------------------------------------------------
+
+_IN_SCRIPT: Final = re.compile(rb"__main__\.([A-Za-z_]\w*)")
+
+_received: Final[set[str]] = set()
+"""The names in this process's main module that came from another process's script."""
 
 
 def packed_with_names(thing: Any) -> bytes:
@@ -108,47 +129,12 @@ def packed_with_names(thing: Any) -> bytes:
     return pack((thing, named)) if named else parcel
 
 
-_IN_SCRIPT: Final = re.compile(rb"__main__\.([A-Za-z_]\w*)")
-
-_lent: Final[set[str]] = set()
-"""Objects that were put into this process's main module, for names that come from another process's script."""
-
-
-def _unpacked(parcel: bytes) -> Any:
+def _unpack_with_names(parcel: bytes) -> Any:
     """Unpickle an object, in a worker. The functions it refers to by name are put into the main module."""
     thing, named = unpack(parcel)
     main = sys.modules["__main__"]
     for name, found in named.items():
-        if name in _lent or not hasattr(main, name):
+        if name in _received or not hasattr(main, name):
             setattr(main, name, found)
-            _lent.add(name)
+            _received.add(name)
     return thing
-
-
-@contextmanager
-def _closing(results: Any) -> Iterator[None]:
-    """Cancel the remaining work when the caller stops reading results."""
-    try:
-        yield
-    finally:
-        close = getattr(results, "close", None)
-        if close is not None:
-            with warnings.catch_warnings():  # joblib warns that it cancels
-                warnings.simplefilter("ignore")
-                close()
-
-
-def _work(parcel: bytes, seeds: list[Any]) -> tuple[bool, bytes]:
-    """Run the function, in a worker.
-
-    Returns:
-        Whether it failed, and a pickle of its result or of the error. The error is pickled here because each of
-        joblib's backends would pass it on in its own way.
-    """
-    try:
-        work, arguments = _unpacked(parcel)
-        return False, pack(work(*arguments, seeds))
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:
-        return True, pack_error(error)

@@ -1,7 +1,7 @@
 """The vector view: many copies of a simulation, stepped together."""
 
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from threading import Lock
 from typing import Any
 
@@ -25,7 +25,7 @@ from ..errors import (
 )
 from ..simulation import RULE
 from .gymnasium_base import OneAgentView
-from .vector_batch import SimulationBatch, State, SubEnvironmentType, checked_actions
+from .vector_batch import Infos, SimulationBatch, State, SubEnvironmentType, checked_actions
 from .vector_workers import WorkerPool
 
 
@@ -113,7 +113,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             seeds = self._seeds(seed)
             chosen, options = self._chosen(options)
             observations, infos = self._batch.reset(seeds, options, chosen)
-        return duplicate(observations) if self._copy else observations, _merged(infos, self.num_envs)
+        return duplicate(observations) if self._copy else observations, self._merged(infos)
 
     def step(
         self, actions: Any
@@ -134,7 +134,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 of them need a reset.
         """
         with _exclusive(self):
-            state = self._batch.states.max()
+            state = int(self._batch.states.max())
             if state == State.NEW:
                 raise NotResetError("there is no episode yet; call reset() first")
             if state == State.FAILED:
@@ -146,7 +146,13 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                     ' reset(options={"reset_mask": ...})'
                 )
             observations, *results, infos = self._batch.step(self._split(actions))
-        return duplicate(observations) if self._copy else observations, *results, _merged(infos, self.num_envs)
+        return duplicate(observations) if self._copy else observations, *results, self._merged(infos)
+
+    def _merged(self, infos: Infos) -> dict[str, Any]:
+        merged: dict[str, Any] = {}
+        for number, info in infos:
+            merged = self._add_info(merged, info, number)
+        return merged
 
     def _split(self, actions: Any) -> list[Any]:
         """Split a batch of actions, and check each action that will be used, before any simulation moves."""
@@ -205,7 +211,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         chosen: list[int] = np.flatnonzero(mask).tolist()
         if not chosen:
             raise OptionValueError("reset_mask selects no simulation to reset")
-        state = self._batch.states.max()
+        state = int(self._batch.states.max())
         if chosen != numbers and state == State.NEW:
             raise NotResetError("there are no episodes yet; call reset() without a reset_mask first")
         if chosen != numbers and state == State.FAILED:
@@ -311,39 +317,6 @@ class _exclusive:  # noqa: N801 - it is used like a function
 
     def __exit__(self, *error: object) -> None:
         self._env.lock.release()
-
-
-def _merged(infos: Iterable[tuple[int, dict[str, Any]]], number: int) -> dict[str, Any]:
-    """Merge the infos of many simulations, as ``VectorEnv._add_info`` does one by one, but key by key."""
-    columns: dict[str, dict[int, Any]] = {}
-    for index, info in infos:
-        for key, value in info.items():
-            columns.setdefault(key, {})[index] = value
-    merged: dict[str, Any] = {}
-    for key, values in columns.items():
-        merged[f"_{key}"] = mask = np.zeros(number, np.bool_)
-        mask[list(values)] = True
-        merged[key] = _column(key, values, number)
-    return merged
-
-
-def _column(key: str, values: dict[int, Any], number: int) -> Any:
-    """Merge the values of one key, in the kind of array that Gymnasium chooses by the first of them."""
-    first = next(iter(values.values()))
-    column: NDArray[Any]
-    if isinstance(first, dict) and key != "final_obs":
-        return _merged(values.items(), number)
-    if key != "final_obs" and (type(first) in (int, float, bool) or isinstance(first, np.number)):
-        column = np.zeros(number, type(first))
-    elif key != "final_obs" and isinstance(first, np.ndarray):
-        column = np.zeros((number, *first.shape), first.dtype)
-    else:
-        column = np.full(number, None, object)
-        for index, value in values.items():
-            column[index] = value
-        return column
-    column[list(values)] = list(values.values())
-    return column
 
 
 def _count(value: Any, name: str, least: int) -> int:

@@ -8,7 +8,6 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
@@ -34,14 +33,10 @@ Results = tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], 
 class State(IntEnum):
     """What may happen to a sub-environment next. The largest state of all sub-environments decides for all of them."""
 
-    RUNNING = 0
-    """A step."""
-    ENDED = 1
-    """The next episode, which the next step or a reset begins."""
-    FAILED = 2
-    """A reset of all sub-environments: an error has left them at different steps."""
-    NEW = 3
-    """The first reset."""
+    RUNNING = 0  # a step
+    ENDED = 1  # the next episode, which the next step or a reset begins
+    FAILED = 2  # a reset of all sub-environments: an error has left them at different steps
+    NEW = 3  # the first reset
 
 
 class SubEnvironmentType:
@@ -56,25 +51,13 @@ class SubEnvironmentType:
     """
 
     def __init__(self, simulation: Any, points: Any, options: Mapping[str, Any], view: str | None) -> None:
-        """Choose the view. For a joint view this may take the reset of a simulation.
-
-        Args:
-            simulation: A simulation, its class, a factory, or a variant, as ``vector_env`` takes it.
-            points: The active decision points, as ``generate_env`` takes them.
-            options: The options of the sub-environments.
-            view: "single" or "joint". None: single if one point with one string agent is active, else joint.
-
-        Raises:
-            SimEnvError: The arguments do not work. The subclass of the error says why.
-        """
+        """Choose the view, by arguments of ``vector_env``. For a joint view this may take the reset of a simulation."""
         self._arguments = simulation, points, options
         plan = Plan.draw_up(simulation, points, options)
         if view is None:
             view = "joint" if plan.one_agent is None else "single"
         self.joint: Joint | None = None
         self.view: type[OneAgentView]
-        self.observation_space: spaces.Space[Any]
-        self.action_space: spaces.Space[Any]
         if view == "single":
             self.view, self.view_plan = single_view(plan), plan
             self.plan = plan if plan.active[0].definition.goal_space is None else with_goals(plan)
@@ -111,17 +94,7 @@ class SimulationBatch:
     """
 
     def __init__(self, kind: SubEnvironmentType, number: int, mode: AutoresetMode, offset: int = 0) -> None:
-        """Make the simulations.
-
-        Args:
-            kind: The shared view of the sub-environments.
-            number: The number of sub-environments.
-            mode: When a new episode follows one that has ended.
-            offset: The number of sub-environments in the batches before, for error messages.
-
-        Raises:
-            BaseException: Any error of making a simulation.
-        """
+        """Make the simulations. ``offset``: the number of sub-environments in the batches before, for messages."""
         self._kind, self._mode, self._offset = kind, mode, offset
         self._agent = str(kind.plan.one_agent)
         self._shows = kind.plan.options.render_mode == "human"
@@ -146,31 +119,16 @@ class SimulationBatch:
     def reset(
         self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: Sequence[int]
     ) -> tuple[Any, Infos]:
-        """Begin new episodes of some sub-environments.
-
-        Args:
-            seeds: A seed for each sub-environment.
-            options: The options for all sub-environments that are reset.
-            chosen: The numbers of the sub-environments to reset.
+        """Begin new episodes of the chosen sub-environments. ``seeds`` has a seed for each, chosen or not.
 
         Returns:
             The observations of all sub-environments, and the infos of those that were reset.
-
-        Raises:
-            BaseException: Any error of a simulation or a mapping. All have failed unless nothing has moved.
         """
         infos = [(number, self._begin(number, seeds[number], options, first=chosen[0])) for number in chosen]
         return self._stacked(), infos
 
     def check(self, actions: Sequence[Any]) -> list[Any]:
-        """Check actions against the pending decisions. Nothing moves.
-
-        Returns:
-            The actions in the form that mappings take.
-
-        Raises:
-            InvalidActionError: An action is not legal. The message says which.
-        """
+        """Check actions against the pending decisions; return them in the form that mappings take."""
         return checked_actions(actions, self.states, self._checked, self._offset)
 
     def _checked(self, number: int, action: Any) -> Any:
@@ -186,15 +144,8 @@ class SimulationBatch:
         return action
 
     def step(self, actions: Sequence[Any]) -> Results:
-        """Answer all pending decisions, and run each simulation to its next decision.
-
-        Args:
-            actions: A checked action for each sub-environment; those of ended episodes are not used.
-
-        Raises:
-            BaseException: Any error of a simulation or a mapping. All have failed unless nothing has moved.
-        """
-        begun = np.flatnonzero(self.states == State.ENDED).tolist()
+        """Answer all pending decisions by checked actions, and run each simulation to its next decision."""
+        begun = np.flatnonzero(self.states == State.ENDED.value).tolist()  # the member itself is slow to compare
         for number in begun:
             self._begin(number)
         moving = np.delete(np.arange(len(self.sessions)), begun).tolist() if begun else range(len(self.sessions))
@@ -282,13 +233,7 @@ class SimulationBatch:
         return self._observations
 
     def _fail(self, number: int, error: BaseException, first: int) -> None:
-        """Say in an error which sub-environment raised it. All have failed, if any has moved.
-
-        Args:
-            number: The number of the sub-environment that has raised.
-            error: The error.
-            first: The number of the sub-environment that moves first, and so may be the only one that has moved.
-        """
+        """Say in an error which sub-environment raised it. All have failed, unless the first to move has not moved."""
         annotate(error, self._place(number))
         episode = self.sessions[number].episode
         if number != first or episode is None or episode.pending is None:  # otherwise nothing has moved
@@ -307,11 +252,7 @@ class SimulationBatch:
         return self._views
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
-        """Call a method of each view, or get an attribute of each.
-
-        Raises:
-            BaseException: Any error of a view.
-        """
+        """Call a method of each view, or get an attribute of each."""
         results = []
         for view in self.views:
             found = getattr(view, name)
@@ -326,12 +267,7 @@ class SimulationBatch:
     # -- ends -------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Unwind all simulations.
-
-        Raises:
-            ReentrancyError, WrongThreadError: The simulations cannot be ended from here, and continue.
-            BaseException: The first error that a simulation raises. The others are unwound nevertheless.
-        """
+        """Unwind all simulations, also if one raises an error; raise the first of the errors."""
         raised: BaseException | None = None
         for number, session in enumerate(self.sessions):
             try:
@@ -360,16 +296,10 @@ class SimulationBatch:
 def checked_actions(
     actions: Iterable[Any], states: NDArray[Any], check: Callable[[int, Any], Any], offset: int = 0
 ) -> list[Any]:
-    """Check the actions of sub-environments, except of those whose next episode begins.
-
-    Args:
-        actions: An action for each sub-environment.
-        states: The states of the sub-environments.
-        check: A function of a sub-environment's number and an action that returns the checked action.
-        offset: The number of sub-environments before the first one, for error messages.
+    """Check the actions of sub-environments, except of those whose next episode begins; return the checked actions.
 
     Raises:
-        InvalidActionError: An action is not legal. The message says which.
+        InvalidActionError: An action is not legal. The message names the sub-environment.
     """
     checked = list(actions)
     for number, action in enumerate(checked):

@@ -34,13 +34,9 @@ EXIT: Final = b""
 
 
 def serve(pipe: Connection, other_end: Connection | None) -> None:
-    """The main function of a worker. It answers messages, each a packed pair of a method and its arguments.
+    """Answer messages, each a packed pair of a method and its arguments, in a worker: make a batch, and call it.
 
-    The first message makes the batch of the worker, the others call its methods.
-
-    Args:
-        pipe: The pipe to the user.
-        other_end: The user's end of that pipe, if a fork has copied it.
+    ``other_end`` is the user's end of the pipe, if a fork has copied it.
     """
     with suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the user's process, which decides what to do
@@ -74,14 +70,12 @@ class Worker:
         first, end: The number of its first simulation, and the number after that of its last one.
         name: Its name in messages.
         owes: Whether it has not yet answered the last message.
-        observations: The latest observations of its simulations.
     """
 
     def __init__(self, number: int, first: int, end: int) -> None:
         self.first, self.end = first, end
         self.name = f"worker {number} (of the sub-environments {first} to {end - 1})"
         self.owes = False
-        self.observations: Any = None
         self._pipe: Any = None
         self._process: Any = None
 
@@ -107,11 +101,7 @@ class Worker:
         self._pipe, self._process, self.owes = ours, process, False
 
     def send(self, message: bytes) -> None:
-        """Send a message to the worker, after the answer to one whose wait was interrupted.
-
-        Raises:
-            WorkerError: The worker is dead.
-        """
+        """Send a message to the worker, after the answer to one whose wait was interrupted."""
         if self.owes:
             self.receive()
         if not self.alive:
@@ -198,13 +188,7 @@ class WorkerPool:
     idle = True
 
     def __init__(self, kind: SubEnvironmentType, number: int, mode: AutoresetMode, workers: int, context: Any) -> None:
-        """Start the workers.
-
-        Raises:
-            OptionValueError: There is no such context, or the arguments of the environment cannot be pickled.
-            WorkerError: A worker died.
-            BaseException: Any error of making a simulation.
-        """
+        """Start the workers, each with a part of the sub-environments."""
         self._context = _context(context)
         self._space, self._mode = kind.observation_space, mode
         self._observations = create_empty_array(self._space, number)
@@ -240,23 +224,23 @@ class WorkerPool:
             raise
 
     def _ask(
-        self, method: str, arguments: Callable[[Worker], tuple[Any, ...]], asked: Sequence[Worker]
-    ) -> list[tuple[Worker, Any]]:
-        """Call a method of the batches of some workers, and wait for the results.
-
-        Raises:
-            WorkerError: A worker is dead, or belongs to the process of which this one is a fork.
-            BaseException: The error of the first worker that has raised one.
-        """
+        self, method: str, arguments: Callable[[Worker], tuple[Any, ...]], new: Sequence[Worker] | None = None
+    ) -> list[Any]:
+        """Call a method of all batches, or of those of new workers; return the results, or raise the first error."""
         self._check_process()
+        asked = self._workers if new is None else new
         messages = [pack_plainly((method, arguments(worker))) for worker in asked]
-        for worker, message in zip(asked, messages, strict=True):
-            worker.send(message)
-        answers = [worker.receive() for worker in asked]
+        try:
+            for worker, message in zip(asked, messages, strict=True):
+                worker.send(message)
+            answers = [worker.receive() for worker in asked]
+        finally:
+            if not all(worker.alive for worker in asked):
+                self.states[self.states != State.NEW] = State.FAILED
         for _, error in answers:
             if error is not None:
                 raise error
-        return [(worker, result) for worker, (result, _) in zip(asked, answers, strict=True)]
+        return [result for result, _ in answers]
 
     def _check_process(self) -> None:
         if os.getpid() != self._process:
@@ -270,46 +254,42 @@ class WorkerPool:
         self, seeds: Sequence[int | None], options: dict[str, Any] | None, chosen: Sequence[int]
     ) -> tuple[Any, Infos]:
         """Do as ``SimulationBatch.reset``, after a restart of the workers that have died."""
-        self._hire()
-        own = {
-            worker: [number - worker.first for number in chosen if worker.first <= number < worker.end]
-            for worker in self._workers
-        }
-        asked = [worker for worker in self._workers if own[worker]]
         before, self.states = self.states, np.where(self.states == State.NEW, State.NEW, State.FAILED)
-        answers = self._ask("reset", lambda each: (seeds[each.first : each.end], options, own[each]), asked)
+        self._hire()
+
+        def arguments(worker: Worker) -> tuple[Any, ...]:
+            own = [number - worker.first for number in chosen if worker.first <= number < worker.end]
+            return seeds[worker.first : worker.end], options, own
+
+        answers = self._ask("reset", arguments)
         self.states = before
         self.states[chosen] = State.RUNNING
-        infos: Infos = []
-        for worker, (observations, news) in answers:
-            worker.observations = observations
-            infos += [(worker.first + number, info) for number, info in news]
-        return self._joined(), infos
+        observations, infos = zip(*answers, strict=True)
+        return self._joined(observations), self._numbered(infos)
 
     def check(self, actions: Sequence[Any]) -> list[Any]:
         """Do as ``SimulationBatch.check``."""
-        answers = self._ask("check", lambda each: (actions[each.first : each.end],), self._workers)
-        return [action for _, checked in answers for action in checked]
+        return list(chain.from_iterable(self._ask("check", lambda each: (actions[each.first : each.end],))))
 
     def step(self, actions: Sequence[Any]) -> Results:
         """Do as ``SimulationBatch.step``."""
         self.states[:] = State.FAILED  # unless all workers answer
-        answers = self._ask("step", lambda each: (actions[each.first : each.end],), self._workers)
-        infos: Infos = []
-        parts = []
-        for worker, (observations, *arrays, news) in answers:
-            worker.observations = observations
-            parts.append(arrays)
-            infos += [(worker.first + number, info) for number, info in news]
-        rewards, terminations, truncations = map(np.concatenate, zip(*parts, strict=True))
+        answers = self._ask("step", lambda each: (actions[each.first : each.end],))
+        observations, *arrays, infos = zip(*answers, strict=True)
+        rewards, terminations, truncations = map(np.concatenate, arrays)
         over = (terminations | truncations) & (self._mode != AutoresetMode.SAME_STEP)
         self.states[:] = np.where(over, State.ENDED, State.RUNNING)
-        return self._joined(), rewards, terminations, truncations, infos
+        return self._joined(observations), rewards, terminations, truncations, self._numbered(infos)
 
-    def _joined(self) -> Any:
-        parts = [worker.observations for worker in self._workers]
+    def _joined(self, parts: Sequence[Any]) -> Any:
+        """Join the observations of all workers, in arrays that the next call overwrites."""
         self._observations = _join(self._space, parts, self._observations)
         return self._observations
+
+    def _numbered(self, parts: Sequence[Infos]) -> Infos:
+        """Join the infos of all workers, whose numbers begin at zero."""
+        workers = zip(self._workers, parts, strict=True)
+        return [(worker.first + number, info) for worker, part in workers for number, info in part]
 
     @property
     def views(self) -> list[Any]:
@@ -318,19 +298,14 @@ class WorkerPool:
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
         """Do as ``SimulationBatch.call``."""
-        answers = self._ask("call", lambda _: (name, args, kwargs), self._workers)
-        return [value for _, values in answers for value in values]
+        return list(chain.from_iterable(self._ask("call", lambda _: (name, args, kwargs))))
 
     def set_attr(self, name: str, values: Sequence[Any]) -> None:
         """Do as ``SimulationBatch.set_attr``."""
-        self._ask("set_attr", lambda each: (name, values[each.first : each.end]), self._workers)
+        self._ask("set_attr", lambda each: (name, values[each.first : each.end]))
 
     def close(self) -> None:
-        """Unwind all simulations and end the workers, by force after some seconds.
-
-        Raises:
-            BaseException: The first error that a simulation raises. The others are unwound nevertheless.
-        """
+        """Do as ``SimulationBatch.close``, and end the workers, by force after some seconds."""
         self._check_process()
         deadline = monotonic() + SECONDS_TO_CLOSE
         asked = [worker for worker in self._workers if worker.alive and not worker.owes]
@@ -338,12 +313,12 @@ class WorkerPool:
             for worker in asked:
                 with suppress(WorkerError):
                     worker.send(pack_plainly(("close", ())))
-            asked = [worker for worker in asked if worker.alive]
-            late = [worker for worker in asked if not worker.answers_within(max(deadline - monotonic(), 0.0))]
-            if late:
+            there = [worker for worker in asked if worker.alive]
+            ready = [worker for worker in there if worker.answers_within(max(deadline - monotonic(), 0.0))]
+            if len(ready) < len(there):
                 warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are killed", ResourceWarning)
-            answers = [(worker, worker.receive()) for worker in asked if worker not in late]
-            for worker, (_, error) in answers:
+            for worker in ready:
+                _, error = worker.receive()
                 if error is not None and worker.alive:  # nothing is left to close in one that is dead
                     raise error
         finally:

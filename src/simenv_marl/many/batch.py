@@ -43,7 +43,7 @@ class BatchPolicy:
         informed: Whether it takes the infos.
         identifying: Whether it also takes the identities of the decisions.
         asking: Whether it asks for the environment and therefore answers one decision at a time.
-        groups: The groups of its decisions.
+        groups: The groups of its decisions, by decision point.
     """
 
     def __init__(self, policy: Callable[..., Any]) -> None:
@@ -52,7 +52,7 @@ class BatchPolicy:
         self.informed = self.policy is policy
         self.identifying = self.informed and takes_identities(policy)
         self.asking = isinstance(self.policy, AskingPolicy)
-        self.groups: list[Group] = []
+        self.groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
         return f"the policy of {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
@@ -65,10 +65,10 @@ class BatchPolicy:
 
     def group(self, point: BoundPoint) -> Group:
         """Return the group of the decisions at a point."""
-        group = next((group for group in self.groups if group.takes(point)), None)
+        group = self.groups.get(point.point)
         if group is None:
-            group = Group(self, point)
-            self.groups.append(group)
+            group = next((known for known in self.groups.values() if known.takes(point)), None) or Group(self, point)
+            self.groups[point.point] = group
         return group
 
 
@@ -78,7 +78,7 @@ def takes_identities(policy: Callable[..., Any]) -> bool:
 
 
 class PolicyKey(DeferredPolicy):
-    """The stand-in for a policy in a plan: the policy, and the key under which it was given.
+    """A batched policy in a plan, with the key under which it was given.
 
     Attributes:
         place: The place of its key in ``policies``.
@@ -88,14 +88,6 @@ class PolicyKey(DeferredPolicy):
     def __init__(self, place: int, asked: BatchPolicy) -> None:
         self.place = place
         self.asked = asked
-        self._groups: dict[DecisionPoint, Group] = {}
-
-    def group(self, point: BoundPoint) -> Group:
-        """Return the group of its decisions at a point."""
-        group = self._groups.get(point.point)
-        if group is None:
-            group = self._groups[point.point] = self.asked.group(point)
-        return group
 
     def __call__(self, observation: Any, info: Any) -> Any:
         """Answer one decision, if the policy answers one decision at a time."""
@@ -103,7 +95,7 @@ class PolicyKey(DeferredPolicy):
 
     def alone(self, episode: Any, agent: Any) -> Any:
         """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
-        group = self.group(agent.point)
+        group = self.asked.group(agent.point)
         episode.pending = agent
         try:
             actions, _ = group.ask(group.stack([agent.observation]), [episode])
@@ -125,12 +117,10 @@ class AskingKey(AskingPolicy, PolicyKey):
 
 
 def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[Any, Any]:
-    """Replace policies by their stand-ins for a plan. Values that are not policies stay as they are.
+    """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
-    Args:
-        policies: The policies.
-        rewarded: Whether episodes wait for policies that ask for the environment, too. Otherwise, such a policy is
-            called where it decides, since it answers one decision at a time.
+    ``rewarded``: whether episodes wait for policies that ask for the environment, too. Otherwise, such a policy is
+    called where it decides, since it answers one decision at a time.
     """
     known: dict[int, BatchPolicy] = {}
     found: dict[Any, Any] = {}
@@ -179,19 +169,7 @@ class Group:
         )
 
     def ask(self, observations: Any, waiting: Sequence[Episode]) -> tuple[list[Any], Mapping[str, Any]]:
-        """Ask the policy for actions.
-
-        Args:
-            observations: The stacked observations of the waiting decisions.
-            waiting: The episodes that wait.
-
-        Returns:
-            The list of actions, and the dict of extras that the policy returned.
-
-        Raises:
-            InvalidActionError: The policy did not return one action for each decision.
-            BaseException: Any exception of the policy.
-        """
+        """Ask the policy about the stacked observations of waiting episodes; return the actions, and the extras."""
         asked = self.asked
         infos: list[Any] = []
         if asked.informed:
@@ -261,7 +239,7 @@ def run(
     finish: Callable[[int, Any], Callable[[], None] | None],
     watcher: Watcher | None = None,
 ) -> None:
-    """Run one simulation per seed. Batched policies answer the decisions.
+    """Run one simulation per seed. Batched policies answer the decisions. After an error, all simulations are unwound.
 
     Args:
         plan: The plan of the episodes, with a ``PolicyKey`` for each policy.
@@ -270,9 +248,6 @@ def run(
         finish: Called with the index of a seed and its simulation when the simulation has ended. If it returns a
             callable, that is called after the simulation is closed.
         watcher: The observer of rewards and ends. None: agents are not rewarded.
-
-    Raises:
-        BaseException: Any exception of a model, a mapping, a policy or ``finish``. All simulations are unwound.
     """
     with outside_simulation(), processes_kept():
         _Simulations(plan, seeds, size, finish, watcher).run()
@@ -358,7 +333,7 @@ class _Simulations:
             return
         group = agent.group
         if group is None:
-            group = agent.group = agent.policy.group(agent.point)
+            group = agent.group = agent.policy.asked.group(agent.point)
             self._groups[group] = None
         group.waiting.append(episode)
         group.places.append(place)

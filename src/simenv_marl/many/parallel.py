@@ -19,15 +19,7 @@ EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots"}
 
 
 def import_extra(module: str, feature: str) -> Any:
-    """Import a module that an extra installs.
-
-    Args:
-        module: The dotted name of the module.
-        feature: The feature that needs it, for the error message.
-
-    Raises:
-        MissingExtraError: The module is not installed.
-    """
+    """Import a module that an extra installs, or raise an error that says which feature needs which extra."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -37,16 +29,7 @@ def import_extra(module: str, feature: str) -> Any:
 
 
 def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
-    """Return a progress bar that counts simulations, or other units.
-
-    Args:
-        total: The number of units.
-        unit: The name of the unit.
-        done: The number of units that are done already.
-
-    Raises:
-        MissingExtraError: tqdm is not installed.
-    """
+    """Return a progress bar over ``total`` units, of which some are done already."""
     return import_extra("tqdm.auto", "progress=True").tqdm(total=total, unit=unit, initial=done)
 
 
@@ -58,23 +41,18 @@ def spread(
     least: int,
     share: int = 4,
 ) -> Iterator[tuple[int, Any]]:
-    """Run a function in worker processes, each call on a part of the seeds.
+    """Call ``work`` with the arguments and a part of the seeds (or of other items) in worker processes, for all parts.
 
     Args:
-        work: A function of this package. It is called with the arguments and a list of seeds.
-        arguments: The arguments.
-        seeds: All seeds, or other items to divide.
+        work: A function of this package.
+        arguments: Its arguments before the seeds.
+        seeds: All seeds.
         workers: The number of worker processes. -1: as many as joblib's backend has.
         least: The smallest size of a part, as long as every worker gets some seeds.
         share: The number of parts per process.
 
     Yields:
         The number of seeds of a part, and the function's result; in the order of the seeds.
-
-    Raises:
-        MissingExtraError: joblib is not installed.
-        WorkerError: An error in a worker could not be sent here as itself.
-        BaseException: Any exception of the function.
     """
     joblib = import_extra("joblib", f"workers={workers}")
     processes = max(1, joblib.effective_n_jobs(workers))
@@ -118,11 +96,7 @@ _received: Final[set[str]] = set()
 
 
 def packed_with_names(thing: Any) -> bytes:
-    """Pickle an object for workers, with the functions of this process's script that it refers to by dotted name.
-
-    Raises:
-        Exception: Any exception of pickling it.
-    """
+    """Pickle an object for workers, with the functions of this process's script that it refers to by dotted name."""
     parcel, main = pack((thing, {})), sys.modules["__main__"]
     named = {name.decode(): getattr(main, name.decode(), None) for name in set(_IN_SCRIPT.findall(parcel))}
     named = {name: found for name, found in named.items() if isinstance(found, (type, FunctionType))}

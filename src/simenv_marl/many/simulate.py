@@ -152,11 +152,7 @@ def _simulate(
 
 
 def checked_seeds(seeds: Any) -> list[int]:
-    """Return seeds as a list of Python integers.
-
-    Raises:
-        OptionValueError: These are not valid seeds.
-    """
+    """Return seeds as a list of Python integers, or raise an error that says why they are not valid."""
     if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
         raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {short_repr(seeds)}")
     checked = []
@@ -168,11 +164,7 @@ def checked_seeds(seeds: Any) -> list[int]:
 
 
 def checked_policies(policies: Any) -> Mapping[Any, Any]:
-    """Return policies as a mapping.
-
-    Raises:
-        OptionValueError: They are not a mapping.
-    """
+    """Return policies as a mapping."""
     if policies is not None and not isinstance(policies, Mapping):
         raise OptionValueError(
             f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
@@ -181,21 +173,13 @@ def checked_policies(policies: Any) -> Mapping[Any, Any]:
 
 
 def check_collect(collect: Any) -> None:
-    """Check the argument ``collect``.
-
-    Raises:
-        OptionValueError: It is not a callable.
-    """
+    """Check that the argument ``collect`` is a callable or None."""
     if collect is not None and not callable(collect):
         raise OptionValueError(f"collect must be a callable of a simulation, or None, not {short_repr(collect)}")
 
 
 def check_numbers(batch_size: Any, workers: Any) -> None:
-    """Check ``batch_size`` and ``workers``.
-
-    Raises:
-        OptionValueError: One of the numbers is invalid.
-    """
+    """Check that ``batch_size`` and ``workers`` are valid."""
     for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"

@@ -328,6 +328,21 @@ def test_workers_that_are_killed_between_steps_are_noticed():
         assert envs.closed
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+def test_a_worker_that_dies_in_a_call_ends_all_episodes():
+    envs = workers(Failing)
+    envs.reset(seed=0)
+    os.kill(processes_of(envs)[0], signal.SIGKILL)
+    with pytest.raises(WorkerError, match="worker 0 .* exit code -9"):
+        envs.call("simulation")
+    for use in (lambda: envs.step(ONES), lambda: envs.reset(options={"reset_mask": np.array([0, 0, 0, 1], bool)})):
+        with pytest.raises(EpisodeOverError, match="an error has ended the episodes"):
+            use()
+    envs.reset(seed=0)
+    assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
+    envs.close()
+
+
 def test_errors_survive_pickling():
     envs = workers(Failing)
     envs.reset(seed=0, options={1: 7})

@@ -21,7 +21,7 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import cloudpickle
 
 from ..decision import Definition, unwrapped
-from ..errors import WorkerError, annotate, describe_error, error_notes
+from ..errors import WorkerError, describe_error, error_notes
 from ..hooks.hook import Hook, hook_of, made_with
 
 
@@ -95,7 +95,7 @@ def pack_error(error: BaseException) -> bytes:
     except Exception:
         other = WorkerError(f"another process raised an error that cannot be pickled: {describe_error(error)}")
         for note in error_notes(error):
-            annotate(other, note)
+            other.add_note(note)
         parcel = pack(other)
     return pickle.dumps((parcel, text), 5)
 
@@ -150,12 +150,14 @@ _known: WeakValueDictionary[str, Any] = WeakValueDictionary()
 
 def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
     """How another process finds or makes a function that its name does not lead to; None for all others."""
-    found = _import(function.__module__, function.__qualname__)
-    for look in (_unbound, unwrapped):
-        if found is not function and look(found) is function:
-            return _find, (look, function.__module__, function.__qualname__)
+    place = function.__module__, function.__qualname__
+    if _import(*place) is function:
+        return None
+    for rule in (False, True):
+        if _find(*place, rule) is function:
+            return _find, (*place, rule)
     hook = hook_of(function)
-    if found is function or hook is None:
+    if hook is None:
         return None
     token = _tokens.setdefault(function, uuid4().hex)
     _known[token] = function
@@ -172,12 +174,10 @@ def _import(module: str | None, path: str) -> Any:
         return None
 
 
-def _unbound(found: Any) -> Any:
-    return getattr(found, "__func__", found)
-
-
-def _find(look: Callable[[Any], Any], module: str, path: str) -> Any:
-    return look(_import(module, path))
+def _find(module: str | None, path: str, rule: bool) -> Any:
+    """Import a function, without the class that binds it, or the rule behind a decision function."""
+    found = _import(module, path)
+    return unwrapped(found) if rule else getattr(found, "__func__", found)
 
 
 def _make_wrapper(token: str, hook: Hook, definition: Definition | None) -> Any:

@@ -88,30 +88,27 @@ def empty(space: spaces.Space[Any]) -> Any:
 
 def stack_masks(masks: Sequence[Any]) -> Any:
     """Stack masks of one action space."""
-    if masks and isinstance(masks[0], tuple):
-        return tuple(np.stack(part) for part in zip(*masks, strict=True))
-    return np.stack(masks)
+    return _map(lambda *arrays: np.stack(arrays), *masks)
 
 
 def taken(stack: Any, index: NDArray[Any]) -> Any:
     """Take the rows of a stack with the given indices, in that order."""
-    if isinstance(stack, Mapping):
-        return {key: taken(part, index) for key, part in stack.items()}
-    if isinstance(stack, tuple):
-        return tuple(taken(part, index) for part in stack)
-    return stack[index]
+    return _map(lambda array: array[index], stack)
 
 
 def joined(stacks: Sequence[Any]) -> Any:
     """Concatenate stacks of the same space."""
-    if len(stacks) == 1:
-        return stacks[0]
+    return stacks[0] if len(stacks) == 1 else _map(lambda *arrays: np.concatenate(arrays), *stacks)
+
+
+def _map(function: Callable[..., Any], *stacks: Any) -> Any:
+    """Call a function of arrays with the arrays in the same place of several stacks, for each place."""
     first = stacks[0]
     if isinstance(first, Mapping):
-        return {key: joined([stack[key] for stack in stacks]) for key in first}
+        return {key: _map(function, *(stack[key] for stack in stacks)) for key in first}
     if isinstance(first, tuple):
-        return tuple(joined(parts) for parts in zip(*stacks, strict=True))
-    return np.concatenate(stacks)
+        return tuple(_map(function, *parts) for parts in zip(*stacks, strict=True))
+    return function(*stacks)
 
 
 def rows(stack: Any, *, integers: bool) -> list[Any] | None:

@@ -63,7 +63,8 @@ def spread(
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
     except ValueError:  # this backend returns nothing before all work is done
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1)
-    outcomes = parallel(joblib.delayed(_work)(parcel, part) for part in parts)
+    # Errors are packed in the worker, because each backend would pass them on in its own way.
+    outcomes = parallel(joblib.delayed(pack_outcome)(pack, _work, parcel, part) for part in parts)
     try:
         for part, outcome in zip(parts, outcomes, strict=True):
             result, error = unpack_outcome(outcome)
@@ -77,12 +78,8 @@ def spread(
                 outcomes.close()
 
 
-def _work(parcel: bytes, seeds: list[Any]) -> bytes:
-    """Run the function, in a worker. Its error is packed here because each backend would pass it on in its own way."""
-    return pack_outcome(pack, _call, parcel, seeds)
-
-
-def _call(parcel: bytes, seeds: list[Any]) -> Any:
+def _work(parcel: bytes, seeds: list[Any]) -> Any:
+    """Call the function, in a worker."""
     work, arguments = _unpack_with_names(parcel)
     return work(*arguments, seeds)
 

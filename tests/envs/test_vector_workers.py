@@ -333,7 +333,7 @@ def test_a_worker_that_dies_in_a_call_ends_all_episodes():
     envs = workers(Failing)
     envs.reset(seed=0)
     os.kill(processes_of(envs)[0], signal.SIGKILL)
-    with pytest.raises(WorkerError, match="worker 0 .* exit code -9"):
+    with pytest.raises(WorkerError, match=r"worker 0 .* exit code -9"):
         envs.call("simulation")
     for use in (lambda: envs.step(ONES), lambda: envs.reset(options={"reset_mask": np.array([0, 0, 0, 1], bool)})):
         with pytest.raises(EpisodeOverError, match="an error has ended the episodes"):

@@ -7,9 +7,9 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from simenv_marl.core import processes
+from simenv_marl.core import packing
+from simenv_marl.core.packing import pack, unpack
 from simenv_marl.core.points import aliases, find_point, find_points, locate, own_points, portable
-from simenv_marl.core.processes import pack, unpack
 from simenv_marl.decision import point_of, registered, unwrapped
 from simenv_marl.errors import UnknownPointError
 from simenv_marl.hooks.hook import hook_of
@@ -155,7 +155,7 @@ def test_functions_are_themselves_again_in_other_processes(monkeypatch):
     """The name leads there, whatever binds them: nothing is made anew."""
     functions = [Base.decorated, Base.plain, Base.of_class.__func__]
     parcels = list(map(pack, functions))
-    monkeypatch.setattr(processes, "_known", {})  # as where nothing has come from yet
+    monkeypatch.setattr(packing, "_known", {})  # as where nothing has come from yet
     assert list(map(unpack, parcels)) == functions
 
 

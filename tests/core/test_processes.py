@@ -14,7 +14,7 @@ import pytest
 from gymnasium import spaces
 
 from simenv_marl import branch, make_step, simulate_many, single_env, vector_env
-from simenv_marl.core.processes import RemoteTraceback, pack_error, unpack_error
+from simenv_marl.core.packing import RemoteTraceback, pack_error, unpack_error
 from simenv_marl.errors import BranchError, InvalidActionError, NoDecisionError, WorkerError, error_text
 from tests.worlds.counters import FORK, FORKS
 
@@ -217,7 +217,7 @@ def members_of(error):
     return found
 
 
-def assert_alike(one, other, seen=()):
+def assert_alike(one, other):
     """What came is what went, with all that belongs to it."""
     assert type(one) is type(other)
     assert error_text(one) == error_text(other)
@@ -228,20 +228,18 @@ def assert_alike(one, other, seen=()):
     if isinstance(one, BaseExceptionGroup):
         assert len(one.exceptions) == len(other.exceptions)
         for mine, theirs in zip(one.exceptions, other.exceptions, strict=True):
-            if id(mine) not in seen:
-                assert_alike(mine, theirs, (*seen, id(one)))
+            assert_alike(mine, theirs)
     elif type(one) is not Reduced:
         assert repr(one.args) == repr(other.args) or type(one) is Unspeakable
-    cause = one.__cause__ or (None if one.__suppress_context__ else one.__context__)
-    if cause is not None and id(cause) not in seen:
-        theirs = other.__context__ if one.__cause__ is None else other.__cause__
-        assert_alike(cause, theirs, (*seen, id(one)))
 
 
-def first_cause(error):
-    while error.__cause__ or error.__context__:
-        error = error.__cause__ or error.__context__
-    return error
+def causes_of(error):
+    """The causes of an error that a traceback shows, without the error."""
+    found = []
+    while error is not None and all(error is not known for known in found):
+        found.append(error)
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return found[1:]
 
 
 @pytest.mark.parametrize("make", ERRORS.values(), ids=ERRORS)
@@ -250,8 +248,9 @@ def test_errors_cross_with_all_that_belongs_to_them(make):
     again = unpack_error(pack_error(error))
     assert again is not error
     assert_alike(error, again)
-    assert type(first_cause(again)) is RemoteTraceback
-    assert type(error).__name__ in str(first_cause(again))
+    assert type(again.__cause__) is RemoteTraceback
+    for known in (error, *causes_of(error)):
+        assert type(known).__name__ in str(again.__cause__)
     assert_alike(error, unpack_error(pack_error(again)))  # and once more
     traceback.format_exception(again)
 
@@ -290,14 +289,15 @@ def test_what_cannot_cross_is_told_of_with_its_notes_and_causes(make):
     assert type(again) is WorkerError
     assert f"cannot be pickled: {type(error).__name__}: {error_text(error)}" in str(again)
     assert again.__notes__ == ["a note"]
-    assert again.__cause__.filename == "/nowhere"
-    group = ExceptionGroup("several", [error, Keywords(count=3)])
-    other, last = unpack_error(pack_error(group)).exceptions
-    assert (type(other), type(last), last.count) == (WorkerError, Keywords, 3)
+    assert "/nowhere" in str(again.__cause__)
+    group = unpack_error(pack_error(noted(ExceptionGroup("several", [error, Keywords(count=3)]), "another")))
+    assert type(group) is WorkerError
+    assert "cannot be pickled: ExceptionGroup: several (2 sub-exceptions)" in str(group)
+    assert group.__notes__ == ["another"]
+    assert type(error).__name__ in str(group.__cause__)
     outer = Many(1, 2, 3)
     outer.__context__ = error
-    again = unpack_error(pack_error(outer))
-    assert (type(again), type(again.__context__)) == (Many, WorkerError)
+    assert_alike(outer, unpack_error(pack_error(outer)))
 
 
 @pytest.mark.parametrize("notes", ["text", 3, None, ("one", "two"), {}, [3, "one"], [[]]], ids=str)
@@ -314,10 +314,8 @@ def test_a_long_chain_crosses():
         cause, error = error, ValueError(number)
         error.__cause__ = cause
     again = unpack_error(pack_error(error))
-    for number in reversed(range(3000)):
-        assert again.args == (number,)
-        again = again.__cause__
-    assert type(again) is RemoteTraceback
+    assert_alike(error, again)
+    assert "ValueError: 0\n" in str(again.__cause__)
 
 
 # -- from simulations ---------------------------------------------------------------------------------
@@ -372,7 +370,7 @@ def assert_alike_but_raised(one, other):
     assert {name: vars(other)[name] for name in mine if name != "lock"} == {
         name: vars(one)[name] for name in mine if name != "lock"
     }
-    assert "in run" in str(first_cause(other))
+    assert "in run" in str(other.__cause__)
 
 
 @FORKS

@@ -22,7 +22,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simenv_marl import make_step, vector_env
-from simenv_marl.envs.worker import is_shareable
 from simenv_marl.errors import (
     ClosedError,
     EpisodeOverError,
@@ -329,6 +328,21 @@ def test_workers_that_are_killed_between_steps_are_noticed():
         assert envs.closed
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="there is no SIGKILL")
+def test_a_worker_that_dies_in_a_call_ends_all_episodes():
+    envs = workers(Failing)
+    envs.reset(seed=0)
+    os.kill(processes_of(envs)[0], signal.SIGKILL)
+    with pytest.raises(WorkerError, match=r"worker 0 .* exit code -9"):
+        envs.call("simulation")
+    for use in (lambda: envs.step(ONES), lambda: envs.reset(options={"reset_mask": np.array([0, 0, 0, 1], bool)})):
+        with pytest.raises(EpisodeOverError, match="an error has ended the episodes"):
+            use()
+    envs.reset(seed=0)
+    assert envs.step(ONES)[0][:, 0].tolist() == [1, 1, 1, 1]
+    envs.close()
+
+
 def test_errors_survive_pickling():
     envs = workers(Failing)
     envs.reset(seed=0, options={1: 7})
@@ -409,16 +423,8 @@ def test_workers_of_an_environment_that_is_dropped_may_finish(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "2", "3"]
 
 
-def test_what_is_shared_are_arrays_of_one_size():
-    number, text = spaces.Discrete(3), spaces.Text(3)
-    for part, expected in ((number, True), (text, False)):
-        assert is_shareable(part) is expected
-        assert is_shareable(spaces.Dict(first=number, second=part)) is expected
-        assert is_shareable(spaces.Tuple([number, part])) is expected
-
-
 def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
-    monkeypatch.setattr("simenv_marl.envs.workers.SECONDS_TO_CLOSE", 0.5)
+    monkeypatch.setattr("simenv_marl.envs.vector_workers.SECONDS_TO_CLOSE", 0.5)
     envs = workers(Hanging)
     envs.reset(seed=0)
     with pytest.warns(ResourceWarning, match="did not close"):

@@ -18,7 +18,7 @@ from simenv_marl import RULE, difference, make_step, simulate_many
 from simenv_marl.data import collect_episodes
 from simenv_marl.errors import InvalidActionError, WorkerError
 from simenv_marl.experiments import Variant
-from simenv_marl.many import spread
+from simenv_marl.many import parallel
 from simenv_marl.plugins import expose_to_plugins
 from tests.processes import alone, descriptors
 from tests.worlds.many_worlds import Colony, Creature, Design, colony_points
@@ -211,7 +211,7 @@ def test_an_error_that_cannot_be_pickled_is_told_of():
 def test_what_nobody_wants_any_more_is_cancelled(monkeypatch):
     """An interrupt while results arrive: the rest is given up, and nothing is in the way of the next call."""
     with monkeypatch.context() as patch:
-        patch.setattr("simenv_marl.many.spread.unpack", interrupted)
+        patch.setattr("simenv_marl.many.parallel.unpack_outcome", interrupted)
         with pytest.raises(KeyboardInterrupt):
             traces(seeds=range(40), workers=2, batch_size=1)
     assert len(traces(seeds=range(2), workers=2)) == 2
@@ -296,8 +296,8 @@ def test_backends_that_tell_nothing_before_the_end_share_the_work_as_well(monkey
     class Silent(ThreadingBackend):
         supports_return_generator = False
 
-    sizes, work = [], spread._work
-    monkeypatch.setattr(spread, "_work", lambda parcel, seeds: (sizes.append(len(seeds)), work(parcel, seeds))[1])
+    sizes, work = [], parallel._work
+    monkeypatch.setattr(parallel, "_work", lambda parcel, seeds: (sizes.append(len(seeds)), work(parcel, seeds))[1])
     monkeypatch.setitem(joblib.parallel.BACKENDS, "silent", Silent)
     with joblib.parallel_config(backend="silent"):
         assert traces(seeds=range(9), workers=2, batch_size=1) == traces(seeds=range(9))

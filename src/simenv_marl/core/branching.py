@@ -27,7 +27,7 @@ from ..errors import (
     short_repr,
 )
 from .forking import Standing, end_with
-from .processes import pack_error, pack_plainly, unpack, unpack_error
+from .packing import pack_error, pack_plainly, unpack, unpack_error
 from .reuse import reuse_resources
 from .rng import is_seed, process_kept, seed_process
 

@@ -22,36 +22,25 @@ SMALL: Final = 1024
 
 
 def stacker(space: spaces.Space[Any], *, cast: bool = False, other: Stacker | None = None) -> Stacker:
-    """Make the function that stacks elements of a space.
+    """Make the function that stacks elements of a space. The stack shares no memory with them.
 
     Args:
         space: The space.
         cast: Whether the items already have the space's dtype and shape, as observations have. If False, they are cast.
         other: A function that stacks elements of a space without a shape. None: they become an array of objects.
-
-    Returns:
-        A function that takes the items, and the stack to write them into. The stack shares no memory with the items.
     """
-    if isinstance(space, spaces.Dict):
-        parts = {key: stacker(part, cast=cast, other=other) for key, part in space.spaces.items()}
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        parts = {key: stacker(part, cast=cast, other=other) for key, part in inner}
 
-        def stack_dicts(items: Sequence[Any], out: Any = None) -> Any:
-            return {
+        def stack_parts(items: Sequence[Any], out: Any = None) -> Any:
+            stacks = {
                 key: part([item[key] for item in items], None if out is None else out[key])
                 for key, part in parts.items()
             }
+            return stacks if isinstance(space, spaces.Dict) else tuple(stacks.values())
 
-        return stack_dicts
-    if isinstance(space, spaces.Tuple):
-        places = tuple(stacker(part, cast=cast, other=other) for part in space.spaces)
-
-        def stack_tuples(items: Sequence[Any], out: Any = None) -> Any:
-            return tuple(
-                part([item[place] for item in items], None if out is None else out[place])
-                for place, part in enumerate(places)
-            )
-
-        return stack_tuples
+        return stack_parts
     if isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)):
         return _array_stacker(space.dtype, space.shape or (), cast=cast)
     if other is None:
@@ -99,45 +88,35 @@ def empty(space: spaces.Space[Any]) -> Any:
 
 def stack_masks(masks: Sequence[Any]) -> Any:
     """Stack masks of one action space."""
-    if masks and isinstance(masks[0], tuple):
-        return tuple(np.stack(part) for part in zip(*masks, strict=True))
-    return np.stack(masks)
+    return _map(lambda *arrays: np.stack(arrays), *masks)
 
 
 def taken(stack: Any, index: NDArray[Any]) -> Any:
     """Take the rows of a stack with the given indices, in that order."""
-    return _each(lambda array: array[index], stack)
+    return _map(lambda array: array[index], stack)
 
 
 def joined(stacks: Sequence[Any]) -> Any:
     """Concatenate stacks of the same space."""
-    if len(stacks) == 1:
-        return stacks[0]
+    return stacks[0] if len(stacks) == 1 else _map(lambda *arrays: np.concatenate(arrays), *stacks)
+
+
+def _map(function: Callable[..., Any], *stacks: Any) -> Any:
+    """Call a function of arrays with the arrays in the same place of several stacks, for each place."""
     first = stacks[0]
     if isinstance(first, Mapping):
-        return {key: joined([stack[key] for stack in stacks]) for key in first}
+        return {key: _map(function, *(stack[key] for stack in stacks)) for key in first}
     if isinstance(first, tuple):
-        return tuple(joined(parts) for parts in zip(*stacks, strict=True))
-    return np.concatenate(stacks)
-
-
-def _each(function: Callable[[NDArray[Any]], NDArray[Any]], stack: Any) -> Any:
-    if isinstance(stack, Mapping):
-        return {key: _each(function, part) for key, part in stack.items()}
-    if isinstance(stack, tuple):
-        return tuple(_each(function, part) for part in stack)
-    return function(stack)
+        return tuple(_map(function, *parts) for parts in zip(*stacks, strict=True))
+    return function(*stacks)
 
 
 def rows(stack: Any, *, integers: bool) -> list[Any] | None:
-    """Split the return value of a batched policy into one action for each decision.
+    """Split what a batched policy returned into one action for each decision; None if it cannot be split.
 
     Args:
         stack: An array, an object that converts to one (a tensor), a sequence, or a dict of these.
         integers: Whether to return integers as Python integers.
-
-    Returns:
-        The rows; None if the value cannot be split into rows.
     """
     if isinstance(stack, Mapping):
         parts = [rows(part, integers=False) for part in stack.values()]
@@ -145,17 +124,14 @@ def rows(stack: Any, *, integers: bool) -> list[Any] | None:
         if not columns or len(columns) < len(parts) or len({len(column) for column in columns}) > 1:
             return None
         return [dict(zip(stack, row, strict=True)) for row in zip(*columns, strict=True)]
-    if not isinstance(stack, (np.ndarray, list, tuple)):
-        if hasattr(stack, "__array__"):
-            stack = np.asarray(stack)
-        elif isinstance(stack, Iterable) and not isinstance(stack, (str, bytes)):
-            return list(stack)
-        else:
+    if hasattr(stack, "__array__"):
+        array = np.asarray(stack)
+        if array.ndim == 0:
             return None
-    if isinstance(stack, np.ndarray):
-        if stack.ndim == 0:
-            return None
-        if integers and stack.ndim == 1 and stack.dtype.kind in "iu":
-            integral: list[int] = stack.tolist()  # the check of Python integers is the fastest
+        if integers and array.ndim == 1 and array.dtype.kind in "iu":
+            integral: list[int] = array.tolist()  # the check of Python integers is the fastest
             return integral
-    return list(stack)
+        return list(array)
+    if isinstance(stack, Iterable) and not isinstance(stack, (str, bytes)):
+        return list(stack)
+    return None

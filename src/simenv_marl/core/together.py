@@ -8,11 +8,15 @@ from typing import Any
 from greenlet import getcurrent
 
 from ..hooks.stacks import EVALUATING
-from .driver import WAIT
+from .agent import WAIT
 from .episode import Episode
 
 
-def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callable[[int, BaseException], None]) -> None:
+def step_all(
+    episodes: Sequence[Episode],
+    actions: Sequence[Any],
+    blame: Callable[[int, BaseException], None] = lambda number, error: None,
+) -> None:
     """Answer the pending decisions of many episodes, and run each episode to its next decision.
 
     All simulations move before any agent is updated, so that the data of each loop stays in the processor's caches.
@@ -26,10 +30,6 @@ def step_all(episodes: Sequence[Episode], actions: Sequence[Any], blame: Callabl
         BaseException: See ``Episode.step``. The other episodes may have moved or not. They can be closed.
     """
     agents: list[Any] = [episode.pending for episode in episodes]
-    for number, agent in enumerate(agents) if None in agents else ():
-        if agent is None and not episodes[number].unreported_end:
-            blame(number, error := episodes[number].refusal())
-            raise error
     callers = {episode.driver.caller for episode in episodes}
     together = callers == {getcurrent()} and not EVALUATING and None not in agents and episodes[0].plugins is None
     number = 0

@@ -10,8 +10,8 @@ from ..core.plan import Plan
 from ..core.points import Points
 from ..errors import DefinitionError
 from ..many.batch import BatchPolicy, PolicyKey, policy_keys, run
+from ..many.parallel import progress_bar, spread
 from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
-from ..many.spread import progress_bar, spread
 from ..simulation import RULE
 from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionValueError, short_repr
-from ..many.spread import import_extra
+from ..many.parallel import import_extra
 from .trajectories import Trajectories
 
 if TYPE_CHECKING:

@@ -15,7 +15,6 @@ from .joint import SimulationJointEnv
 from .parallel import SimulationParallelEnv
 from .single import SimulationEnv, single_view
 from .vector import SimulationVectorEnv
-from .worker import Recipe
 
 VIEWS: Final = ("aec", "parallel", "single", "joint")
 
@@ -198,7 +197,10 @@ def vector_env(
         SimEnvError: Something cannot work. The subclass tells what.
     """
     return SimulationVectorEnv(
-        Recipe(simulation, points, options, view),
+        simulation,
+        points,
+        options,
+        view,
         num_envs=num_envs,
         workers=workers,
         copy=copy,

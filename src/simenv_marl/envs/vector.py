@@ -1,13 +1,14 @@
 """The vector view: many copies of a simulation, stepped together."""
 
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from threading import Lock
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space, create_empty_array
+from gymnasium.vector.utils import batch_space, iterate
 from numpy.typing import NDArray
 
 from ..core.session import checked_seed
@@ -16,16 +17,16 @@ from ..errors import (
     ClosedError,
     CopyError,
     EpisodeOverError,
+    InvalidActionError,
     NotResetError,
     OptionValueError,
     ReentrancyError,
     short_repr,
 )
-from .batches import Actions, Batch
+from ..simulation import RULE
 from .one_agent import OneAgentView
-from .rows import Row, SubEnvironments
-from .worker import Recipe
-from .workers import Workers
+from .vector_batch import Infos, SimulationBatch, State, SubEnvironmentType, checked_actions
+from .vector_workers import WorkerPool
 
 
 class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
@@ -44,7 +45,10 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
     def __init__(
         self,
-        recipe: Recipe,
+        simulation: Any,
+        points: Any,
+        options: Mapping[str, Any],
+        view: str | None = None,
         *,
         num_envs: int,
         workers: int = 0,
@@ -52,7 +56,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         context: Any = None,
     ) -> None:
-        """Make the environment of a recipe; the other arguments are those of ``vector_env``.
+        """Make the environment; the arguments are those of ``vector_env``.
 
         Raises:
             SimEnvError: Something cannot work. The subclass tells what.
@@ -63,26 +67,24 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         workers = _count(workers, "workers", 0)
         self._mode = _mode(autoreset_mode)
         self._copy = bool(copy)
-        plan = recipe.plan()
-        common = SubEnvironments(plan, recipe.view)
+        kind = SubEnvironmentType(simulation, points, options, view)
+        plan = kind.plan
         self.render_mode = plan.options.render_mode
-        self.metadata = {**common.metadata, "autoreset_mode": self._mode}
-        self.single_observation_space = common.single_observation_space
-        self.single_action_space = common.single_action_space
+        self.metadata = {**kind.view.metadata_of(plan), "autoreset_mode": self._mode}
+        self.single_observation_space = kind.observation_space
+        self.single_action_space = kind.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        point = common.plan.active[0] if common.single else None
-        self._actions = Actions(self.single_action_space, self.num_envs, point)
-        self._begun = False
-        self._moving = Lock()
-        self._crew: Row | Workers
+        # The point that takes all actions, if no simulation is needed to check them.
+        self._point = plan.active[0] if kind.joint is None and plan.active[0].legal is None else None
+        self._agent = str(plan.one_agent)
+        self.lock = Lock()
+        self._batch: SimulationBatch | WorkerPool
         if workers:
-            self._crew = Workers(recipe, common, self._mode, self.num_envs, workers, context)
+            self._batch = WorkerPool(kind, self.num_envs, self._mode, workers, context)
         else:
-            batch = Batch(create_empty_array(self.single_observation_space, self.num_envs), self.num_envs)
-            self._crew = Row(common, batch, self._mode, self.num_envs)
-        self._batch = self._crew.batch
-        self._finalizer = weakref.finalize(self, self._crew.abandon)
+            self._batch = SimulationBatch(kind, self.num_envs, self._mode)
+        self._finalizer = weakref.finalize(self, self._batch.abandon)
         self.closed = False
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -107,16 +109,11 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             BaseException: Any exception of a simulation or a mapping, with a note that names the simulation. Then all
                 of them need a reset; the ones after it have not been reset.
         """
-        self._enter()
-        try:
+        with _exclusive(self):
             seeds = self._seeds(seed)
             chosen, options = self._chosen(options)
-            told = self._crew.reset(seeds, options, chosen)
-            self._begun = True
-        finally:
-            self._moving.release()
-        observations = self._batch.observations
-        return duplicate(observations) if self._copy else observations, _merged(told, self.num_envs)
+            observations, infos = self._batch.reset(seeds, options, chosen)
+        return duplicate(observations) if self._copy else observations, self._merged(infos)
 
     def step(
         self, actions: Any
@@ -136,43 +133,61 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             BaseException: Any exception of a simulation or a mapping, with a note that names the simulation. Then all
                 of them need a reset.
         """
-        self._enter()
-        try:
-            crew = self._crew
-            if not self._begun:
+        with _exclusive(self):
+            state = int(self._batch.states.max())
+            if state == State.NEW:
                 raise NotResetError("there is no episode yet; call reset() first")
-            if crew.failed:
+            if state == State.FAILED:
                 raise EpisodeOverError("an error has ended the episodes; call reset() to begin the next ones")
-            ended = crew.ended
-            if ended and self._mode == AutoresetMode.DISABLED:
+            if state == State.ENDED and self._mode == AutoresetMode.DISABLED:
+                ended = np.flatnonzero(self._batch.states == State.ENDED).tolist()
                 raise EpisodeOverError(
-                    f"the episodes of the sub-environments {sorted(ended)[:10]} are over; begin the next ones with"
+                    f"the episodes of the sub-environments {ended[:10]} are over; begin the next ones with"
                     ' reset(options={"reset_mask": ...})'
                 )
-            parts = self._actions.split(actions, ended)
-            if not self._actions.complete:
-                crew.check(parts)
-            told = crew.step(parts)
-        finally:
-            self._moving.release()
-        batch = self._batch
-        observations = batch.observations
-        return (
-            duplicate(observations) if self._copy else observations,
-            batch.rewards.copy(),
-            batch.terminations.copy(),
-            batch.truncations.copy(),
-            _merged(told, self.num_envs),
+            observations, *results, infos = self._batch.step(self._split(actions))
+        return duplicate(observations) if self._copy else observations, *results, self._merged(infos)
+
+    def _merged(self, infos: Infos) -> dict[str, Any]:
+        merged: dict[str, Any] = {}
+        for number, info in infos:
+            merged = self._add_info(merged, info, number)
+        return merged
+
+    def _split(self, actions: Any) -> list[Any]:
+        """Split a batch of actions, and check each action that will be used, before any simulation moves."""
+        if actions is RULE:
+            raise InvalidActionError("RULE is not an action in vector environments; use single_env, or policies=")
+        point, space = self._point, self.single_action_space
+        if point is None:
+            return self._batch.check(self._apart(actions))
+        if type(actions) is np.ndarray and actions.shape == (self.num_envs, *(space.shape or ())):
+            if isinstance(space, spaces.Discrete) and actions.dtype.kind in "iu":
+                if actions.min() >= space.start and actions.max() < space.start + space.n:
+                    return actions.tolist()  # type: ignore[no-any-return]
+            elif (
+                isinstance(space, spaces.Box)
+                and actions.dtype is space.dtype
+                and ((actions >= space.low) & (actions <= space.high)).all()
+            ):
+                return list(actions.copy())  # so that the caller cannot change them
+        return checked_actions(
+            self._apart(actions), self._batch.states, lambda _, action: point.checked(action, self._agent, None)
         )
 
-    def _enter(self) -> None:
-        if self.closed:
-            raise ClosedError("the environment is closed; make a new one")
-        if not self._moving.acquire(blocking=False):
-            raise ReentrancyError(
-                "the environment was used from inside its own simulations or mappings, or while another thread was"
-                " stepping, resetting or closing it"
+    def _apart(self, actions: Any) -> list[Any]:
+        try:
+            apart = list(iterate(self.action_space, actions))
+        except Exception as error:
+            raise InvalidActionError(
+                f"{short_repr(actions)} is not a batch of {self.num_envs} actions of"
+                f" {short_repr(self.single_action_space)}"
+            ) from error
+        if len(apart) != self.num_envs:
+            raise InvalidActionError(
+                f"there are {len(apart)} actions for {self.num_envs} simulations: {short_repr(actions)}"
             )
+        return apart
 
     def _seeds(self, seed: Any) -> list[int | None]:
         if seed is None or isinstance(seed, (int, np.integer)):
@@ -196,9 +211,10 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         chosen: list[int] = np.flatnonzero(mask).tolist()
         if not chosen:
             raise OptionValueError("reset_mask selects no simulation to reset")
-        if chosen != numbers and not self._begun:
+        state = int(self._batch.states.max())
+        if chosen != numbers and state == State.NEW:
             raise NotResetError("there are no episodes yet; call reset() without a reset_mask first")
-        if chosen != numbers and self._crew.failed:
+        if chosen != numbers and state == State.FAILED:
             raise EpisodeOverError("an error has ended the episodes; call reset() without a reset_mask")
         return chosen, {name: value for name, value in options.items() if name != "reset_mask"}
 
@@ -207,7 +223,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def envs(self) -> list[OneAgentView]:
         """The Gymnasium environments of the simulations, in order."""
-        return list(self._crew.views)
+        return list(self._batch.views)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each sub-environment, or get its attribute.
@@ -224,11 +240,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             ClosedError: The environment is closed.
             BaseException: Any exception of a sub-environment.
         """
-        self._enter()
-        try:
-            return tuple(self._crew.call(name, args, kwargs))
-        finally:
-            self._moving.release()
+        with _exclusive(self):
+            return tuple(self._batch.call(name, args, kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return an attribute of each sub-environment, as a tuple."""
@@ -248,11 +261,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             values = [values] * self.num_envs
         if len(values) != self.num_envs:
             raise OptionValueError(f"there are {len(values)} values for {self.num_envs} simulations")
-        self._enter()
-        try:
-            self._crew.set_attr(name, values)
-        finally:
-            self._moving.release()
+        with _exclusive(self):
+            self._batch.set_attr(name, values)
 
     @property  # type: ignore[misc]  # one generator for each cannot be set as one
     def np_random(self) -> Any:
@@ -277,54 +287,36 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if self.closed:
             return
-        self._enter()
-        try:
-            self._crew.close()
-        finally:
-            self._moving.release()
-            self.closed = not self._crew.suspended
-            if self.closed:
-                self._finalizer.detach()
+        with _exclusive(self):
+            try:
+                self._batch.close()
+            finally:
+                self.closed = self._batch.idle
+                if self.closed:
+                    self._finalizer.detach()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Refuse to be copied or pickled, since the stacks of simulations cannot be."""
         raise CopyError(f"{type(self).__name__} cannot be copied or pickled; make a new one")
 
 
-def _merged(told: Iterable[tuple[int, Any]], number: int) -> dict[str, Any]:
-    """Merge the infos of many simulations, as ``VectorEnv._add_info`` does one by one, but key by key."""
-    columns: dict[str, tuple[list[int], list[Any]]] = {}
-    for index, info in told:
-        for key, value in info.items():
-            column = columns.get(key)
-            if column is None:
-                column = columns[key] = [], []
-            column[0].append(index)
-            column[1].append(value)
-    infos: dict[str, Any] = {}
-    for key, (indices, values) in columns.items():
-        infos[f"_{key}"] = mask = np.zeros(number, np.bool_)
-        mask[indices] = True
-        infos[key] = _column(key, indices, values, number)
-    return infos
+class _exclusive:  # noqa: N801 - it is used like a function
+    """A block in which nobody else can use a vector environment."""
 
+    def __init__(self, env: SimulationVectorEnv) -> None:
+        self._env = env
 
-def _column(key: str, indices: list[int], values: list[Any], number: int) -> Any:
-    first = values[0]
-    column: NDArray[Any]
-    if isinstance(first, dict) and key != "final_obs":
-        return _merged(zip(indices, values, strict=True), number)
-    if key != "final_obs" and (type(first) in (int, float, bool) or isinstance(first, np.number)):
-        column = np.zeros(number, type(first))
-        column[indices] = values
-    elif key != "final_obs" and isinstance(first, np.ndarray):
-        column = np.zeros((number, *first.shape), first.dtype)
-        column[indices] = values
-    else:
-        column = np.full(number, None, object)
-        for index, value in zip(indices, values, strict=True):
-            column[index] = value
-    return column
+    def __enter__(self) -> None:
+        if self._env.closed:
+            raise ClosedError("the environment is closed; make a new one")
+        if not self._env.lock.acquire(blocking=False):
+            raise ReentrancyError(
+                "the environment was used from inside its own simulations or mappings, or while another thread was"
+                " stepping, resetting or closing it"
+            )
+
+    def __exit__(self, *error: object) -> None:
+        self._env.lock.release()
 
 
 def _count(value: Any, name: str, least: int) -> int:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..core.rng import is_seed
 from ..errors import OptionValueError, did_you_mean, short_repr
-from ..many.spread import import_extra
+from ..many.parallel import import_extra
 
 if TYPE_CHECKING:
     from pandas import DataFrame

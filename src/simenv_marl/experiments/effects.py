@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionValueError, did_you_mean, short_repr
-from ..many.spread import import_extra
+from ..many.parallel import import_extra
 from .evaluation import check_metric, check_probability, interval, numbers
 from .runner import RUN_COLUMNS, TEAM
 

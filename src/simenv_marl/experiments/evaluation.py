@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.options import EpisodeOptions
+from ..core.packing import pack
 from ..core.plan import Plan
 from ..core.points import Points
-from ..core.processes import pack
 from ..core.reuse import reuse_resources
 from ..errors import OptionValueError, did_you_mean, short_repr
-from ..many.spread import import_extra, progress_bar, spread
+from ..many.parallel import import_extra, progress_bar, spread
 from .runner import (
     RUN_COLUMNS,
     STATUS_COLUMNS,

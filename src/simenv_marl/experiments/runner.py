@@ -20,8 +20,8 @@ from ..decision import decision_points
 from ..errors import AgentError, OptionValueError, UnknownPointError, annotate, close_after, short_repr, warn_user
 from ..hooks.stacks import outside_simulation
 from ..many.batch import Group, run, takes_identities
+from ..many.parallel import import_extra
 from ..many.simulate import check_numbers, checked_seeds
-from ..many.spread import import_extra
 from ..simulation import RULE
 
 if TYPE_CHECKING:

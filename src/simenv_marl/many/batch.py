@@ -43,7 +43,7 @@ class BatchPolicy:
         informed: Whether it takes the infos.
         identifying: Whether it also takes the identities of the decisions.
         asking: Whether it asks for the environment and therefore answers one decision at a time.
-        groups: The groups of its decisions.
+        groups: The groups of its decisions, by decision point.
     """
 
     def __init__(self, policy: Callable[..., Any]) -> None:
@@ -52,7 +52,7 @@ class BatchPolicy:
         self.informed = self.policy is policy
         self.identifying = self.informed and takes_identities(policy)
         self.asking = isinstance(self.policy, AskingPolicy)
-        self.groups: list[Group] = []
+        self.groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
         return f"the policy of {', '.join(str(getattr(key, '__qualname__', key)) for key in self.keys[:3])}"
@@ -65,10 +65,10 @@ class BatchPolicy:
 
     def group(self, point: Point) -> Group:
         """Return the group of the decisions at a point."""
-        group = next((group for group in self.groups if group.takes(point)), None)
+        group = self.groups.get(point.point)
         if group is None:
-            group = Group(self, point)
-            self.groups.append(group)
+            group = next((known for known in self.groups.values() if known.takes(point)), None) or Group(self, point)
+            self.groups[point.point] = group
         return group
 
 
@@ -78,7 +78,7 @@ def takes_identities(policy: Callable[..., Any]) -> bool:
 
 
 class PolicyKey(DeferredPolicy):
-    """The stand-in for a policy in a plan: the policy, and the key under which it was given.
+    """A batched policy in a plan, with the key under which it was given.
 
     Attributes:
         place: The place of its key in ``policies``.
@@ -88,14 +88,6 @@ class PolicyKey(DeferredPolicy):
     def __init__(self, place: int, asked: BatchPolicy) -> None:
         self.place = place
         self.asked = asked
-        self._groups: dict[DecisionPoint, Group] = {}
-
-    def group(self, point: Point) -> Group:
-        """Return the group of its decisions at a point."""
-        group = self._groups.get(point.point)
-        if group is None:
-            group = self._groups[point.point] = self.asked.group(point)
-        return group
 
     def __call__(self, observation: Any, info: Any) -> Any:
         """Answer one decision, if the policy answers one decision at a time."""
@@ -103,7 +95,7 @@ class PolicyKey(DeferredPolicy):
 
     def alone(self, episode: Any, agent: Any) -> Any:
         """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
-        group = self.group(agent.point)
+        group = self.asked.group(agent.point)
         episode.pending = agent
         try:
             actions, _ = group.ask(group.stack([agent.observation]), [episode])
@@ -125,12 +117,10 @@ class AskingKey(AskingPolicy, PolicyKey):
 
 
 def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[Any, Any]:
-    """Replace policies by their stand-ins for a plan. Values that are not policies stay as they are.
+    """Replace policies by their keys for a plan. Values that are not policies stay as they are.
 
-    Args:
-        policies: The policies.
-        rewarded: Whether episodes wait for policies that ask for the environment, too. Otherwise, such a policy is
-            called where it decides, since it answers one decision at a time.
+    ``rewarded``: whether episodes wait for policies that ask for the environment, too. Otherwise, such a policy is
+    called where it decides, since it answers one decision at a time.
     """
     known: dict[int, BatchPolicy] = {}
     found: dict[Any, Any] = {}
@@ -179,19 +169,7 @@ class Group:
         )
 
     def ask(self, observations: Any, waiting: Sequence[Episode]) -> tuple[list[Any], Mapping[str, Any]]:
-        """Ask the policy for actions.
-
-        Args:
-            observations: The stacked observations of the waiting decisions.
-            waiting: The episodes that wait.
-
-        Returns:
-            The list of actions, and the dict of extras that the policy returned.
-
-        Raises:
-            InvalidActionError: The policy did not return one action for each decision.
-            BaseException: Any exception of the policy.
-        """
+        """Ask the policy about the stacked observations of waiting episodes; return the actions, and the extras."""
         asked = self.asked
         infos: list[Any] = []
         if asked.informed:
@@ -261,7 +239,7 @@ def run(
     finish: Callable[[int, Any], Callable[[], None] | None],
     watcher: Watcher | None = None,
 ) -> None:
-    """Run one simulation per seed. Batched policies answer the decisions.
+    """Run one simulation per seed. Batched policies answer the decisions. After an error, all simulations are unwound.
 
     Args:
         plan: The plan of the episodes, with a ``PolicyKey`` for each policy.
@@ -270,12 +248,9 @@ def run(
         finish: Called with the index of a seed and its simulation when the simulation has ended. If it returns a
             callable, that is called after the simulation is closed.
         watcher: The observer of rewards and ends. None: agents are not rewarded.
-
-    Raises:
-        BaseException: Any exception of a model, a mapping, a policy or ``finish``. All simulations are unwound.
     """
     with outside_simulation(), reuse_resources():
-        _Batches(plan, seeds, size, finish, watcher).run()
+        _Simulations(plan, seeds, size, finish, watcher).run()
 
 
 def _checked(episode: Episode, action: Any) -> Any:
@@ -288,16 +263,12 @@ def _checked(episode: Episode, action: Any) -> Any:
         raise
 
 
-def _blame(number: int, error: BaseException) -> None:
-    """Do nothing: the notes of an error name its seed already."""
-
-
 CROWD: Final = 256
 """The number of simulations at first. With more, each has left the processor's caches when its turn comes again, and
 takes twice as long. If the policy takes longer than all simulations together, more simulations pay off."""
 
 
-class _Batches:
+class _Simulations:
     """The simulations that are running."""
 
     def __init__(
@@ -313,49 +284,45 @@ class _Batches:
         self._crowd = min(size, CROWD)
         self._next = 0
         self._sessions: dict[int, Session] = {}  # by the place of their seed
-        # Groups by the number of their waiting decisions: place i has those with 2**i to 2**(i + 1) - 1.
-        self._by_size: list[dict[Group, None]] = [{} for _ in range(size.bit_length())]
+        self._groups: dict[Group, None] = {}
 
     def run(self) -> None:
         try:
             self._refill()
             while self._sessions:
-                self._answer(self._largest())
+                # Waiting for large groups saves calls of policies.
+                self._answer(max(self._groups, key=lambda group: len(group.waiting)))
         except BaseException as error:
-            self._unwind(error)
+            for place, session in self._sessions.items():
+                try:
+                    session.close()
+                except BaseException as problem:
+                    where = f"unwinding the simulation of seed {self._seeds[place]}"
+                    annotate(error, f"simenv_marl: {where} raised {short_repr(problem)} as well")
             raise
-
-    def _largest(self) -> Group:
-        """Return a group that has more than half as many waiting decisions as any other.
-
-        Waiting for large groups saves calls of policies. Searching for the very largest group would take longer, the
-        more groups there are.
-        """
-        return next(iter(next(groups for groups in reversed(self._by_size) if groups)))
 
     def _answer(self, group: Group) -> None:
         """Have the decisions of a group answered, and run each simulation to its next decision."""
         waiting, group.waiting = group.waiting, []
         places, group.places = group.places, []
-        seen, group.observations = group.observations, []
-        del self._by_size[len(waiting).bit_length() - 1][group]
+        observations, group.observations = group.observations, []
         watcher, number, begun = self._watcher, len(waiting), perf_counter()
-        kept = None if watcher is None else group.stack(seen)
-        actions, extras = group.ask(group.stack(seen), waiting)
+        recorded = None if watcher is None else group.stack(observations)  # policies may change what they get
+        actions, extras = group.ask(group.stack(observations), waiting)
         asked = perf_counter()
         if watcher is not None:
-            watcher.asking(group, places, waiting, kept)
-        step_all(waiting, list(map(_checked, waiting, actions)), _blame)
+            watcher.asking(group, places, waiting, recorded)
+        step_all(waiting, list(map(_checked, waiting, actions)))
         waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
         for place in places:
-            self._settle(place, waiting.pop())
+            self._queue(place, waiting.pop())
         if watcher is not None:
             watcher.answered(group, actions, extras)
         if 2 * number > self._crowd < self._size and asked - begun > perf_counter() - asked:
             self._crowd = min(self._size, 2 * self._crowd)
         self._refill()
 
-    def _settle(self, place: int, episode: Episode) -> None:
+    def _queue(self, place: int, episode: Episode) -> None:
         """Queue an episode that waits at a decision, or end it if it is over."""
         if self._watcher is not None:
             self._watcher.moved(episode)
@@ -365,24 +332,14 @@ class _Batches:
             return
         group = agent.group
         if group is None:
-            group = agent.group = agent.policy.group(agent.point)
-        gathered = group.waiting
-        gathered.append(episode)
+            group = agent.group = agent.policy.asked.group(agent.point)
+            self._groups[group] = None
+        group.waiting.append(episode)
         group.places.append(place)
         # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
         group.observations.append(agent.observation)
         if self._watcher is None:
             agent.observation = None
-        many = len(gathered)
-        if not many & (many - 1):
-            self._grow(group, many)
-
-    def _grow(self, group: Group, number: int) -> None:
-        """Note that the number of waiting decisions of a group has reached a power of two."""
-        place = number.bit_length() - 1
-        if place:
-            del self._by_size[place - 1][group]
-        self._by_size[place][group] = None
 
     def _refill(self) -> None:
         """Start simulations until the limit is reached."""
@@ -395,7 +352,7 @@ class _Batches:
                 annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
                 raise
             self._sessions[place] = session
-            self._settle(place, session.start(seed, None))
+            self._queue(place, session.start(seed, None))
 
     def _end(self, place: int) -> None:
         session = self._sessions[place]
@@ -409,17 +366,3 @@ class _Batches:
             annotate(error, f"simenv_marl: after the simulation's end; seed {self._seeds[place]}")
             raise
         del self._sessions[place]
-
-    def _unwind(self, error: BaseException) -> None:
-        """Unwind all suspended simulations after an error in one of them."""
-        for place, session in self._sessions.items():
-            try:
-                session.close()
-            except BaseException as problem:
-                annotate(
-                    error,
-                    f"simenv_marl: unwinding the simulation of seed {self._seeds[place]} raised"
-                    f" {short_repr(problem)} as"
-                    " well",
-                )
-        self._sessions.clear()

@@ -13,7 +13,7 @@ from ..core.reuse import reuse_resources
 from ..core.session import Session, checked_seed
 from ..errors import OptionValueError, close_after, short_repr
 from .batch import policy_keys, run
-from .spread import progress_bar, spread
+from .parallel import progress_bar, spread
 
 
 def simulate(
@@ -111,53 +111,47 @@ def simulate_many(
     check_numbers(batch_size, workers)
     check_collect(collect)
     arguments = (simulation, checked_policies(policies), points, collect, int(batch_size), options)
-    # The plan is made here even if workers do the work: errors show up before any work starts.
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(arguments[1])}, unattended=True)
+    if workers:  # errors show up before any work starts
+        _draw_up(simulation, policies or {}, points, options)
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:
-            return _simulate(plan, collect, int(batch_size), checked, bar)
+            return _simulate(*arguments, checked, bar)
         results: list[Any] = []
-        for number, part in spread(_simulate_part, arguments, checked, int(workers), int(batch_size)):
+        for number, part in spread(_simulate, arguments, checked, int(workers), int(batch_size)):
             results += part
             if bar is not None:
                 bar.update(number)
         return results
 
 
-def _simulate_part(
+def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
+    return Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
+
+
+def _simulate(
     simulation: Any,
     policies: Mapping[Any, Any],
     points: Any,
     collect: Callable[[Any], Any] | None,
     batch_size: int,
-    options: dict[str, Any],
+    options: Mapping[str, Any],
     seeds: list[int],
+    bar: Any = None,
 ) -> list[Any]:
-    """Simulate a part of the seeds, in a worker process."""
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
-    return _simulate(plan, collect, batch_size, seeds, None)
-
-
-def _simulate(
-    plan: Plan, collect: Callable[[Any], Any] | None, batch_size: int, seeds: list[int], bar: Any
-) -> list[Any]:
+    """Simulate some of the seeds, in this process."""
     results: list[Any] = [None] * len(seeds)
 
-    def finish(place: int, simulation: Any) -> None:
-        results[place] = simulation if collect is None else collect(simulation)
+    def finish(place: int, ended: Any) -> None:
+        results[place] = ended if collect is None else collect(ended)
         if bar is not None:
             bar.update()
 
-    run(plan, seeds, batch_size, finish)
+    run(_draw_up(simulation, policies, points, options), seeds, batch_size, finish)
     return results
 
 
 def checked_seeds(seeds: Any) -> list[int]:
-    """Return seeds as a list of Python integers.
-
-    Raises:
-        OptionValueError: These are not valid seeds.
-    """
+    """Return seeds as a list of Python integers, or raise an error that says why they are not valid."""
     if isinstance(seeds, (str, bytes)) or not isinstance(seeds, Iterable):
         raise OptionValueError(f"seeds must be an iterable of integers, such as range(100), not {short_repr(seeds)}")
     checked = []
@@ -169,11 +163,7 @@ def checked_seeds(seeds: Any) -> list[int]:
 
 
 def checked_policies(policies: Any) -> Mapping[Any, Any]:
-    """Return policies as a mapping.
-
-    Raises:
-        OptionValueError: They are not a mapping.
-    """
+    """Return policies as a mapping."""
     if policies is not None and not isinstance(policies, Mapping):
         raise OptionValueError(
             f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
@@ -182,21 +172,13 @@ def checked_policies(policies: Any) -> Mapping[Any, Any]:
 
 
 def check_collect(collect: Any) -> None:
-    """Check the argument ``collect``.
-
-    Raises:
-        OptionValueError: It is not a callable.
-    """
+    """Check that the argument ``collect`` is a callable or None."""
     if collect is not None and not callable(collect):
         raise OptionValueError(f"collect must be a callable of a simulation, or None, not {short_repr(collect)}")
 
 
 def check_numbers(batch_size: Any, workers: Any) -> None:
-    """Check ``batch_size`` and ``workers``.
-
-    Raises:
-        OptionValueError: One of the numbers is invalid.
-    """
+    """Check that ``batch_size`` and ``workers`` are valid."""
     for name, value, least in (("batch_size", batch_size, 1), ("workers", workers, -1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             what = "a positive integer" if least == 1 else "a non-negative integer, or -1 for as many as joblib has"

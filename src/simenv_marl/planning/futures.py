@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..core.branching import branch
 from ..errors import BranchError, annotate, short_repr, warn_user
-from ..many.spread import progress_bar
+from ..many.parallel import progress_bar
 from .lookahead import Lookahead
 from .players import player_of
 

@@ -1,0 +1,189 @@
+"""Packing for other processes: simulations, decision functions, policies, results and errors.
+
+Objects that can be imported are pickled by reference, all others by value, such as those of a script or a notebook.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import sys
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from functools import reduce
+from importlib import import_module
+from types import FunctionType, GetSetDescriptorType, MemberDescriptorType
+from typing import Any, Final
+from uuid import uuid4
+from weakref import WeakKeyDictionary, WeakValueDictionary
+
+import cloudpickle
+
+from ..decision import Definition, unwrapped
+from ..errors import WorkerError, describe_error, error_notes
+from ..hooks.hook import Hook, hook_of, made_with
+
+
+def pack(thing: Any) -> bytes:
+    """Pickle an object for any other process."""
+    buffer = io.BytesIO()
+    _Pickler(buffer, 5).dump(thing)
+    return buffer.getvalue()
+
+
+def pack_plainly(thing: Any) -> bytes:
+    """Pickle an object, faster than ``pack``, for a process that ``multiprocessing`` started from the same script."""
+    with suppress(Exception):  # ``pack`` raises the error below
+        plain = pickle.dumps(thing, 5)
+        # Other processes cannot import what is defined in a notebook or an interactive session.
+        if b"__main__" not in plain or hasattr(sys.modules["__main__"], "__file__"):
+            return plain
+    return pack(thing)
+
+
+def unpack(parcel: bytes) -> Any:
+    """Unpickle an object that ``pack`` or ``pack_plainly`` has pickled."""
+    return pickle.loads(parcel)
+
+
+def pack_outcome(pack: Callable[[Any], bytes], function: Callable[..., Any], *args: Any) -> bytes:
+    """Call a function, and pack its result by ``pack``, or the error that it or ``pack`` raises."""
+    try:
+        return pickle.dumps((pack(function(*args)), None), 5)
+    except BaseException as error:
+        return pickle.dumps((None, pack_error(error)), 5)
+
+
+def unpack_outcome(parcel: bytes) -> tuple[Any, BaseException | None]:
+    """Unpack a result, or None and an error, that ``pack_outcome`` has packed."""
+    result, error = pickle.loads(parcel)
+    return (unpack(result), None) if error is None else (None, unpack_error(error))
+
+
+class _Pickler(cloudpickle.Pickler):
+    """A pickler for objects that the default pickling would change: errors, and functions that a patch has wrapped."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        reduced = None
+        if isinstance(obj, FunctionType):
+            reduced = _reduce_function(obj)
+        elif isinstance(obj, BaseException):
+            reduced = _reduce_error(obj)
+        return super().reducer_override(obj) if reduced is None else reduced
+
+
+# -- errors ---------------------------------------------------------------------------------------
+
+
+class RemoteTraceback(Exception):
+    """The cause of an error from another process. Its message is the traceback there, with all causes."""
+
+    def __str__(self) -> str:
+        return f"\n\n{self.args[0]}"
+
+
+def pack_error(error: BaseException) -> bytes:
+    """Pickle an error with its traceback. An error that cannot be pickled becomes a ``WorkerError``."""
+    try:
+        text = "".join(traceback.format_exception(error))
+    except Exception:  # formatting runs code of the error's class, which may fail
+        text = describe_error(error)
+    try:
+        parcel = pack(error)
+        unpack(parcel)  # the class may define pickling that works only in one direction
+    except Exception:
+        other = WorkerError(f"another process raised an error that cannot be pickled: {describe_error(error)}")
+        for note in error_notes(error):
+            other.add_note(note)
+        parcel = pack(other)
+    return pickle.dumps((parcel, text), 5)
+
+
+def unpack_error(parcel: bytes) -> BaseException:
+    """Rebuild an error that ``pack_error`` has packed. Its cause becomes the traceback in the other process."""
+    inner, text = pickle.loads(parcel)
+    error: BaseException = unpack(inner)
+    BaseException.__setattr__(error, "__cause__", RemoteTraceback(text))  # the error's class may be frozen
+    return error
+
+
+_IN_PYTHON: Final = 1 << 9
+"""The flag of classes that were made at run time, as all classes written in Python are."""
+
+
+def _reduce_error(error: BaseException) -> tuple[Any, ...] | None:
+    """How to rebuild an error without a call of its ``__init__``; None if its class itself defines pickling."""
+    kinds = [kind for kind in type(error).__mro__ if kind not in (BaseExceptionGroup, BaseException, object)]
+    if any(kind.__flags__ & _IN_PYTHON and {"__reduce__", "__reduce_ex__"} & vars(kind).keys() for kind in kinds):
+        return None
+    slots = {
+        name: getattr(error, name)
+        for kind in kinds
+        for name, slot in vars(kind).items()
+        if isinstance(slot, (MemberDescriptorType, GetSetDescriptorType)) and not name.startswith("__")
+        if name != "obj" and hasattr(error, name)  # the ``obj`` of an AttributeError may refer to the whole model
+    }
+    attributes = vars(error) | {"__notes__": error_notes(error)}
+    args = (error.message, error.exceptions) if isinstance(error, BaseExceptionGroup) else error.args
+    return _rebuild_error, (type(error), args, slots, attributes)
+
+
+def _rebuild_error(
+    kind: type[BaseException], args: tuple[Any, ...], slots: dict[str, Any], attributes: dict[str, Any]
+) -> BaseException:
+    builtin = next(base for base in kind.__mro__ if not base.__flags__ & _IN_PYTHON)
+    error: BaseException = builtin.__new__(kind, *args)
+    for name, value in {**slots, "args": args}.items():
+        if value is not None or getattr(error, name, error) is not None:
+            BaseException.__setattr__(error, name, value)
+    vars(error).update(attributes)
+    return error
+
+
+# -- functions ------------------------------------------------------------------------------------
+
+_tokens: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
+_known: WeakValueDictionary[str, Any] = WeakValueDictionary()
+"""Functions that were sent or received, by token. A function that comes back is identical to the one that was sent."""
+
+
+def _reduce_function(function: FunctionType) -> tuple[Any, ...] | None:
+    """How another process finds or makes a function that its name does not lead to; None for all others."""
+    place = function.__module__, function.__qualname__
+    if _import(*place) is function:
+        return None
+    for rule in (False, True):
+        if _find(*place, rule) is function:
+            return _find, (*place, rule)
+    hook = hook_of(function)
+    if hook is None:
+        return None
+    token = _tokens.setdefault(function, uuid4().hex)
+    _known[token] = function
+    return _make_wrapper, (token, hook, made_with(function))
+
+
+def _import(module: str | None, path: str) -> Any:
+    """Import the object with a dotted name; None if there is none."""
+    if module is None or module == "__main__":
+        return None
+    try:
+        return reduce(getattr, path.split("."), import_module(module))
+    except (ImportError, AttributeError):
+        return None
+
+
+def _find(module: str | None, path: str, rule: bool) -> Any:
+    """Import a function, without the class that binds it, or the rule behind a decision function."""
+    found = _import(module, path)
+    return unwrapped(found) if rule else getattr(found, "__func__", found)
+
+
+def _make_wrapper(token: str, hook: Hook, definition: Definition | None) -> Any:
+    """Make the decision function that has a token, unless this process has it."""
+    function = _known.get(token)
+    if function is None:
+        function = _known[token] = hook.stand_in(definition)
+        _tokens[function] = token
+    return function

@@ -16,8 +16,8 @@ from ..errors import MaskError, RewardError, short_repr
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import MASK
-from .asking import AskingPolicy
 from .bound import BoundPoint, DeferredPolicy
+from .planner import PlannerPolicy
 from .spaces import duplicate
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class Agent:
     def follow(self, policy: Any) -> None:
         """Let a policy answer the agent's decisions. None: the environment's user answers them."""
         self.policy = policy
-        self.deferred, self.looks = isinstance(policy, DeferredPolicy), isinstance(policy, AskingPolicy)
+        self.deferred, self.looks = isinstance(policy, DeferredPolicy), isinstance(policy, PlannerPolicy)
 
     # -- the arguments of its decision ------------------------------------------------------------
 

@@ -28,11 +28,11 @@ from ..hooks.plugins import Plugins
 from ..hooks.stacks import outside_simulation
 from ..simulation import RULE, SimulationInterface
 from .agent import settling
-from .asking import AskingPolicy, given_session
 from .bound import BoundPoint, DeferredPolicy, given_simulation
 from .drivers import Spare
 from .events import Answered, Decision, Ended, Removed, Told
 from .options import Options
+from .planner import PlannerPolicy, bind_session
 from .points import (
     NamedPoint,
     by_name,
@@ -124,7 +124,7 @@ class Plan:
         self.plugins = Plugins(options.plugins, named_here) if options.plugins else None
         self.wanted = {*self.policies, *declared_agents(options.possible_agents)}
         mappings = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
-        self.looked_into = any(isinstance(p, AskingPolicy) for p in (*by_point.values(), *self.policies.values()))
+        self.looked_into = any(isinstance(p, PlannerPolicy) for p in (*by_point.values(), *self.policies.values()))
         self.asks, self.alone = mappings or self.looked_into, False
         self._bind_points(first=True)
 
@@ -174,8 +174,8 @@ class Plan:
         made._everything = [
             replace(point, definition=given_simulation(point.definition, simulation)) for point in self._everything
         ]
-        made._by_point = {key: given_session(policy, session) for key, policy in self._by_point.items()}
-        made.policies = {key: given_session(policy, session) for key, policy in self.policies.items()}
+        made._by_point = {key: bind_session(policy, session) for key, policy in self._by_point.items()}
+        made.policies = {key: bind_session(policy, session) for key, policy in self.policies.items()}
         made._bind_points(first=False)
         return made
 

@@ -7,8 +7,8 @@ from typing import Any, Final, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.options import EpisodeOptions
+from ..core.planner import PlannerPolicy, is_planner
 from ..core.points import Points
 from ..core.spaces import same as alike
 from ..core.stacking import stacker
@@ -122,7 +122,7 @@ class _AskingOnlooker:
     """An ``_Onlooker`` for a policy that asks for the environment."""
 
     def __init__(self, policy: Any) -> None:
-        self.asked = AskingPolicy(policy)
+        self.asked = PlannerPolicy(policy)
 
     def __call__(self, observation: Any, info: Any, *, _environment: Any) -> Any:
         noted = np.empty((), object)
@@ -131,7 +131,7 @@ class _AskingOnlooker:
 
 
 def _onlooker(policy: Any) -> Any:
-    return _AskingOnlooker(policy) if asks_for_environment(policy) else _Onlooker(policy)
+    return _AskingOnlooker(policy) if is_planner(policy) else _Onlooker(policy)
 
 
 def _compared(found: Trajectories, tolerance: float) -> Comparison:

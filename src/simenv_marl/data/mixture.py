@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.asking import asks_for_environment
+from ..core.planner import is_planner
 from ..core.stacking import rows, taken
 from ..errors import InvalidActionError, OptionValueError, short_repr
 from ..many.batch import BatchPolicy
@@ -45,7 +45,7 @@ class Mixture:
                 raise OptionValueError(
                     f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
                 )
-            if asks_for_environment(policy):
+            if is_planner(policy):
                 raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
             if (
                 isinstance(weight, bool)

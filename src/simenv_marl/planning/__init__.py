@@ -2,16 +2,12 @@
 
 Each module imports only from those below it::
 
-    tree            a policy that looks several decisions ahead
-    policy          a policy that looks one decision ahead
-    values          the values of candidate actions
-    futures         tries candidates on common futures, in branches
-    lookahead       the horizon and discount of a try, and its return
-    players         the deciding agent in a branch, in each view
+    policies        policies that try candidates before they decide
+    values          the values of candidate actions: rollouts on common futures, in branches
+    player          the deciding agent in a branch, in each view
 """
 
-from .policy import RolloutPolicy
-from .tree import TreeSearchPolicy
+from .policies import RolloutPolicy, TreeSearchPolicy
 from .values import ActionValues, action_values
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""The environment for policies that ask for one: the single view of the agent for which the policy decides."""
+"""The environment that a planner gets: the single view of the agent for which it decides."""
 
 from __future__ import annotations
 
@@ -7,33 +7,26 @@ from typing import Any, NoReturn
 
 from gymnasium import spaces
 
-from ..core.agent import Agent
-from ..core.asking import AskingPolicy
 from ..core.session import Session
 from ..errors import BranchError, CopyError, ReentrancyError
 from .single import SimulationEnv
 
 
-class AskedEnv(SimulationEnv):
-    """The single view of an agent while its policy is asked. It serves for ``branch`` and the functions built on it.
+class PlannerEnv(SimulationEnv):
+    """The single view of an agent whose planner is being asked, for ``branch`` and the functions built on it.
 
-    The agent's decision is pending, and the return value of the policy answers it. A branch of it is an ordinary
-    environment: it can be stepped, and returns the agent's observations and rewards. In a branch, policies answer for
-    all other agents, or the rule where there is no policy.
+    The decision is pending until the planner returns an action. A branch is an ordinary environment of the agent, which
+    can be stepped; policies or rules answer for all other agents.
     """
 
     def __init__(self, session: Session) -> None:
-        """Make the view.
-
-        Args:
-            session: A session in whose episode such a policy is being asked.
-        """
+        """Make the view of a session in whose episode a planner is being asked."""
         self._plan = self._made_of = session.plan
         self._session = session
         self.metadata = self.metadata_of(session.plan)
         self.render_mode, self._shows = session.plan.options.render_mode, False
         episode: Any = session.episode
-        self._own: Agent = episode.consulted or episode.pending
+        self._own = episode.consulted or episode.pending
         self._agent = self._own.name
         self._branched = False
 
@@ -49,51 +42,31 @@ class AskedEnv(SimulationEnv):
             self._running().single_out(self._own)
 
     def check_pending(self) -> None:
-        """Make sure that the decision is pending.
-
-        Raises:
-            ResetNeededError, ReentrancyError: The decision was already answered.
-        """
+        """Refuse a branch after the planner has returned its action."""
         episode = self._running()
         if (episode.pending or episode.consulted) is not self._own:
             raise episode.refusal()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """In a branch, answer the pending decision and run to the agent's next one, as in every single view.
-
-        Raises:
-            ReentrancyError: This environment is not a branch.
-        """
-        if not self._branched:
-            raise ReentrancyError(
-                "a policy answers by what it returns; call step(action) only on branches of this environment"
-            )
+        """In a branch, answer the pending decision and run to the agent's next one."""
+        self._check_branched("answers by what it returns; call step(action) only on branches of this environment")
         return super().step(action)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
-        """Refuse the reset: this is the environment of one decision.
-
-        Raises:
-            ReentrancyError: Always.
-        """
-        raise ReentrancyError("a policy cannot reset the environment that it is given; it must return an action")
-
     def close(self) -> None:
-        """End a branch.
-
-        Raises:
-            ReentrancyError: This environment is not a branch.
-        """
-        if not self._branched:
-            raise ReentrancyError("a policy cannot close the environment that it is given; it must return an action")
+        """End a branch."""
+        self._check_branched("cannot close the environment that it is given; it must return an action")
         super().close()
 
-    def replayed(self) -> AskedEnv:
-        """Make a copy for ``branch`` that stands at the same decision, by a replay.
+    def _check_branched(self, problem: str) -> None:
+        if not self._branched:
+            raise ReentrancyError(f"a policy {problem}")
 
-        Raises:
-            BranchError: The replay does not reach the same decision.
-        """
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
+        """Refuse the reset: this is the environment of one decision."""
+        raise ReentrancyError("a policy cannot reset the environment that it is given; it must return an action")
+
+    def replayed(self) -> PlannerEnv:
+        """Make a copy for ``branch`` that stands at the same decision, by a replay."""
         if self._running().alone:
             raise BranchError(
                 "a branch of the environment that a policy is given cannot be branched again by replay; use"
@@ -113,6 +86,3 @@ class AskedEnv(SimulationEnv):
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         raise CopyError("the environment that a policy is given cannot be pickled; use branch to continue it")
-
-
-AskingPolicy.make = staticmethod(AskedEnv)

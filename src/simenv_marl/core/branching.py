@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from contextvars import ContextVar
+from functools import partial
 from multiprocessing.connection import Connection, Pipe, wait
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -26,20 +27,15 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
-from .forking import ForkedState, end_with
+from .forking import end_with, separator
 from .processes import pack_error, pack_plainly, unpack, unpack_error
 from .reuse import processes_kept
 from .rng import is_seed, process_kept, seed_process
 
 Result = TypeVar("Result")
 
-METHODS: Final = ("fork", "replay")
-
 DEEPEST: Final = 4
 """The largest depth of nested branches. Each level can run as many branches as there are cores."""
-
-LONGEST_WAIT: Final = 3600.0
-"""In seconds. The operating system does not wait for longer than some weeks, and a time limit may be infinite."""
 
 _depth: ContextVar[int] = ContextVar("simenv_marl.core.branching", default=0)
 """The depth of this branch."""
@@ -65,13 +61,12 @@ def branch(
         env: An environment of a single simulation, in any view, with or without wrappers.
         function: Called with the continuation and its number, from 0 to ``n - 1``. It may do anything with it.
         n: The number of continuations.
-        method: "fork": each continuation runs in a process of its own, forked while the simulation is suspended (POSIX,
-            and ``driver="greenlet"``). It has its own open files and global generators. Processes run on all available
-            cores, and their results are pickled. "replay": the continuations run one after the other in this process.
-            Each is a new simulation with the same seed, to which the same actions are given. The policies of the option
-            ``policies`` repeat their answers, and are called from the present on. None: "fork" if it is possible, else
-            "replay". Forking is not possible if the simulation has opened something that two processes cannot share:
-            threads, sockets, child processes.
+        method: "fork": each continuation runs in a forked process, with its own open files and global generators
+            (POSIX, and ``driver="greenlet"``), on all available cores. The results are pickled. "replay": the
+            continuations run one after the other in this process. Each is a new simulation with the same seed, to which
+            the same actions are given. The policies of the option ``policies`` repeat their answers, and are called
+            from the present on. None: "fork" if it is possible, else "replay". Forking is not possible if the
+            simulation has opened something that two processes cannot share: threads, sockets, child processes.
         seeds: A seed for each continuation. The same seed gives the same future, by either method. The simulation's
             ``reseed(seed)`` is called in each continuation, on the caller's side like ``state``. With
             ``global_rng=True`` the simulation's own global generators are seeded. While the function runs, the
@@ -91,12 +86,11 @@ def branch(
             integers.
         BaseException: Any exception of the function or ``reseed``, with a note that names the continuation.
     """
-    view = getattr(env, "unwrapped", env)
-    can_fork = hasattr(os, "fork") and getattr(view, "driver", None) == "greenlet"
-    _check(env, view, n, method, time_limit, can_fork=can_fork)
+    view = pending_view(env, "branch")
+    can_fork = hasattr(os, "fork") and view.driver == "greenlet"
+    _check(n, method, seeds, time_limit, can_fork=can_fork)
     if seeds is not None:
         view.check_reseed()
-        seeds = _checked_seeds(seeds, n)
     depth = _depth.get() + 1
     if depth > DEEPEST:
         raise BranchError(
@@ -104,41 +98,51 @@ def branch(
             " and branches them again; use action_values or RolloutPolicy, which let a base policy decide there"
         )
 
-    def call(continuation: Any, number: int) -> Result:
-        token = _depth.set(depth)
-        try:
-            twin = getattr(continuation, "unwrapped", continuation)
-            twin.begin_branch()
-            if seeds is not None:
-                seed_process(seeds[number])
-                twin.reseed(seeds[number])
-            return function(continuation, number)
-        finally:
-            _depth.reset(token)
-
-    obstacles, loops = view.opened() if can_fork and method != "replay" else ([], [])
+    forks = can_fork and method != "replay"
+    obstacles, loops = view.opened() if forks else ([], [])
     if obstacles and method == "fork":
         raise BranchError(
             f"a forked process cannot continue with {', '.join(obstacles)} that the simulation has opened; use"
             ' method="replay"'
         )
-    if obstacles or not can_fork or method == "replay":
-        with processes_kept():
-            return [_call_in_replay(env, view, call, number) for number in range(n)]
-    return _call_in_forks(env, call, n, ForkedState(loops), time_limit)
+    separate = separator(loops) if forks and not obstacles else None
+
+    def call(continuation: Any, number: int) -> Result:
+        token = _depth.set(depth)
+        try:
+            if separate is not None:
+                separate()
+            twin = getattr(continuation, "unwrapped", continuation)
+            twin.begin_branch()
+            if seeds is not None:
+                seed_process(int(seeds[number]))
+                twin.reseed(int(seeds[number]))
+            return function(continuation, number)
+        finally:
+            _depth.reset(token)
+
+    if separate is not None:
+        return _call_in_forks(partial(call, env), n, time_limit)
+    with processes_kept():
+        return [_call_in_replay(env, view, call, number) for number in range(n)]
 
 
-def _check(env: Any, view: Any, n: Any, method: Any, time_limit: Any, *, can_fork: bool) -> None:
-    """Check the arguments of ``branch``, and that a decision is pending."""
+def pending_view(env: Any, user: str) -> Any:
+    """Return the unwrapped environment whose decision is pending, for a user named in errors."""
+    view = getattr(env, "unwrapped", env)
     if not hasattr(view, "begin_branch"):
-        raise ViewError(f"branch needs an environment of one simulation, not {short_repr(env)}")
+        raise ViewError(f"{user} needs an environment of one simulation, not {short_repr(env)}")
+    view.check_pending()
+    return view
+
+
+def _check(n: Any, method: Any, seeds: Any, time_limit: Any, *, can_fork: bool) -> None:
+    """Check the arguments of ``branch``."""
     if isinstance(n, bool) or not isinstance(n, int) or n < 0:
         raise OptionValueError(f"n must be a non-negative integer, not {short_repr(n)}")
-    if method not in (None, *METHODS):
-        raise OptionValueError(
-            f"method must be None or one of {', '.join(map(repr, METHODS))}, not {short_repr(method)}"
-            f"{did_you_mean(method, METHODS)}"
-        )
+    if method not in (None, "fork", "replay"):
+        suggestion = did_you_mean(method, ["fork", "replay"])
+        raise OptionValueError(f"method must be None, 'fork' or 'replay', not {short_repr(method)}{suggestion}")
     if method == "fork" and not can_fork:
         raise OptionValueError(
             'method="fork" needs a platform that can fork, and driver="greenlet": a forked process does not have the'
@@ -146,17 +150,11 @@ def _check(env: Any, view: Any, n: Any, method: Any, time_limit: Any, *, can_for
         )
     if not isinstance(time_limit, (int, float)) or not time_limit > 0:
         raise OptionValueError(f"time_limit must be a number of seconds, not {short_repr(time_limit)}")
-    view.check_pending()
-
-
-def _checked_seeds(seeds: Any, n: int) -> list[int]:
-    """Return the seeds as Python integers."""
-    listed: list[Any] = list(seeds) if isinstance(seeds, (Sequence, np.ndarray)) else [None]
-    if len(listed) != n or not all(map(is_seed, listed)):
+    listed = isinstance(seeds, (Sequence, np.ndarray))
+    if seeds is not None and not (listed and len(seeds) == n and all(map(is_seed, seeds))):
         raise OptionValueError(
             f"seeds must be n = {n} non-negative integers, one for each branch, not {short_repr(seeds)}"
         )
-    return [int(seed) for seed in listed]
 
 
 # -- by replaying ---------------------------------------------------------------------------------
@@ -213,16 +211,8 @@ class _Child(NamedTuple):
         annotate(error, f"simenv_marl: in branch {self.number}")
         raise error
 
-    def end(self) -> None:
-        """End the process."""
-        self.pipe.close()
-        os.kill(self.process, signal.SIGKILL)
-        os.waitpid(self.process, 0)
 
-
-def _call_in_forks(
-    env: Any, function: Callable[[Any, int], Any], n: int, state: ForkedState, time_limit: float
-) -> list[Any]:
+def _call_in_forks(function: Callable[[int], Any], n: int, time_limit: float) -> list[Any]:
     """Call a function in forked processes, as many at a time as there are cores."""
     results: list[Any] = [None] * n
     children: dict[Any, _Child] = {}
@@ -231,26 +221,26 @@ def _call_in_forks(
     try:
         while started < n or children:
             while started < n and len(children) < cores:
-                child = _fork(env, function, started, state, list(children), time.monotonic() + time_limit)
+                child = _fork(function, started, list(children), time.monotonic() + time_limit)
                 children[child.pipe] = child
                 started += 1
             oldest = next(iter(children.values()))  # whose time limit comes first
-            left = oldest.deadline - time.monotonic()
-            ready: list[Any] = wait(list(children), min(max(left, 0.0), LONGEST_WAIT))
-            if not ready and left <= LONGEST_WAIT:
+            left = max(oldest.deadline - time.monotonic(), 0.0)
+            ready: list[Any] = wait(list(children), min(left, 3600.0))  # in parts, because it may be infinite
+            if not ready and left <= 3600.0:
                 raise BranchError(f"branch {oldest.number} was stopped: it took longer than {time_limit} s")
             for pipe in ready:
                 child = children.pop(pipe)
                 results[child.number] = child.result()
     finally:
         for child in children.values():
-            child.end()
+            child.pipe.close()
+            os.kill(child.process, signal.SIGKILL)
+            os.waitpid(child.process, 0)
     return results
 
 
-def _fork(
-    env: Any, function: Callable[[Any, int], Any], number: int, state: ForkedState, others: list[Any], deadline: float
-) -> _Child:
+def _fork(function: Callable[[int], Any], number: int, others: list[Any], deadline: float) -> _Child:
     """Fork a process that calls the function and sends the result."""
     _flush()  # else both processes would write what is buffered
     parent = os.getpid()
@@ -264,21 +254,17 @@ def _fork(
             end_with(parent)
             for pipe in (reading, *others):
                 pipe.close()
-            writing.send_bytes(_message(env, function, number, state))
+            writing.send_bytes(_message(function, number))
         finally:
             os._exit(0)  # without any of the parent's exit handlers
     writing.close()
     return _Child(number, process, reading, deadline)
 
 
-def _message(env: Any, function: Callable[[Any, int], Any], number: int, state: ForkedState) -> bytes:
+def _message(function: Callable[[int], Any], number: int) -> bytes:
     """In the forked process, call the function; pickle its result or its error."""
-    torch = sys.modules.get("torch")
-    if torch is not None:
-        torch.set_num_threads(1)  # its threads do not exist in the child, and torch would wait for them
     try:
-        state.restore()
-        result = function(env, number)
+        result = function(number)
         try:
             parcel = pack_plainly(result)
         except Exception as error:

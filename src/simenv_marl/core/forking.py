@@ -1,7 +1,7 @@
 """What makes a forked process continue as its parent would.
 
 ``fork`` copies the memory, but parent and child share the offsets and contents of open files and the sockets of event
-loops, and Python reseeds its global generator in the child. ``ForkedState`` corrects this in the child.
+loops, and Python reseeds its global generator in the child. A function from ``separator`` corrects this in the child.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import socket
 import stat
 import sys
 import tempfile
-from collections.abc import Container, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Container, Iterable
+from contextlib import nullcontext, suppress
 from gc import get_objects
 from typing import Any, Final, NamedTuple
 
@@ -25,34 +25,27 @@ if hasattr(os, "fork"):
 
 DESCRIPTORS: Final = "/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"
 
-STANDARD: Final = (0, 1, 2)
-"""The descriptors of the standard streams, which branches share with their parent."""
-
 FLAGS: Final = os.O_WRONLY | os.O_RDWR | os.O_APPEND
 """The flags with which a file is opened again. The others say how it was made, or matter for other kinds of files."""
 
 
-class ForkedState:
-    """The state that forked children must restore or separate before anything else.
+def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
+    """Return a function that separates forked children, in which the event loops continue, from this process."""
+    python, files = random.getstate(), _open_files()
 
-    It is read once, in the parent. The parent must not continue before all children are forked.
-    """
+    def separate() -> None:
+        random.setstate(python)  # Python reseeds it after a fork
+        _reopen(files)
+        for loop in loops:
+            _separate_loop(loop)
+        torch = sys.modules.get("torch")
+        if torch is not None:
+            torch.set_num_threads(1)  # its threads do not exist here, and torch would wait for them
 
-    def __init__(self, loops: Iterable[Any] = ()) -> None:
-        """Read the state of this process, with that of event loops that must continue in the children."""
-        self._python, self._loops, self._files = random.getstate(), loops, _open_files()
-
-    def restore(self) -> None:
-        """Separate this forked process from its parent."""
-        random.setstate(self._python)  # Python reseeds it after a fork
-        _reopen(self._files)
-        for loop in self._loops:
-            _separate(loop)
+    return separate
 
 
 # -- the end of the parent ------------------------------------------------------------------------
-
-_PR_SET_PDEATHSIG: Final = 1
 
 _prctl: Final[Any] = getattr(ctypes.CDLL(None), "prctl", None) if sys.platform == "linux" else None
 
@@ -60,7 +53,7 @@ _prctl: Final[Any] = getattr(ctypes.CDLL(None), "prctl", None) if sys.platform =
 def end_with(parent: int) -> None:
     """Let this forked process end when its parent ends, for whatever reason. Only Linux supports this."""
     if _prctl is not None:
-        _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        _prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
         if os.getppid() != parent:  # the parent has already ended
             os._exit(1)
 
@@ -82,7 +75,7 @@ def sockets_of(loop: Any) -> set[int]:
     return {loop._ssock.fileno(), loop._csock.fileno()}
 
 
-def _separate(loop: Any) -> None:
+def _separate_loop(loop: Any) -> None:
     """Give an event loop a selector, and sockets behind the same descriptors, that belong to this process only."""
     for old, new in zip((loop._ssock, loop._csock), socket.socketpair(), strict=True):
         with new:
@@ -115,7 +108,7 @@ def _open_files() -> list[_OpenFile]:
         with suppress(OSError):  # the descriptor by which ``listdir`` read the list, or one that only stands for a path
             status = os.fstat(number)
             inode = status.st_dev, status.st_ino
-            if number in STANDARD:
+            if number < 3:  # a standard stream, which branches share with their parent
                 standard.add(inode)
             elif stat.S_ISREG(status.st_mode) and inode not in standard:
                 _add(files, number, inode)
@@ -149,25 +142,19 @@ def _reopen(files: list[_OpenFile]) -> None:
         alike = [file for file in files if file.inode == inode]
         modes = {file.flags & os.O_ACCMODE for file in alike}
         path = _path(alike[0].numbers[0])
-        if modes == {os.O_RDONLY}:
-            _open_behind(alike, path)
-            continue
-        with tempfile.TemporaryFile() as copy:
+        writes = modes != {os.O_RDONLY}
+        copy: Any
+        with tempfile.TemporaryFile() if writes else nullcontext() as copy:
             if modes == {os.O_WRONLY}:  # the contents are never read
                 copy.truncate(os.stat(path).st_size)
-            else:
+            elif writes:
                 shutil.copyfile(path, _path(copy.fileno()))
-            _open_behind(alike, _path(copy.fileno()))
-
-
-def _open_behind(alike: list[_OpenFile], path: str) -> None:
-    """Open a path for each opening of a file, behind the same descriptors."""
-    for file in alike:
-        again = os.open(path, file.flags)
-        os.lseek(again, file.offset, os.SEEK_SET)
-        for number in file.numbers:
-            os.dup2(again, number, inheritable=os.get_inheritable(number))
-        os.close(again)
+            for file in alike:
+                again = os.open(_path(copy.fileno()) if writes else path, file.flags)
+                os.lseek(again, file.offset, os.SEEK_SET)
+                for number in file.numbers:
+                    os.dup2(again, number, inheritable=os.get_inheritable(number))
+                os.close(again)
 
 
 def _path(number: int) -> str:

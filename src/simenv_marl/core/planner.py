@@ -44,11 +44,7 @@ def base_of(base: Any, agent: str) -> Any:
 
 
 class PlannerPolicy:
-    """The wrapper of a planner in a plan. Other policies have none, and so cost nothing extra.
-
-    Attributes:
-        policy: The planner.
-    """
+    """The wrapper of a planner in a plan. Other policies have none, and so cost nothing extra."""
 
     def __init__(self, policy: Callable[..., Any]) -> None:
         self.policy = policy
@@ -72,7 +68,7 @@ class PlannerPolicy:
         episode = session.episode
         if not (episode.alone or PLANNING.get()):
             views = import_module("..envs.planner", __package__)  # by name, because views import the core
-            return self.answer(observation, info, views.PlannerEnv(session))
+            return self.answer(observation, info, views.PlannerEnv(session.plan, session))
         base = base_of(getattr(self.policy, "base", RULE), (episode.consulted or episode.pending).name)
         if base is RULE or not callable(base) or is_planner(base):
             return RULE

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import copy
+from copy import deepcopy
 from typing import Any, NoReturn
 
 from gymnasium import spaces
 
+from ..core.plan import Plan
 from ..core.session import Session
 from ..errors import BranchError, CopyError, ReentrancyError
+from .base import View
 from .single import SimulationEnv
 
 
@@ -19,20 +21,34 @@ class PlannerEnv(SimulationEnv):
     can be stepped; policies or rules answer for all other agents.
     """
 
-    def __init__(self, session: Session) -> None:
-        """Make the view of a session in whose episode a planner is being asked."""
-        self._plan = self._made_of = session.plan
-        self._session = session
-        self.metadata = self.metadata_of(session.plan)
-        self.render_mode, self._shows = session.plan.options.render_mode, False
-        episode: Any = session.episode
+    def __init__(self, plan: Plan, session: Session | None = None) -> None:
+        """Make the view of a session in whose episode a planner is being asked; None: of a new session, to replay."""
+        View.__init__(self, plan, session)
+        self._shows = self._branched = False
+        if session is not None:
+            self._resume_from_replay()
+
+    @classmethod
+    def check(cls, plan: Plan) -> None:
+        """Allow every plan: the agent is the one whose planner is being asked."""
+
+    def _resume_from_replay(self) -> None:
+        episode: Any = self._running()
         self._own = episode.consulted or episode.pending
         self._agent = self._own.name
-        self._branched = False
 
     def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         definition = self._own.point.definition
-        return copy.deepcopy((definition.observation_space, definition.action_space))
+        return deepcopy((definition.observation_space, definition.action_space))
+
+    def replayed(self) -> Any:
+        """Make a copy for ``branch`` that stands at the same decision, by a replay."""
+        if self._running().alone:
+            raise BranchError(
+                "a branch of the environment that a policy is given cannot be branched again by replay; use"
+                ' method="fork"'
+            )
+        return super().replayed()
 
     def begin_branch(self) -> None:
         """Turn this environment into a branch that waits for the agent only."""
@@ -49,37 +65,21 @@ class PlannerEnv(SimulationEnv):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """In a branch, answer the pending decision and run to the agent's next one."""
-        self._check_branched("answers by what it returns; call step(action) only on branches of this environment")
-        return super().step(action)
-
-    def close(self) -> None:
-        """End a branch."""
-        self._check_branched("cannot close the environment that it is given; it must return an action")
-        super().close()
-
-    def _check_branched(self, problem: str) -> None:
         if not self._branched:
-            raise ReentrancyError(f"a policy {problem}")
+            raise ReentrancyError(
+                "a policy answers by what it returns; call step(action) only on branches of this environment"
+            )
+        return super().step(action)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
         """Refuse the reset: this is the environment of one decision."""
         raise ReentrancyError("a policy cannot reset the environment that it is given; it must return an action")
 
-    def replayed(self) -> PlannerEnv:
-        """Make a copy for ``branch`` that stands at the same decision, by a replay."""
-        if self._running().alone:
-            raise BranchError(
-                "a branch of the environment that a policy is given cannot be branched again by replay; use"
-                ' method="fork"'
-            )
-        session = Session(self._made_of)
-        try:
-            session.take_over(copy.deepcopy(self._session.kept()))
-            session.replay(self._session)
-            return type(self)(session)
-        except BaseException:
-            session.close()
-            raise
+    def close(self) -> None:
+        """End a branch."""
+        if not self._branched:
+            raise ReentrancyError("a policy cannot close the environment that it is given; it must return an action")
+        super().close()
 
     def __deepcopy__(self, memory: dict[int, Any]) -> NoReturn:
         raise CopyError("the environment that a policy is given cannot be copied; use branch to continue it")

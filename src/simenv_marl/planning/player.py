@@ -9,30 +9,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
-from zlib import crc32
 
 from gymnasium import spaces
 
 from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
+from ..core.branching import pending_view
 from ..core.planner import PlannerPolicy, base_of
 from ..core.roster import two_arguments
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
-from ..envs.base import View
-from ..errors import (
-    EpisodeOverError,
-    InvalidActionError,
-    OptionValueError,
-    UnknownAgentError,
-    ViewError,
-    did_you_mean,
-    short_repr,
-)
+from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, did_you_mean, short_repr
 from ..simulation import RULE
-
-Seen = tuple[Any, dict[str, Any]]
-"""An observation and an info."""
 
 
 class Player:
@@ -57,13 +45,7 @@ class Player:
         self.may_be: Callable[[Any], bool] = self.episode.may_be
         self.over = False
         self._policies: dict[str, Any] = {}  # the bases that were asked, by agent
-        self._seen: dict[str, Seen] = {}  # what the latest step has returned, by agent
-
-    @property
-    def entropy(self) -> list[int]:
-        """The numbers that distinguish this decision from all others, however the episode is played."""
-        episode, number = self.episode, self.record.consultations
-        return [episode.seed, number - 1 if number else episode.turns, crc32(self.agent.encode(errors="surrogatepass"))]
+        self._seen: dict[str, Any] = {}  # observation and info, as the latest step has returned them, by agent
 
     # -- checks, before anything moves ------------------------------------------------------------
 
@@ -152,7 +134,7 @@ class Player:
             self._policies[name] = policy
         return RULE if policy is RULE else policy(*self._observe(name))
 
-    def _observe(self, name: str) -> Seen:
+    def _observe(self, name: str) -> Any:
         """Return the latest observation and info of an agent."""
         if name in self._seen:
             return self._seen[name]
@@ -169,22 +151,18 @@ class Player:
 
     def _step_env(self, action: Any, name: str) -> Any:
         """Step through the wrappers. ``RULE``, also as a part of a dict of actions, reaches the view unchanged."""
-        if self.env is self.view:
+        view, parts = self.view, action if isinstance(action, Mapping) else {}
+        rules = {agent: RULE for agent, part in parts.items() if part is RULE}
+        if self.env is view or not (rules or action is RULE):
             return self.env.step(action)
-        if action is RULE:
-            return self._step_behind_wrappers(self._sample(name), lambda through: RULE)
-        rules = {name: RULE for name, part in action.items() if part is RULE} if isinstance(action, Mapping) else {}
-        if not rules:
-            return self.env.step(action)
-        samples = {name: self._sample(name) for name in rules}
-        return self._step_behind_wrappers({**action, **samples}, lambda through: {**through, **rules})
+        sample = {**parts, **{agent: self._sample(agent) for agent in rules}} if rules else self._sample(name)
 
-    def _step_behind_wrappers(self, action: Any, replace: Callable[[Any], Any]) -> Any:
-        """Step through the wrappers with an action, and replace what they let through."""
-        view, step = self.view, type(self.view).step
-        vars(view)["step"] = lambda through: step(view, replace(through))
+        def step(through: Any) -> Any:
+            return type(view).step(view, {**through, **rules} if rules else RULE)
+
+        vars(view)["step"] = step  # wrappers call it with what they make of the sample
         try:
-            return self.env.step(action)
+            return self.env.step(sample)
         finally:
             del vars(view)["step"]
 
@@ -202,6 +180,10 @@ class JointPlayer(Player):
         super().__init__(env, base)
         self.agent = "all agents"
         self.may_be = self.view.joint.roster.__contains__
+        if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
+            raise OptionValueError(
+                "a base by agent needs a joint view without flatten=True; pass one policy for all agents"
+            )
 
     def _space_of(self, name: str) -> Any:
         space: Any = self.env.action_space
@@ -215,14 +197,6 @@ class JointPlayer(Player):
         else:
             super()._check(action, mask)
 
-    def check_base(self) -> None:
-        """Refuse a base that cannot answer."""
-        super().check_base()
-        if isinstance(self.base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
-            raise OptionValueError(
-                "a base by agent needs a joint view without flatten=True; pass one policy for all agents"
-            )
-
     def decide(self) -> Any:
         """Return the actions of all agents by the base."""
         if not isinstance(self.base, Mapping):
@@ -230,7 +204,7 @@ class JointPlayer(Player):
         agents = self.episode.agents
         return {name: self._decide_for(name) if name in agents else RULE for name in self.view.joint.roster}
 
-    def _observe(self, name: str) -> Seen:
+    def _observe(self, name: str) -> Any:
         if name == self.agent and not self._seen:
             return self.view.joint.observe(self.episode), {}
         return super()._observe(name)
@@ -262,7 +236,7 @@ class AECPlayer(Player):
         self.over = True
         return 0.0
 
-    def _observe(self, name: str) -> Seen:
+    def _observe(self, name: str) -> Any:
         observation, _, _, _, info = self.env.last()
         return observation, info
 
@@ -287,19 +261,8 @@ class ParallelPlayer(Player):
         return float(rewards.get(self.agent, 0.0))
 
 
-PLAYERS: dict[type, type[Player]] = {
-    SimulationAECEnv: AECPlayer,
-    SimulationParallelEnv: ParallelPlayer,
-    SimulationJointEnv: JointPlayer,
-    SimulationEnv: Player,
-}
-"""The players, by the class of the view."""
-
-
 def player_of(env: Any, base: Any) -> Player:
     """Return the player of the agent whose decision is pending in an environment of one simulation."""
-    view = getattr(env, "unwrapped", env)
-    if not isinstance(view, View):
-        raise ViewError(f"planning needs an environment of one simulation, not {short_repr(env)}")
-    view.check_pending()
-    return next(player for kind, player in PLAYERS.items() if isinstance(view, kind))(env, base)
+    view = pending_view(env, "planning")
+    players = {SimulationAECEnv: AECPlayer, SimulationParallelEnv: ParallelPlayer, SimulationJointEnv: JointPlayer}
+    return next((player for kind, player in players.items() if isinstance(view, kind)), Player)(env, base)

@@ -58,7 +58,7 @@ class RolloutPolicy(RolloutOptions):
 
         Raises:
             OptionValueError: The budget is too small to try each candidate.
-            SimEnvError: As ``action_values`` raises it; this holds for all other errors, too.
+            BaseException: As ``action_values``.
         """
         if PLANNING.get():
             return base_value(env, self.base)
@@ -131,15 +131,11 @@ class TreeSearchPolicy(RolloutPolicy):
 
 
 class _Tree:
-    """The results of sequences of candidates.
-
-    Attributes:
-        visits: The number of tries of each node, including those that are running.
-    """
+    """The results of sequences of candidates."""
 
     def __init__(self, candidates: int, depth: int, exploration: float) -> None:
         self._candidates, self._depth, self._exploration = candidates, depth, exploration
-        self.visits: dict[Plan, int] = {}
+        self.visits: dict[Plan, int] = {}  # the tries of each node, including those that are running
         self._returns: dict[Plan, list[float]] = {}  # returns from the node's own decision on
         self._least, self._most = inf, -inf
 

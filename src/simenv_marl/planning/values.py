@@ -1,7 +1,4 @@
-"""The values of candidate actions for a pending decision, from rollouts in branches.
-
-In a rollout, the candidate is taken and a base policy decides from then on. All candidates meet the same futures.
-"""
+"""The values of candidate actions for a pending decision, from rollouts in branches."""
 
 from __future__ import annotations
 
@@ -10,6 +7,7 @@ from dataclasses import dataclass
 from math import isfinite
 from numbers import Real
 from typing import Any, Final
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +21,7 @@ from ..many.spread import progress_bar
 from ..simulation import RULE
 from .player import Player, player_of
 
-_KEY: Final = 0x706C616E
-"""Separates the seeds of futures from other seeds that are derived from the episode's seed."""
+_KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
 
 Plan = tuple[int, ...]
 """The places of the candidates to take at the agent's next decisions, beginning with the pending one."""
@@ -199,7 +196,9 @@ class Rollouts:
             raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
         self.actions = player.candidates(actions, legal=legal)
         self.returns: list[list[float]] = [[] for _ in self.actions]
-        self._entropy = [*player.entropy, _KEY, *(() if options.seed is None else (options.seed,))]
+        number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
+        decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
+        self._entropy = [*decision, _KEY, *(() if options.seed is None else (options.seed,))]
         try:
             player.view.check_reseed()
             self.reseeds = True

@@ -3,15 +3,15 @@
 import copy
 import os
 import pickle
+import select
 import signal
 import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from contextvars import ContextVar
 from functools import partial
-from multiprocessing.connection import Connection, Pipe, wait
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -182,16 +182,13 @@ class _Child(NamedTuple):
 
     number: int
     process: int
-    pipe: Connection
+    pipe: int
     deadline: float
 
     def result(self) -> Any:
         """Receive the result of the function, or raise its exception; wait for the process to end."""
-        try:
-            message = self.pipe.recv_bytes()
-        except (EOFError, OSError):  # before or within the message
-            message = b""
-        self.pipe.close()
+        message = b"".join(iter(partial(os.read, self.pipe, 1 << 16), b""))
+        os.close(self.pipe)
         code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
         if not message:
             how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
@@ -215,49 +212,52 @@ class _Child(NamedTuple):
 def _call_in_forks(function: Callable[[int], Any], n: int, time_limit: float) -> list[Any]:
     """Call a function in forked processes, as many at a time as there are cores."""
     results: list[Any] = [None] * n
-    children: dict[Any, _Child] = {}
+    children: dict[int, _Child] = {}  # by their pipes
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    started = 0
+    started, waiting = 0, select.poll()
     try:
         while started < n or children:
             while started < n and len(children) < cores:
                 child = _fork(function, started, list(children), time.monotonic() + time_limit)
                 children[child.pipe] = child
+                waiting.register(child.pipe, select.POLLIN)
                 started += 1
             oldest = next(iter(children.values()))  # whose time limit comes first
             left = max(oldest.deadline - time.monotonic(), 0.0)
-            ready: list[Any] = wait(list(children), min(left, 3600.0))  # in parts, because it may be infinite
+            ready = waiting.poll(min(left, 3600.0) * 1000)  # in parts, because the time limit may be infinite
             if not ready and left <= 3600.0:
                 raise BranchError(f"branch {oldest.number} was stopped: it took longer than {time_limit} s")
-            for pipe in ready:
+            for pipe, _ in ready:
+                waiting.unregister(pipe)
                 child = children.pop(pipe)
                 results[child.number] = child.result()
     finally:
         for child in children.values():
-            child.pipe.close()
+            os.close(child.pipe)
             os.kill(child.process, signal.SIGKILL)
             os.waitpid(child.process, 0)
     return results
 
 
-def _fork(function: Callable[[int], Any], number: int, others: list[Any], deadline: float) -> _Child:
+def _fork(function: Callable[[int], Any], number: int, others: list[int], deadline: float) -> _Child:
     """Fork a process that calls the function and sends the result."""
     _flush()  # else both processes would write what is buffered
     parent = os.getpid()
-    reading, writing = Pipe(duplex=False)
-    with warnings.catch_warnings():
-        # Python 3.12 warns because the child never releases locks that other threads hold.
-        warnings.simplefilter("ignore", DeprecationWarning)
+    reading, writing = os.pipe()
+    # Python 3.12 warns because the child never releases locks that other threads hold.
+    with warnings.catch_warnings(action="ignore") if sys.version_info >= (3, 12) else nullcontext():
         process = os.fork()
     if process == 0:
         try:
             end_with(parent)
             for pipe in (reading, *others):
-                pipe.close()
-            writing.send_bytes(_message(function, number))
+                os.close(pipe)
+            message = _message(function, number)
+            while message:
+                message = message[os.write(writing, message) :]
         finally:
             os._exit(0)  # without any of the parent's exit handlers
-    writing.close()
+    os.close(writing)
     return _Child(number, process, reading, deadline)
 
 

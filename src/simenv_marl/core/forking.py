@@ -35,7 +35,8 @@ def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
 
     def separate() -> None:
         random.setstate(python)  # Python reseeds it after a fork
-        _reopen(files)
+        if files:
+            _reopen(files)
         for loop in loops:
             _separate_loop(loop)
         torch = sys.modules.get("torch")

@@ -25,7 +25,7 @@ from hypothesis import strategies as st
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from simenv_marl import RULE, aec_env, branch, difference, joint_env, parallel_env, single_env
-from simenv_marl.core import episode, forking
+from simenv_marl.core import episode
 from simenv_marl.core.forking import loops_on
 from simenv_marl.errors import (
     BranchError,
@@ -710,11 +710,9 @@ def test_a_duplicate_shares_its_offset_in_a_branch_too(tmp_path):
     assert found[0] == found[1] == filing.left(env) == list("abacdbefc")
 
 
-@pytest.mark.parametrize("largest", [0, forking.LARGEST])
 @pytest.mark.parametrize("modes", [["w"], ["a", "w"], ["r+"], ["a", "r"]])
-def test_copies_of_files_are_what_they_were(tmp_path, monkeypatch, modes, largest):
-    """In size, place and contents, in memory or on a disk; and the file itself stays what it is."""
-    monkeypatch.setattr(forking, "LARGEST", largest)
+def test_copies_of_files_are_what_they_were(tmp_path, modes):
+    """In size, place and contents; and the file itself stays what it is."""
     path = tmp_path / "letters"
 
     class Model(Holding):

@@ -28,8 +28,7 @@ from simenv_marl.errors import (
     ViewError,
 )
 from simenv_marl.planning import action_values
-from simenv_marl.planning.futures import Futures
-from simenv_marl.planning.lookahead import Lookahead
+from simenv_marl.planning.values import RolloutOptions, Rollouts
 from tests.conftest import DRIVERS
 from tests.worlds.duels import LEFT, SPACE, Duel, Unseeded, points, worth
 from tests.worlds.models import define
@@ -52,7 +51,7 @@ def made(view, model=Duel, **options):
 
 def futures_of(env, number, seed=None):
     """The seeds of an environment's futures."""
-    return Futures(env, [RULE], Lookahead(), seed).seeds(number)
+    return Rollouts(env, [RULE], RolloutOptions(seed=seed)).seeds(number)
 
 
 def expected(env, agent, actions=(0, 1, 2), number=3, **given):

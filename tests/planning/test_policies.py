@@ -3,8 +3,11 @@
 import copy
 import pickle
 import random
+import subprocess
 import sys
+import textwrap
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -600,3 +603,16 @@ def test_environments_of_the_registry(request):
     bare.reset(seed=5)
     told = action_values(env, futures=2)
     assert told.returns == pytest.approx(action_values(bare, futures=2, horizon=3).returns)
+
+
+def test_a_simulation_without_environments_has_planners():
+    """No view is imported before the planner is asked."""
+    code = """
+        from simenv_marl import simulate
+        from simenv_marl.planning import RolloutPolicy
+        from tests.worlds.inventory import Shop
+
+        simulate(Shop, {"buyer": RolloutPolicy(futures=1, horizon=1)}, points=Shop.order, seed=1)
+    """
+    root = Path(__file__).parent.parent.parent
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], cwd=root, check=True, timeout=60)

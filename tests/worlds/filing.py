@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -29,9 +30,14 @@ class Archive:
         np.random.seed(seed)
         self.files: list[Any] = []
         self.numbers: list[int] = []
+        self.folder = tempfile.mkdtemp()
+
+    def close(self) -> None:
+        """Branches do not come here, and so leave the folder to the environment."""
+        shutil.rmtree(self.folder)
 
     def run(self) -> None:
-        with tempfile.TemporaryDirectory() as self.folder, tempfile.NamedTemporaryFile("w+") as self.named:
+        with tempfile.NamedTemporaryFile("w+", dir=self.folder, delete=False) as self.named:
             Path(self.folder, "0").write_text("".join(f"{line} " * 3 + "\n" for line in range(3000)))
             try:
                 for _ in range(self.chance.randrange(6)):  # what is found by its name is every branch's alike

@@ -2,24 +2,21 @@
 
 Each module imports only from those below it::
 
-    processes, provenance       pickling for other processes; the record of what an environment was made of
+    branching                   exact continuations of an episode
+    provenance                  the record of what an environment was made of
+    solo, together              a branch that waits for one agent; steps of many episodes
     session                     the simulation of one environment, over all its episodes
     episode                     one episode, and the life cycle of a decision
-    ending                      the end of an episode
-    participants                the agents of an episode
+    rounds, run                 rounds of the parallel and joint views; the run on the simulation's stack
     plan                        the checked description of an environment
-    drivers                     the drivers by name
+    agent, prototype, roster    one agent; a simulation made for inspection; who decides where
     greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
-    switch                      the switch between a simulation's stack and its user's
-    events                      the events that a simulation sends, and how an episode handles them
-    children                    the threads, processes and sockets that a simulation opens
-    contexts                    the context in which an environment's code runs on the user's side
-    agent                       one agent of an episode: its rewards, observations and infos
-    asking                      policies that ask for the environment
-    bound                       decision points with the definitions of one environment
-    variant                     a named variant of a model, for experiments
-    points                      the decision points that ``points=`` names
-    options                     the options of environments
-    rng                         a state of the global random generators for each environment
+    planner                     policies that get the environment
+    point, loops                decision points and other events; asyncio's loops of two stacks
+    driver                      the switch between a simulation's stack and its user's
+    context, points, resources  the user's side; points by their names; what a simulation has opened
+    actions, reseeding          checks of actions; seeds for a simulation's own generators
     spaces, stacking            casts and checks of single values; stacks of many
+    rng, options, packing       global generators; options; pickles for other processes
+    forking, reuse              what a forked process needs; processes that serve several simulations
 """

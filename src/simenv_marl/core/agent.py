@@ -16,8 +16,8 @@ from ..errors import MaskError, RewardError, short_repr
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
 from .actions import MASK
-from .asking import AskingPolicy
 from .driver import WAIT
+from .planner import PlannerPolicy
 from .point import Point
 from .spaces import duplicate
 
@@ -157,7 +157,7 @@ class Agent:
     @property
     def is_planner(self) -> bool:
         """Whether the policy gets the environment."""
-        return isinstance(self.policy, AskingPolicy)
+        return isinstance(self.policy, PlannerPolicy)
 
     # -- infos ------------------------------------------------------------------------------------
 

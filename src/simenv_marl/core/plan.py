@@ -26,8 +26,8 @@ from ..hooks.hook import Hook
 from ..hooks.plugins import Plugins
 from ..simulation import RULE, SimulationInterface
 from .agent import make_updates
-from .asking import AskingPolicy, given_session
 from .options import Options
+from .planner import PlannerPolicy, bind_session
 from .point import EndAgent, Point, Removal, given_simulation
 from .points import (
     NamedPoint,
@@ -117,7 +117,7 @@ class Plan:
         self.plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
         self.unmatched_names = {*self.policies, *declared_agents(options.possible_agents)}
         mappings = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
-        self.has_planner = any(isinstance(p, AskingPolicy) for p in (*by_point.values(), *self.policies.values()))
+        self.has_planner = any(isinstance(p, PlannerPolicy) for p in (*by_point.values(), *self.policies.values()))
         self.is_bound_to_simulation = mappings or self.has_planner
         self._prepare_points(first=True)
 
@@ -344,8 +344,8 @@ class Plan:
         made._everything = [
             replace(point, definition=given_simulation(point.definition, simulation)) for point in self._everything
         ]
-        made._by_point = {key: given_session(policy, session) for key, policy in self._by_point.items()}
-        made.policies = {key: given_session(policy, session) for key, policy in self.policies.items()}
+        made._by_point = {key: bind_session(policy, session) for key, policy in self._by_point.items()}
+        made.policies = {key: bind_session(policy, session) for key, policy in self.policies.items()}
         made._prepare_points(first=False)
         return made
 

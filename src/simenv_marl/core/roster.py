@@ -9,7 +9,7 @@ from typing import Any
 from ..decision import DecisionPoint, Definition, unwrapped
 from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, short_repr
 from ..simulation import RULE
-from .asking import AskingPolicy, asks_for_environment, takes_info
+from .planner import PlannerPolicy, is_planner, takes_info
 from .point import Point
 from .points import NamedPoint, find_point
 
@@ -132,6 +132,6 @@ def _is_path(key: Any) -> bool:
 
 def two_arguments(policy: Callable[..., Any]) -> Callable[[Any, Any], Any]:
     """Make a policy callable with observation and info, even if it takes no info or asks for the environment."""
-    if asks_for_environment(policy):
-        return AskingPolicy(policy)
+    if is_planner(policy):
+        return PlannerPolicy(policy)
     return policy if takes_info(policy) else lambda observation, info: policy(observation)

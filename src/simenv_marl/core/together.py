@@ -8,7 +8,7 @@ from typing import Any
 from greenlet import getcurrent
 
 from ..hooks.stacks import EVALUATING
-from .agent import WAIT
+from .driver import WAIT
 from .episode import Episode
 
 

@@ -9,8 +9,8 @@ from typing import Any, Final, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.options import EpisodeOptions
+from ..core.planner import PlannerPolicy, is_planner
 from ..core.points import Points
 from ..core.spaces import same
 from ..core.stacking import rows, stacker, taken
@@ -85,7 +85,7 @@ def _check_part(policy: Any, weight: Any) -> None:
     """Check a policy of a mixture and its weight."""
     if policy is not RULE and not callable(policy):
         raise OptionValueError(f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}")
-    if asks_for_environment(policy):
+    if is_planner(policy):
         raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
     number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
     if not number or not isfinite(weight) or weight < 0:
@@ -190,8 +190,8 @@ def compare_with_rule(
 
 def _shadow(policy: Any) -> Any:
     """Make a policy that records the action of another policy as an extra, and leaves the decision to the rule."""
-    if asks_for_environment(policy):
-        return partial(_record_one, AskingPolicy(policy))
+    if is_planner(policy):
+        return partial(_record_one, PlannerPolicy(policy))
     return partial(_record, policy, BatchPolicy(policy))
 
 
@@ -202,7 +202,7 @@ def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: An
     return RULE, {SHADOW: recorded}
 
 
-def _record_one(policy: AskingPolicy, observation: Any, info: Any, *, _environment: Any) -> Any:
+def _record_one(policy: PlannerPolicy, observation: Any, info: Any, *, _environment: Any) -> Any:
     recorded = np.empty((), object)
     recorded[()] = policy.answer(observation, info, _environment)
     return RULE, {SHADOW: recorded}

@@ -9,7 +9,6 @@ from ..core.options import ViewOptions, explain_options
 from ..core.plan import Plan
 from ..core.points import Points
 from ..errors import OptionValueError, did_you_mean, short_repr
-from . import asked  # noqa: F401 - registers the environments that policies get
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
 from .parallel import SimulationParallelEnv

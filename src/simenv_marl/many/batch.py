@@ -16,9 +16,9 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from ..core.asking import AskingPolicy, asks_for_environment
 from ..core.episode import Episode
 from ..core.plan import DeferredPolicy, Plan
+from ..core.planner import PlannerPolicy, is_planner
 from ..core.point import Point
 from ..core.reuse import reuse_resources
 from ..core.roster import two_arguments
@@ -51,7 +51,7 @@ class BatchPolicy:
         self.policy: Callable[..., Any] = two_arguments(policy)
         self.informed = self.policy is policy
         self.identifying = self.informed and takes_identities(policy)
-        self.asking = isinstance(self.policy, AskingPolicy)
+        self.asking = isinstance(self.policy, PlannerPolicy)
         self.groups: dict[DecisionPoint, Group] = {}
 
     def __repr__(self) -> str:
@@ -104,11 +104,11 @@ class PolicyKey(DeferredPolicy):
         return actions[0]
 
 
-class AskingKey(AskingPolicy, PolicyKey):
+class PlannerKey(PlannerPolicy, PolicyKey):
     """A ``PolicyKey`` of a policy that asks for the environment and therefore answers one decision at a time."""
 
     def __init__(self, place: int, asked: BatchPolicy, policy: Callable[..., Any]) -> None:
-        AskingPolicy.__init__(self, policy)
+        PlannerPolicy.__init__(self, policy)
         PolicyKey.__init__(self, place, asked)
 
     def alone(self, episode: Any, agent: Any) -> Any:
@@ -126,11 +126,11 @@ def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[
     found: dict[Any, Any] = {}
     for place, (key, policy) in enumerate(policies.items()):
         found[key] = policy
-        asks = asks_for_environment(policy)
+        asks = is_planner(policy)
         if policy is not RULE and callable(policy) and (rewarded or not asks):
             asked = known.setdefault(id(policy), BatchPolicy(policy))
             asked.keys.append(key)
-            found[key] = AskingKey(place, asked, policy) if asks else PolicyKey(place, asked)
+            found[key] = PlannerKey(place, asked, policy) if asks else PolicyKey(place, asked)
     return found
 
 

@@ -1,17 +1,30 @@
-"""The values of candidate actions for a pending decision."""
+"""The values of candidate actions for a pending decision, from rollouts in branches."""
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from math import isfinite
+from numbers import Real
+from typing import Any, Final
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.branching import branch
+from ..core.planner import PLANNING
+from ..core.rng import is_seed
 from ..core.session import checked_seed
+from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
+from ..many.parallel import progress_bar
 from ..simulation import RULE
-from .futures import Futures
-from .lookahead import Lookahead, within_a_branch
-from .players import player_of
+from .player import Player, player_of
+
+_KEY: Final = 0x706C616E  # separates the seeds of futures from others that are derived from the episode's seed
+
+Plan = tuple[int, ...]
+"""The places of the candidates to take at the agent's next decisions, beginning with the pending one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,37 +107,193 @@ def action_values(
         BranchError: A branch died, took too long, or cannot be made.
         BaseException: Any exception of the model, a mapping or the base in a branch.
     """
-    look = Lookahead(
+    options = RolloutOptions(
         base=base, futures=futures, horizon=horizon, horizon_by=horizon_by, terminal_value=terminal_value,
-        discount=discount, discount_by=discount_by, method=method, time_limit=time_limit,
+        discount=discount, discount_by=discount_by, seed=seed, method=method, time_limit=time_limit,
     )  # fmt: skip
-    if within_a_branch():
+    if PLANNING.get():
         return base_value(env, base)
-    found = Futures(env, actions, look, checked_seed(seed))
-    found.run(range(len(found.actions)), look.futures, progress=progress)
-    return valued(found, range(len(found.actions)))
-
-
-def valued(found: Futures, left: Sequence[int]) -> ActionValues:
-    """Return the values of candidates that were tried.
-
-    Args:
-        found: The results of the tries.
-        left: The places of the candidates among which the best one is chosen.
-    """
-    table, counts = found.table(), np.array([len(values) for values in found.returns], np.int64)
-    means, errors = np.full((2, len(counts)), np.nan)
-    for row, values in enumerate(found.returns):
-        if values:
-            means[row] = np.mean(values)
-        if len(values) > 1:
-            errors[row] = np.std(values, ddof=1) / np.sqrt(len(values))
-    best = max(left, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
-    return ActionValues(tuple(found.actions), means, errors, counts, found.actions[best], table)
+    rollouts = Rollouts(env, actions, options)
+    candidates = range(len(rollouts.actions))
+    if progress:
+        with progress_bar(len(candidates) * futures, "branch") as bar:
+            for _ in range(futures):
+                rollouts.add(candidates, 1)
+                bar.update(len(candidates))
+    else:
+        rollouts.add(candidates, futures)
+    return rollouts.values(candidates)
 
 
 def base_value(env: Any, base: Any) -> ActionValues:
-    """Return the base's answer as the best action, without tries; within a branch."""
-    player = player_of(env, base)
-    nothing = np.full(1, np.nan)
-    return ActionValues((action := player.decide(),), nothing, nothing, np.zeros(1, np.int64), action, np.zeros((1, 0)))
+    """Return the base's answer as the best action, without rollouts. In branches, planners act as their bases."""
+    action, unknown = player_of(env, base).decide(), np.full(1, np.nan)
+    return ActionValues((action,), unknown, unknown, np.zeros(1, np.int64), action, np.zeros((1, 0)))
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class RolloutOptions:
+    """The options of rollouts: the arguments of ``action_values``, which describes them."""
+
+    base: Any = RULE
+    futures: int = 16
+    horizon: float | None = None
+    horizon_by: str = "decision"
+    terminal_value: Callable[[Any], float] | None = None
+    discount: float = 1.0
+    discount_by: str = "decision"
+    seed: int | None = None
+    method: str | None = None
+    time_limit: float = 600.0
+
+    def __post_init__(self) -> None:
+        self.timed = "time" in (self.discount_by, self.horizon_by)
+        for name in ("horizon_by", "discount_by"):
+            self.require(name, getattr(self, name) in ("decision", "time"), '"decision" or "time"')
+        self.require("futures", is_count(self.futures), "a positive integer")
+        horizon: Any = self.horizon
+        if self.horizon_by == "time":
+            fine, kind = is_number(horizon) and horizon > 0, "a positive time or None"
+        else:
+            fine, kind = is_count(horizon), "a number of decisions, 1 or more, or None"
+        self.require("horizon", horizon is None or fine, kind)
+        self.require("discount", is_number(self.discount) and 0 <= self.discount <= 1, "a number from 0 to 1")
+        fine = self.terminal_value is None or callable(self.terminal_value)
+        self.require("terminal_value", fine, "a callable of the environment")
+        self.seed = checked_seed(self.seed)
+
+    def require(self, name: str, fine: bool, kind: str) -> None:
+        """Refuse the value of an option unless it is fine."""
+        if not fine:
+            raise OptionValueError(f"{name} must be {kind}, not {short_repr(getattr(self, name))}")
+
+
+def is_count(value: Any) -> bool:
+    """Return whether a value is a positive integer."""
+    return is_seed(value) and value > 0
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is one finite number."""
+    return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)
+
+
+class Rollouts:
+    """The rollouts of the candidates for a pending decision. Future number i is the same for all candidates.
+
+    Attributes:
+        actions: The candidates.
+        reseeds: Whether there are unlimited futures. Otherwise there is only the one exact future.
+        returns: The returns of each candidate's rollouts.
+    """
+
+    def __init__(self, env: Any, actions: Any, options: RolloutOptions, *, legal: bool = False) -> None:
+        """Check the candidates, the base and the options. Masked candidates are left out if ``legal``."""
+        self._env, self._options = env, options
+        player = player_of(env, options.base)
+        player.check_base()
+        if options.timed and player.episode.clock is None:
+            raise OptionValueError('discount_by="time" and horizon_by="time" need a simulation with a method time()')
+        self.actions = player.candidates(actions, legal=legal)
+        self.returns: list[list[float]] = [[] for _ in self.actions]
+        number = player.record.consultations - 1 if player.record.consultations else player.episode.turns
+        decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
+        self._entropy = [*decision, _KEY, *(() if options.seed is None else (options.seed,))]
+        try:
+            player.view.check_reseed()
+            self.reseeds = True
+        except BranchError:
+            self.reseeds = False
+            warn_user(
+                f"{type(player.view.simulation).__name__} cannot draw new random numbers in a branch: the planner"
+                " tries all candidates on the one future that will happen, and so foresees chance. Give it a method"
+                " reseed(seed), empty if nothing is random, or set global_rng=True if it draws from random or"
+                " numpy.random"
+            )
+
+    def seeds(self, number: int) -> list[int]:
+        """Return the seeds of the first futures."""
+        return [int(word) for word in np.random.SeedSequence(self._entropy).generate_state(number)]
+
+    def add(self, candidates: Iterable[int], number: int) -> None:
+        """Try candidates, given by their places, in some more futures; at most in one if there is only one."""
+        self.run(
+            [
+                ((place,), future)
+                for place in candidates
+                for future in range(len(self.returns[place]), len(self.returns[place]) + number)
+                if self.reseeds or future == 0
+            ]
+        )
+
+    def run(self, rollouts: Sequence[tuple[Plan, int]]) -> list[list[float]]:
+        """Run rollouts, given by their plans and the numbers of their futures; return what each ``rollout`` returns."""
+        options, seeds = self._options, None
+        if self.reseeds:
+            numbers = self.seeds(1 + max((future for _, future in rollouts), default=0))
+            seeds = [numbers[future] for _, future in rollouts]
+
+        def run_one(env: Any, number: int) -> list[float]:
+            plan, future = rollouts[number]
+            actions = [self.actions[place] for place in plan]
+            planning = PLANNING.set(True)
+            try:
+                return rollout(player_of(env, options.base), actions, options)
+            except BaseException as error:
+                tried = ", ".join(map(short_repr, actions))
+                annotate(error, f"simenv_marl: while {tried} was tried out in future {future}")
+                raise
+            finally:
+                PLANNING.reset(planning)
+
+        results: list[list[float]] = branch(
+            self._env, run_one, len(rollouts), method=options.method, seeds=seeds, time_limit=options.time_limit
+        )
+        for (plan, _), rewards in zip(rollouts, results, strict=True):
+            self.returns[plan[0]].append(sum(rewards))
+        return results
+
+    def values(self, finalists: Sequence[int]) -> ActionValues:
+        """Estimate the values; the best candidate is one of the finalists, which are given by their places."""
+        counts = np.array([len(values) for values in self.returns], np.int64)
+        returns = np.full((len(counts), counts.max()), np.nan)
+        means, errors = np.full((2, len(counts)), np.nan)
+        for place, values in enumerate(self.returns):
+            returns[place, : len(values)] = values
+            if values:
+                means[place] = np.mean(values)
+            if len(values) > 1:
+                errors[place] = np.std(values, ddof=1) / np.sqrt(len(values))
+        best = max(finalists, key=lambda place: -np.inf if np.isnan(means[place]) else means[place])
+        return ActionValues(tuple(self.actions), means, errors, counts, self.actions[best], returns)
+
+
+def rollout(player: Player, actions: Sequence[Any], options: RolloutOptions) -> list[float]:
+    """Take actions in a branch, one after the other, and continue with the base.
+
+    If an action is illegal when its decision arises, the base decides. Returns the discounted reward of each decision
+    of the agent; the terminal value is added to the last one.
+    """
+    player.start()
+    rewards: list[float] = []
+    action, start = actions[0], player.now() if options.timed else 0.0
+    while True:
+        number, elapsed = len(rewards), player.now() - start if options.timed else 0.0
+        weight = options.discount ** (elapsed if options.discount_by == "time" else number)
+        if number:
+            reached = elapsed if options.horizon_by == "time" else number
+            if options.horizon is not None and reached >= options.horizon:
+                break
+            planned = number < len(actions) and player.allows(actions[number])
+            action = actions[number] if planned else player.decide()
+        rewards.append(weight * player.step(action))
+        if player.over:
+            return rewards
+    if options.terminal_value is not None:
+        value: Any = options.terminal_value(player.env)
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.item()
+        if not is_number(value):
+            raise OptionValueError(f"terminal_value must return a finite number, not {short_repr(value)}")
+        rewards[-1] += float(value) * weight
+    return rewards

@@ -1,0 +1,85 @@
+"""Planners: policies with a keyword-only parameter ``_environment``, which get the environment in which they decide.
+
+In branches of that environment, and where a planner tries a candidate, no policy gets an environment, because two
+planners would ask each other without end. There the planner's attribute ``base`` answers, or the rule if it has none.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
+from importlib import import_module
+from typing import Any, Final
+from weakref import ref
+
+from ..errors import OptionValueError, short_repr
+from ..simulation import RULE, positional
+from .point import asks_for
+
+PLANNING: Final[ContextVar[bool]] = ContextVar("simenv_marl.planning", default=False)
+"""Whether this code runs in a branch in which a planner tries a candidate action."""
+
+
+def takes_info(policy: Callable[..., Any]) -> bool:
+    """Return whether a policy takes the observation and the info, and not the observation alone."""
+    parameters = positional(policy)
+    return len(parameters) > 1 and (parameters[1].default is parameters[1].empty or parameters[1].name == "info")
+
+
+def is_planner(policy: Any) -> bool:
+    """Return whether a policy has a keyword-only parameter ``_environment``."""
+    return asks_for(policy, "_environment")
+
+
+def base_of(base: Any, agent: str) -> Any:
+    """Find the base of an agent, which is ``RULE`` or a policy, in a base, a dict of these by agent, or a planner."""
+    while True:
+        if isinstance(base, Mapping):
+            base = base.get(agent, RULE)
+        elif hasattr(base, "base") and is_planner(base):
+            base = base.base
+        else:
+            return base
+
+
+class PlannerPolicy:
+    """The wrapper of a planner in a plan. Other policies have none, and so cost nothing extra."""
+
+    def __init__(self, policy: Callable[..., Any]) -> None:
+        self.policy = policy
+        self._takes_info = takes_info(policy)
+        self._session: ref[Any] | None = None
+
+    def bind(self, session: Any) -> PlannerPolicy:
+        """Copy the wrapper for the episodes of a session, which it holds by a weak reference."""
+        bound = copy.copy(self)
+        bound._session = ref(session)
+        return bound
+
+    def __call__(self, observation: Any, info: Any) -> Any:
+        """Ask the planner; in a branch, ask its base."""
+        session = None if self._session is None else self._session()
+        if session is None:
+            raise OptionValueError(
+                f"the policy {short_repr(self.policy)} asks for _environment, but there is no environment to give it"
+                " here; pass the policy in policies="
+            )
+        episode = session.episode
+        if not (episode.plan.solo or PLANNING.get()):
+            views = import_module("..envs.planner", __package__)  # by name, because views import the core
+            return self.answer(observation, info, views.PlannerEnv(session.plan, session))
+        base = base_of(getattr(self.policy, "base", RULE), (episode.consulted or episode.pending).name)
+        if base is RULE or not callable(base) or is_planner(base):
+            return RULE
+        return base(observation, info) if takes_info(base) else base(observation)
+
+    def answer(self, observation: Any, info: Any, environment: Any) -> Any:
+        """Ask the planner for an action, and give it an environment."""
+        seen = (observation, info) if self._takes_info else (observation,)
+        return self.policy(*seen, _environment=environment)
+
+
+def bind_session(policy: Any, session: Any) -> Any:
+    """Bind a session to a wrapped planner; return any other policy unchanged."""
+    return policy.bind(session) if isinstance(policy, PlannerPolicy) else policy

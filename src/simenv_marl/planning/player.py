@@ -1,0 +1,269 @@
+"""The agent whose decision is pending, in each view: it takes a candidate in a branch, and then follows its base.
+
+The environment may have wrappers. The agent's actions go through them, and its observations and rewards come from them.
+``RULE``, which only the unwrapped environment knows, replaces the action that the wrappers let through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any
+
+from gymnasium import spaces
+
+from ..core.actions import ILLEGAL, action_check
+from ..core.agent import Agent
+from ..core.branching import pending_view
+from ..core.planner import PlannerPolicy, base_of
+from ..core.roster import two_arguments
+from ..core.solo import delegate, may_be
+from ..core.spaces import duplicate
+from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
+from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, did_you_mean, short_repr
+from ..simulation import RULE
+
+
+class Player:
+    """The agent whose decision is pending, in the single view.
+
+    Attributes:
+        env: The environment, with or without wrappers.
+        view: The unwrapped environment.
+        episode: Its episode.
+        record: The episode's record of the agent.
+        agent: The name of the agent.
+        base: What decides after the candidate: ``RULE``, a policy of the agent, or a dict of policies by agent.
+        may_be: Returns whether an agent of a name exists, or may appear.
+        over: Whether the agent's episode has ended.
+    """
+
+    def __init__(self, env: Any, base: Any) -> None:
+        self.env, self.view, self.base = env, env.unwrapped, base
+        self.episode = self.view.episode
+        self.record: Agent = self.episode.pending or self.episode.consulted
+        self.agent = self.record.name
+        self.may_be: Callable[[Any], bool] = partial(may_be, self.episode)
+        self.over = False
+        self._policies: dict[str, Any] = {}  # the bases that were asked, by agent
+        self._seen: dict[str, Any] = {}  # observation and info, as the latest step has returned them, by agent
+
+    # -- checks, before anything moves ------------------------------------------------------------
+
+    def candidates(self, actions: Any, *, legal: bool = False) -> list[Any]:
+        """Check the candidates for the pending decision, and return them; without masked ones if ``legal``."""
+        if actions is None:
+            space = self._space_of(self.agent)
+            if not isinstance(space, spaces.Discrete):
+                raise OptionValueError(
+                    f"actions=None needs a Discrete action space; list candidates of {short_repr(space)}"
+                )
+            actions, legal = range(int(space.start), int(space.start + space.n)), True
+        listed = list(actions) if isinstance(actions, Iterable) and not isinstance(actions, (str, Mapping)) else []
+        if not listed:
+            raise OptionValueError(f"actions must be a list of candidates, not {short_repr(actions)}")
+        for action in listed:
+            self._check(action, None if legal else self.record.mask)
+        found = [action for action in listed if self.allows(action)] if legal else listed
+        if not found:
+            raise InvalidActionError(
+                f"all candidates of {self.agent!r} are masked; its mask is {short_repr(self.record.mask)}"
+            )
+        return found
+
+    def allows(self, action: Any) -> bool:
+        """Return whether an action is legal now."""
+        try:
+            self._check(action, self.record.mask)
+        except InvalidActionError:
+            return False
+        return True
+
+    def _check(self, action: Any, mask: Any) -> None:
+        """Refuse an action that is not legal. The mask does not apply if wrappers have replaced the action space."""
+        point, space = self.record.point, self._space_of(self.agent)
+        if action is RULE:
+            return
+        if space == point.definition.action_space:
+            point.checked(action, self.agent, mask)
+        elif action_check(space)(action) is ILLEGAL:
+            raise InvalidActionError(f"the action {short_repr(action)} of {self.agent!r} is not in {short_repr(space)}")
+
+    def check_base(self) -> None:
+        """Refuse a base that is not a policy, or that names an agent that does not exist."""
+        bases = self.base if isinstance(self.base, Mapping) else {self.agent: self.base}
+        if any(policy is not RULE and not callable(policy) for policy in bases.values()):
+            raise OptionValueError(f"base must be RULE, a policy, or policies by agent, not {short_repr(self.base)}")
+        for name in bases if bases is self.base else ():
+            if not self.may_be(name):
+                known = [*self.episode.agents, *self.episode.others]
+                raise UnknownAgentError(
+                    f"base names {short_repr(name)}, which is not an agent here; the agents are:"
+                    f" {known}{did_you_mean(name, known)}"
+                )
+
+    # -- in a branch ------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Prepare a branch."""
+        self.view.stop_showing()
+        if isinstance(self.view, SimulationEnv) and isinstance(self.base, Mapping):
+            delegate(self.episode, self.base)  # the simulation answers for all other agents
+
+    def now(self) -> float:
+        """Return the simulation's time."""
+        return float(self.episode.clock())
+
+    def step(self, action: Any) -> float:
+        """Take an action, continue to the agent's next decision or its end, and return the reward."""
+        observation, reward, terminated, truncated, info = self._step_env(action, self.agent)
+        self._seen, self.over = {self.agent: (observation, info)}, terminated or truncated
+        return float(reward)
+
+    def decide(self) -> Any:
+        """Return the agent's action by its base."""
+        return self._decide_for(self.agent)
+
+    def _decide_for(self, name: str) -> Any:
+        """Return an agent's action by its base."""
+        policy: Any = self._policies.get(name)
+        if policy is None:
+            base: Any = base_of(self.base, name) if name == self.agent or isinstance(self.base, Mapping) else RULE
+            policy = base if base is RULE else two_arguments(base)
+            if isinstance(policy, PlannerPolicy):
+                policy = partial(policy.answer, environment=self.env)
+            self._policies[name] = policy
+        return RULE if policy is RULE else policy(*self._observe(name))
+
+    def _observe(self, name: str) -> Any:
+        """Return the latest observation and info of an agent."""
+        if name in self._seen:
+            return self._seen[name]
+        agent = self.record if name == self.agent else self.episode.agents[name]
+        observation = agent.point.blank() if agent.observation is None else duplicate(agent.observation)
+        return observation, dict(agent.info)
+
+    # -- through wrappers -------------------------------------------------------------------------
+
+    def _space_of(self, name: str) -> Any:
+        """Return the action space of an agent in the wrapped environment."""
+        space: Any = self.env.action_space
+        return space(name) if callable(space) else space
+
+    def _step_env(self, action: Any, name: str) -> Any:
+        """Step through the wrappers. ``RULE``, also as a part of a dict of actions, reaches the view unchanged."""
+        view, parts = self.view, action if isinstance(action, Mapping) else {}
+        rules = {agent: RULE for agent, part in parts.items() if part is RULE}
+        if self.env is view or not (rules or action is RULE):
+            return self.env.step(action)
+        sample = {**parts, **{agent: self._sample(agent) for agent in rules}} if rules else self._sample(name)
+
+        def step(through: Any) -> Any:
+            return type(view).step(view, {**through, **rules} if rules else RULE)
+
+        vars(view)["step"] = step  # wrappers call it with what they make of the sample
+        try:
+            return self.env.step(sample)
+        finally:
+            del vars(view)["step"]
+
+    def _sample(self, name: str) -> Any:
+        """Return a legal action of an agent, which wrappers see in place of ``RULE``."""
+        space, agent = self._space_of(name), self.episode.agents.get(name)
+        masked = agent is not None and agent.mask is not None and space == agent.point.definition.action_space
+        return space.sample(agent.mask) if masked else space.sample()
+
+
+class JointPlayer(Player):
+    """The one agent of a joint view, whose action holds the actions of the roster's agents."""
+
+    def __init__(self, env: Any, base: Any) -> None:
+        super().__init__(env, base)
+        self.agent = "all agents"
+        self.may_be = self.view.joint.roster.__contains__
+        if isinstance(base, Mapping) and not isinstance(self.view.action_space, spaces.Dict):
+            raise OptionValueError(
+                "a base by agent needs a joint view without flatten=True; pass one policy for all agents"
+            )
+
+    def _space_of(self, name: str) -> Any:
+        space: Any = self.env.action_space
+        return space if name == self.agent else space[name]
+
+    def _check(self, action: Any, mask: Any) -> None:
+        if self._space_of(self.agent) == self.view.action_space:
+            self.episode.rounds.check(self.episode, self.view.joint.actions(self.episode, action))
+        elif isinstance(action, Mapping):
+            super()._check({name: self._sample(name) if part is RULE else part for name, part in action.items()}, mask)
+        else:
+            super()._check(action, mask)
+
+    def decide(self) -> Any:
+        """Return the actions of all agents by the base."""
+        if not isinstance(self.base, Mapping):
+            return super().decide()
+        agents = self.episode.agents
+        return {name: self._decide_for(name) if name in agents else RULE for name in self.view.joint.roster}
+
+    def _observe(self, name: str) -> Any:
+        if name == self.agent and not self._seen:
+            return self.view.joint.observe(self.episode), {}
+        return super()._observe(name)
+
+
+class AECPlayer(Player):
+    """An agent of an AEC view."""
+
+    def __init__(self, env: Any, base: Any) -> None:
+        super().__init__(env, base)
+        if self.view.agent_selection != self.agent:
+            raise EpisodeOverError(
+                f"{self.view.agent_selection!r} is selected, but its episode has ended: call step(None) before you"
+                f" plan the decision of {self.agent!r}"
+            )
+
+    def step(self, action: Any) -> float:
+        """Take an action; all other agents decide until this agent is selected again."""
+        env, name = self.env, self.agent
+        self._step_env(action, name)
+        while env.agents:
+            name = env.agent_selection
+            if name == self.agent:
+                _, reward, terminated, truncated, _ = env.last(observe=False)
+                self.over = terminated or truncated
+                return float(reward)
+            ended = env.terminations[name] or env.truncations[name]
+            self._step_env(None if ended else self._decide_for(name), name)
+        self.over = True
+        return 0.0
+
+    def _observe(self, name: str) -> Any:
+        observation, _, _, _, info = self.env.last()
+        return observation, info
+
+
+class ParallelPlayer(Player):
+    """An agent of a parallel view, whose actions are part of rounds."""
+
+    def step(self, action: Any) -> float:
+        """Play a round, and further rounds without an action of the agent until its decision is pending again."""
+        reward = self._play({self.agent: action})
+        while not self.over and self.episode.pending is not self.record:
+            reward += self._play({})
+        return reward
+
+    def _play(self, actions: dict[str, Any]) -> float:
+        """Play a round in which the other agents follow their bases."""
+        others = {name: self._decide_for(name) for name in self.episode.agents if name != self.agent}
+        observations, rewards, terminations, truncations, infos = self._step_env(actions | others, self.agent)
+        self._seen = {name: (observations[name], infos.get(name, {})) for name in observations}
+        over = terminations.get(self.agent, True) or truncations.get(self.agent, True)
+        self.over = bool(over or self.record.ended)  # with padded=True, ended agents stay
+        return float(rewards.get(self.agent, 0.0))
+
+
+def player_of(env: Any, base: Any) -> Player:
+    """Return the player of the agent whose decision is pending in an environment of one simulation."""
+    view = pending_view(env, "planning")
+    players = {SimulationAECEnv: AECPlayer, SimulationParallelEnv: ParallelPlayer, SimulationJointEnv: JointPlayer}
+    return next((player for kind, player in players.items() if isinstance(view, kind)), Player)(env, base)

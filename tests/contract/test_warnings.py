@@ -21,7 +21,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.core import session
+from simenv_marl.core import rng
 from simenv_marl.errors import ObservationError, UnknownPointError
 from tests.worlds.models import calling, decision, define, script
 
@@ -43,7 +43,7 @@ def heard():
 @pytest.fixture
 def _alone(monkeypatch):
     """As if no threads of other tests were left, beside which the driver of threads can blame no simulation."""
-    monkeypatch.setattr(session, "enumerate_threads", lambda: [threading.current_thread()])
+    monkeypatch.setattr(rng, "enumerate_threads", lambda: [threading.current_thread()])
 
 
 # -- global generators ----------------------------------------------------------------------------
@@ -174,7 +174,7 @@ def test_threads_that_only_wait_are_no_excuse(heard) -> None:
 
 def test_each_class_is_checked_at_its_first_reset_only(monkeypatch) -> None:
     checked = []
-    monkeypatch.setattr(session, "global_state", lambda state=session.global_state: (checked.append(1), state())[1])
+    monkeypatch.setattr(rng, "global_states", lambda states=rng.global_states: (checked.append(1), states())[1])
     kind = gambler(lambda: 0)
     for _ in range(3):
         play(single_env(kind, decide))

@@ -4,10 +4,11 @@ Each module imports only from those below it::
 
     branching                   exact continuations of an episode
     provenance                  the record of what an environment was made of
-    solo, together              a branch that waits for one agent; steps of many episodes
+    together                    steps of many episodes
     session                     the simulation of one environment, over all its episodes
     episode                     one episode, and the life cycle of a decision
     rounds, run                 rounds of the parallel and joint views; the run on the simulation's stack
+    delegation                  decisions that policies or the rule take
     plan                        the checked description of an environment
     agent, prototype, roster    one agent; a simulation made for inspection; who decides where
     greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread

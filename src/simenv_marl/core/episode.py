@@ -14,7 +14,7 @@ A decision::
       suspended          ------>   ``handle``: find the agent; if the rule decides, back to the simulation
                                    ``update``: reward of the previous action (the first of an episode is dropped),
                                      legal actions, info, observation
-                                   if a policy answers (``consult``), back to the simulation with its action
+                                   if a policy answers (``delegation.consult``), back to the simulation with its action
                                    else PENDING, until the user answers
                                    ``answer``: map the checked action to the reply
       returns            <------   ``advance``
@@ -40,11 +40,12 @@ from ..errors import AgentError, NoDecisionError, short_repr, warn_user
 from ..hooks.hook import Hook
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
-from .actions import ILLEGAL, only_choice
+from .actions import ILLEGAL
 from .agent import Agent
 from .context import ExclusiveLock
+from .delegation import consult, decide_too_late, decide_unless_forced, decides_after_end
 from .driver import WAIT, Driver
-from .plan import DeferredPolicy, Plan
+from .plan import Plan
 from .point import Point
 from .rng import GlobalRandom
 from .rounds import Rounds
@@ -130,7 +131,9 @@ class Episode(Run):
         if self.rounds is not None:
             self.decide = self.rounds.decide
         elif self.skips:
-            self.decide = Episode.decide_unless_forced
+            self.decide = decide_unless_forced
+
+    consult = consult
 
     def events_by_hook(self) -> dict[Hook, Any]:
         """The events that the simulation sends: an agent where it is the only one of a point, else the plan's event."""
@@ -283,7 +286,7 @@ class Episode(Run):
             self.tape = LOST
         self.limit = self.most_steps
         if self.turns == self.limit:
-            self.decide = Episode._decide_too_late
+            self.decide = decide_too_late
 
     def _observe_announced(self) -> None:
         """After a reset, observe the agents that ``expected_calls`` announces and that have not decided."""
@@ -297,84 +300,6 @@ class Episode(Run):
         self.pending = following
         for agent in self.agents.values() if self.skips else ():
             agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards
-
-    # -- who decides ------------------------------------------------------------------------------
-
-    def consult(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Let a policy answer a decision.
-
-        Returns:
-            The reply to the simulation; ``WAIT`` if the policy is asked later, for many decisions at once, or if a
-            replay has reached the other episode's decision.
-
-        Raises:
-            InvalidActionError: The policy's action is not legal.
-            BaseException: Any error of a mapping or the policy.
-        """
-        if agent.ended:
-            raise _decides_after_end(agent)
-        if self.is_complete:  # else the simulation might run for ever without a decision for the user
-            self.finish(truncated=False)
-            return WAIT
-        policy = agent.policy
-        if policy is RULE:
-            return RULE
-        self.latest = agent
-        update = agent.point.updates[0]
-        update(agent, args, kwargs, reward=False)
-        forced = self.forced_action(agent) if self.skips else None
-        if forced is not None:
-            return self.answer_forced(agent, forced)
-        is_deferred = isinstance(policy, DeferredPolicy)
-        if is_deferred and not self.plan.solo:
-            self.pending = agent
-            return WAIT
-        if agent.is_planner:
-            agent.consultations += 1
-            agent.keep(self, args, kwargs)
-        if self.script:
-            action = self.script.popleft()
-        else:
-            self.consulted = agent
-            if self.script is not None:
-                self.pending = agent
-                return WAIT
-            try:
-                action = policy.alone(self, agent) if is_deferred else policy(agent.observation, agent.info)
-            finally:
-                self.consulted = None
-        self.record(duplicate(action))
-        return self.answer(agent, agent.checked(action), False)
-
-    def _decide_too_late(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Truncate the episode, because the user has taken the last step."""
-        self.finish(truncated=True)
-        return WAIT
-
-    def decide_unless_forced(self, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Update an agent. Its rewards add up until it has more than one legal action."""
-        agent.update(agent, args, kwargs)
-        agent.reward, agent.carried = agent.reward + agent.carried, 0.0
-        forced = self.forced_action(agent)
-        if forced is not None or not agent.asked:  # ``reset`` returns no rewards either
-            agent.reward, agent.carried = 0.0, agent.reward
-        if forced is not None:
-            return self.answer_forced(agent, forced)
-        agent.asked = True
-        self.pending = agent
-        return WAIT
-
-    def answer_forced(self, agent: Agent, action: Any) -> Any:
-        """Answer with the only legal action. The elapsed time adds up until the agent is asked, as rewards do."""
-        before = agent.answered_at
-        reply = self.answer(agent, action, False)
-        if before is not None:
-            agent.answered_at = before
-        return reply
-
-    def forced_action(self, agent: Agent) -> Any:
-        """The only legal action of an agent; None if it has several."""
-        return only_choice(agent.point.definition.action_space, agent.mask)
 
     # -- agents -----------------------------------------------------------------------------------
 
@@ -393,7 +318,7 @@ class Episode(Run):
         agent = self.others.get(name) or self.agents.get(name)
         if agent is None:
             if name in self.ended:
-                raise _decides_after_end(self.ended[name])
+                raise decides_after_end(self.ended[name])
             agent = self._new_agent(name, point)
             (self.agents if agent.own else self.others)[name] = agent
         elif agent.point is not point:
@@ -494,13 +419,6 @@ class Episode(Run):
         return (
             f"{ended} {points}; does the simulation call the decision functions as attributes of their class or module?"
         )
-
-
-def _decides_after_end(agent: Agent) -> AgentError:
-    return AgentError(
-        f"the agent {agent.name!r} decides at {agent.point.point.name} after its end; agent= must give each entity a"
-        " name of its own, and removed_by= or end_agent() must end an agent only when its entity is gone"
-    )
 
 
 def listed(names: Collection[str]) -> str:

@@ -26,30 +26,35 @@ class Loops:
         users: The user's loop and its hooks, while the simulation runs. None if there is nothing to restore.
     """
 
-    __slots__ = ("_own", "running", "users")
+    __slots__ = ("_before", "_own", "running", "users")
 
     def __init__(self) -> None:
         self.running: Callable[[], Any] | None = None
         self.users: Any = None
-        self._own: Any = None
+        self._before: Any = _NO_LOOP  # the user's state without a loop, for a simulation that begins one later
+        self._own: Any = None  # the simulation's state, while the user runs
 
     def begin(self) -> None:
         """Switch to the simulation for a new job, which begins without a loop."""
+        before = _present_loop()
+        self._before = before if before[0] is None else _NO_LOOP
         self._own = None
         self.enter()
 
     def enter(self) -> None:
         """Switch to the simulation's loop."""
-        users, own = _present_loop(), self._own or _NO_LOOP
-        self.users = None if users == own == _NO_LOOP else users
-        if self.users is not None:
-            _set_loop(own)
+        users, own = _present_loop(), self._own
+        self._own = None
+        if own is not None or users[0] is not None:
+            self.users = users
+            _set_loop(own or _NO_LOOP)
 
     def leave(self) -> None:
         """Switch to the user's loop."""
-        self._own = _present_loop()
-        if self._own[0] is not None or self.users is not None:
-            _set_loop(self.users or _NO_LOOP)
+        own = _present_loop()
+        if own[0] is not None or self.users is not None:
+            self._own, users, self.users = own, self.users or self._before, None
+            _set_loop(users)
 
 
 def silence_unwound_tasks() -> None:

@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import random
 from _random import Random as Twister
+from collections.abc import Callable
 from ctypes import memmove, string_at
 from sys import modules
 from threading import current_thread, get_ident
+from threading import enumerate as enumerate_threads
+from time import process_time_ns, thread_time_ns
 from typing import Any, Final
+from weakref import WeakSet
 
 import numpy as np
 
-from ..errors import WrongThreadError
+from ..errors import WrongThreadError, warn_user
 from ..hooks.stacks import SIMULATION
 
 _python: Any = random.seed.__self__  # type: ignore[attr-defined]  # the generator behind the functions of ``random``
@@ -165,9 +169,52 @@ class GlobalRandom:
             self.leave()
 
 
-def global_state() -> tuple[Any, Any]:
+# -- simulations that draw from the generators of the process ---------------------------------------
+
+_CHECKED: Final[WeakSet[type]] = WeakSet()
+"""The classes of simulations that were checked."""
+
+TOO_SHORT: Final = 100_000
+"""A time in nanoseconds. Another thread that wakes up and draws runs for longer; the clocks differ by less."""
+
+
+def draws_check(simulation: Any, *, in_thread: bool) -> Callable[[], None] | None:
+    """Begin to check whether a simulation draws from the global generators.
+
+    Args:
+        simulation: The simulation.
+        in_thread: Whether it runs in a thread of its own, beside which other threads of the user may run.
+
+    Returns:
+        A function that ends the check, and warns if the simulation has drawn. None if its class was checked before.
+    """
+    kind = type(simulation)
+    if kind in _CHECKED:
+        return None
+    states, time = global_states(), _time_of_others()
+
+    def warn_of_draws() -> None:
+        _CHECKED.add(kind)
+        names = [name for name, state in global_states().items() if state != states[name]]
+        alone = all(thread is current_thread() or thread.name == SIMULATION for thread in enumerate_threads())
+        if names and (alone or (not in_thread and _time_of_others() - time < TOO_SHORT)):
+            warn_user(
+                f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which all code in the"
+                " process shares: its environments influence each other, and a seed does not repeat an episode. Make"
+                " them with global_rng=True"
+            )
+
+    return warn_of_draws
+
+
+def global_states() -> dict[str, Any]:
     """Return values that change when a number is drawn from Python's or NumPy's global generator."""
-    return random.getstate(), repr(_legacy.get_bit_generator().state)
+    return {"random": random.getstate(), "numpy.random": repr(_legacy.get_bit_generator().state)}
+
+
+def _time_of_others() -> int:
+    """The time in nanoseconds for which all other threads have run."""
+    return process_time_ns() - thread_time_ns()
 
 
 # -- other futures --------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from ..hooks.stacks import EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import ILLEGAL
 from .agent import Agent
+from .delegation import forced_action
 from .driver import WAIT
 from .spaces import duplicate
 
@@ -134,7 +135,7 @@ class Rounds:
         return self._use_action(episode, agent)
 
     def _use_action(self, episode: Episode, agent: Agent) -> Any:
-        action = episode.forced_action(agent) if episode.skips else None
+        action = forced_action(episode, agent) if episode.skips else None
         if action is None:
             action = self.actions.pop(agent.name, MISSING)
             mask = agent.mask

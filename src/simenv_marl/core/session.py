@@ -11,11 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from contextvars import Context, copy_context
 from enum import Enum
 from functools import partial
-from threading import current_thread
-from threading import enumerate as enumerate_threads
-from time import process_time_ns, thread_time_ns
-from typing import Any, Final
-from weakref import WeakSet
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -24,7 +20,6 @@ from gymnasium.utils import seeding
 
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..hooks.patches import Installation
-from ..hooks.stacks import SIMULATION
 from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, environment_context
 from .driver import Driver
@@ -32,16 +27,9 @@ from .episode import LONGEST_TAPE, LOST, Episode
 from .plan import Plan
 from .prototype import DRIVERS
 from .resources import open_resources
-from .rng import GlobalRandom, global_state, is_seed
+from .rng import GlobalRandom, draws_check, is_seed
 from .run import refusal
 from .spaces import same
-
-_CHECKED: Final[WeakSet[type]] = WeakSet()
-"""The classes of simulations that were checked for draws from the global generators."""
-
-
-TOO_SHORT: Final = 100_000
-"""A time in nanoseconds. Another thread that wakes up and draws runs for longer; the clocks differ by less."""
 
 
 class State(Enum):
@@ -227,8 +215,7 @@ class Session:
         if self._driver is not None and self._driver.given_up is not None:
             self._make_simulation()  # code that still uses the old one must not meet another episode
         context = copy_context()
-        checks_draws = self._rng is None and type(self.simulation) not in _CHECKED
-        before = (*global_state(), _time_of_others()) if checks_draws else None
+        check = None if self._rng is not None else draws_check(self.simulation, in_thread=self.lock is not None)
         try:
             with self.context():
                 if self._rng is not None:
@@ -246,7 +233,7 @@ class Session:
         driver.begin(self.simulation.run, episode.events_by_hook(), context)
         try:
             self.episode = episode  # from now on the episode will be ended, even after an interrupt
-            episode.begin(None if before is None else partial(self._check_draws, before))
+            episode.begin(check)
         except BaseException:
             episode.over = True  # an interrupt may have come before the episode could set this
             if episode.unwound:
@@ -263,19 +250,6 @@ class Session:
             known = self.plan, self.simulation, self.plan.with_simulation(self.simulation, self)
             self._plan_of_simulation = known
         return known[2]
-
-    def _check_draws(self, before: tuple[Any, ...]) -> None:
-        """Warn if a simulation of a new class has drawn from the global generators before its first decision."""
-        kind = type(self.simulation)
-        _CHECKED.add(kind)
-        drawn = zip(("random", "numpy.random"), before, global_state(), strict=False)
-        names = [name for name, old, new in drawn if old != new]
-        if names and (_is_alone() or (self.lock is None and _time_of_others() - before[2] < TOO_SHORT)):
-            warn_user(
-                f"{kind.__name__} draws from the global generator of {' and '.join(names)}, which all code in the"
-                " process shares: its environments influence each other, and a seed does not repeat an episode. Make"
-                " them with global_rng=True"
-            )
 
     def replay(self, other: Session) -> Episode:
         """Bring the simulation to the current decision of another session with the same plan.
@@ -436,16 +410,6 @@ class Session:
                 except BaseException as error:
                     annotate(error, f"simenv_marl: while the simulation was reseeded; seed {seed}")
                     raise
-
-
-def _is_alone() -> bool:
-    """Whether no other thread can have drawn from the global generators while a simulation ran."""
-    return all(thread is current_thread() or thread.name == SIMULATION for thread in enumerate_threads())
-
-
-def _time_of_others() -> int:
-    """The time in nanoseconds for which all other threads have run."""
-    return process_time_ns() - thread_time_ns()
 
 
 def _same_decision(one: Episode, other: Episode) -> bool:

@@ -7,9 +7,9 @@ from typing import Any, NoReturn
 
 from gymnasium import spaces
 
+from ..core.delegation import single_out
 from ..core.plan import Plan
 from ..core.session import Session
-from ..core.solo import single_out
 from ..errors import BranchError, CopyError, ReentrancyError
 from .base import View
 from .single import SimulationEnv

@@ -15,9 +15,9 @@ from gymnasium import spaces
 from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
 from ..core.branching import pending_view
+from ..core.delegation import delegate, may_be
 from ..core.planner import PlannerPolicy, base_of
 from ..core.roster import two_arguments
-from ..core.solo import delegate, may_be
 from ..core.spaces import duplicate
 from ..envs import SimulationAECEnv, SimulationEnv, SimulationJointEnv, SimulationParallelEnv
 from ..errors import EpisodeOverError, InvalidActionError, OptionValueError, UnknownAgentError, did_you_mean, short_repr

@@ -128,7 +128,7 @@ def test_the_generators_of_the_process_are_seeded_for_each_future(method):
     env, own = going_on(simulation=Both, global_rng=True), []
 
     def base(twin, number):
-        with twin._session.at_work():
+        with twin._session.context():
             own.append(drawn(twin, number))
         return drawn(twin, number), own[-1], twin.simulation.random.random()
 

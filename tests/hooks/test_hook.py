@@ -9,8 +9,8 @@ import weakref
 import cloudpickle
 import pytest
 from greenlet import getcurrent, greenlet
-
 from simenv_marl.core.children import Children
+
 from simenv_marl.hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
 from simenv_marl.hooks.stacks import EVALUATING, OUTSIDE, STACKS, outside_simulation, stack_of
 

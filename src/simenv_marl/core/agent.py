@@ -17,7 +17,7 @@ from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
 from .actions import MASK
 from .driver import WAIT
-from .planner import PlannerPolicy
+from .planner import DeferredPolicy, PlannerPolicy
 from .point import Point
 from .spaces import duplicate
 
@@ -35,6 +35,8 @@ class Agent:
         name: The name.
         point: The decision point at which the agent decides.
         policy: The policy that answers the agent's decisions. None: the environment's user answers them.
+        is_planner: Whether that policy gets the environment.
+        is_deferred: Whether that policy answers many decisions at once, so that the episode waits for it.
         own: Whether it is an agent of the environment, with rewards and an end.
         delegated: Whether the environment's user does not answer its decisions: a policy does, or it has ended.
         clock: Returns the simulation's time. None if the simulation has no time.
@@ -63,13 +65,14 @@ class Agent:
 
     __slots__ = (
         "acted", "answered_at", "asked", "carried", "choices", "clock", "consultations", "decided", "delegated",
-        "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "kwargs", "mask", "memory",
-        "name", "notes", "now", "observation", "offered", "own", "plugins", "point", "policy", "present", "report",
-        "rest", "reward", "rule_action", "update",
+        "deliver", "ended", "entity", "group", "handed_out", "info", "informs_rule_action", "is_deferred",
+        "is_planner", "kwargs", "mask", "memory", "name", "notes", "now", "observation", "offered", "own", "plugins",
+        "point", "policy", "present", "report", "rest", "reward", "rule_action", "update",
     )  # fmt: skip
 
     def __init__(self, name: str, point: Point, policy: Any, own: bool, clock: Any, plugins: Any) -> None:
-        self.name, self.point, self.policy, self.clock, self.plugins = name, point, policy, clock, plugins
+        self.name, self.point, self.clock, self.plugins = name, point, clock, plugins
+        self.follow(policy)
         self.own, self.delegated = own, not own
         self.deliver, self.report = point.deliver, point.report
         self.update: Callable[..., None] = point.updates[0]
@@ -91,6 +94,11 @@ class Agent:
         self.entity: Any = None
         self.rest: tuple[Any, ...] | None = None
         self.kwargs: dict[str, Any] = _NOTHING
+
+    def follow(self, policy: Any) -> None:
+        """Let a policy answer the agent's decisions. None: the environment's user answers them."""
+        self.policy = policy
+        self.is_planner, self.is_deferred = isinstance(policy, PlannerPolicy), isinstance(policy, DeferredPolicy)
 
     # -- decisions --------------------------------------------------------------------------------
 
@@ -153,11 +161,6 @@ class Agent:
             InvalidActionError: The action is not legal.
         """
         return action if action is RULE else self.point.checked(action, self.name, self.mask)
-
-    @property
-    def is_planner(self) -> bool:
-        """Whether the policy gets the environment."""
-        return isinstance(self.policy, PlannerPolicy)
 
     # -- infos ------------------------------------------------------------------------------------
 

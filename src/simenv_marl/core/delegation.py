@@ -14,7 +14,6 @@ from ..simulation import RULE
 from .actions import only_choice
 from .agent import Agent
 from .driver import WAIT
-from .plan import DeferredPolicy
 from .roster import declared_agents, two_arguments
 from .spaces import duplicate
 
@@ -55,8 +54,7 @@ def consult(episode: Episode, agent: Agent, args: tuple[Any, ...], kwargs: dict[
     forced = forced_action(episode, agent) if episode.skips else None
     if forced is not None:
         return answer_forced(episode, agent, forced)
-    is_deferred = isinstance(policy, DeferredPolicy)
-    if is_deferred and not episode.plan.solo:
+    if agent.is_deferred and not episode.plan.solo:
         episode.pending = agent
         return WAIT
     if agent.is_planner:
@@ -70,7 +68,7 @@ def consult(episode: Episode, agent: Agent, args: tuple[Any, ...], kwargs: dict[
             episode.pending = agent
             return WAIT
         try:
-            action = policy.alone(episode, agent) if is_deferred else policy(agent.observation, agent.info)
+            action = policy.alone(episode, agent) if agent.is_deferred else policy(agent.observation, agent.info)
         finally:
             episode.consulted = None
     episode.record(duplicate(action))
@@ -125,10 +123,11 @@ def single_out(episode: Episode, agent: Agent) -> None:
     for name, other in episode.agents.items():
         if other is not agent:
             episode.others[name], other.delegated = other, True
-            other.policy = plan.policy_of(name, other.point)
+            other.follow(plan.policy_of(name, other.point))
     episode.others.pop(agent.name, None)
     episode.agents, episode.just_ended, episode.is_complete = {agent.name: agent}, [], False
-    agent.policy, agent.delegated, agent.own, agent.asked = None, False, True, True
+    agent.follow(None)
+    agent.delegated, agent.own, agent.asked = False, True, True
     episode.rounds, episode.decide = None, decide_unless_forced if episode.skips else None
     episode.begun = True
     if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
@@ -145,7 +144,7 @@ def delegate(episode: Episode, policies: Mapping[str, Any]) -> None:
     episode.plan = episode.plan.with_policies(found)
     for name, agent in others.items():
         if agent is not None:
-            agent.policy = episode.plan.policies[name]
+            agent.follow(episode.plan.policies[name])
 
 
 def may_be(episode: Episode, name: Any) -> bool:

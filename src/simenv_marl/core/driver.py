@@ -255,10 +255,9 @@ class Driver:
             return self._outcome(job)
         finally:
             job = None
-            self.hide()
-            self._events = NO_EVENTS
-            if not self.ended:
-                self.show()  # plugins take part between the jobs, too
+            events, self._events = self._events, NO_EVENTS
+            for hook in events:
+                hook.enter(getcurrent(), None, None if self.ended else self.plugins)
 
     def _outcome(self, job: Any) -> Event:
         try:
@@ -373,7 +372,7 @@ class Driver:
 
 
 def reporting_rule(hook: Hook, event: Any, send: Callable[[Any], Taker]) -> Callable[..., Any]:
-    """Return the rule of a hook; if the event has a ``report``, the rule sends that event with each decision.
+    """Return the rule of a hook, which sends the event's ``report`` with each decision.
 
     Args:
         hook: The hook.
@@ -381,8 +380,6 @@ def reporting_rule(hook: Hook, event: Any, send: Callable[[Any], Taker]) -> Call
         send: Makes the interceptor that sends an event.
     """
     rule: Callable[..., Any] = hook.rule
-    if event.report is None:
-        return rule
     report = send(event.report)
 
     def call(*args: Any, **kwargs: Any) -> Any:

@@ -135,7 +135,9 @@ class GreenletDriver(Driver):
 
     def _decider(self, hook: Hook, event: Any, away: bool = False) -> Taker:
         deliver, driver, loops = event.deliver, self, self._loops
-        rule = reporting_rule(hook, event, lambda report: self._decider(hook, report, away))
+        rule: Any = hook.rule
+        if event.report is not None:
+            rule = reporting_rule(hook, event, lambda report: self._decider(hook, report, away))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             if away:

@@ -27,7 +27,7 @@ from ..hooks.plugins import Plugins
 from ..simulation import RULE, SimulationInterface
 from .agent import make_updates
 from .options import Options
-from .planner import PlannerPolicy, bind_session
+from .planner import DeferredPolicy, PlannerPolicy, bind_session
 from .point import EndAgent, Point, Removal, given_simulation
 from .points import (
     NamedPoint,
@@ -44,14 +44,6 @@ from .roster import agent_names, declared_agents, mentions_agents, resolve_polic
 
 END_AGENT = f"{SimulationInterface.__module__}.{SimulationInterface.end_agent.__qualname__}"
 """The dotted name of the method by which a simulation ends an agent's episode."""
-
-
-class DeferredPolicy:
-    """A policy that answers many decisions in one call. An episode waits for it as it waits for the user."""
-
-    def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer one decision at once, in an episode that is a branch and waits for one agent only."""
-        raise NotImplementedError
 
 
 class Plan:

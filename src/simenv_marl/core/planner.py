@@ -43,6 +43,14 @@ def base_of(base: Any, agent: str) -> Any:
             return base
 
 
+class DeferredPolicy:
+    """A policy that answers many decisions in one call. An episode waits for it as it waits for the user."""
+
+    def alone(self, episode: Any, agent: Any) -> Any:
+        """Answer one decision at once, in an episode that is a branch and waits for one agent only."""
+        raise NotImplementedError
+
+
 class PlannerPolicy:
     """The wrapper of a planner in a plan. Other policies have none, and so cost nothing extra."""
 

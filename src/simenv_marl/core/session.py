@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from contextvars import Context, copy_context
 from enum import Enum
 from functools import partial
-from typing import Any
+from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
@@ -30,6 +30,8 @@ from .resources import open_resources
 from .rng import GlobalRandom, draws_check, is_seed
 from .run import refusal
 from .spaces import same
+
+_NO_LOCK: Final = nullcontext()
 
 
 class State(Enum):
@@ -146,7 +148,7 @@ class Session:
 
     def exclusive(self) -> AbstractContextManager[None]:
         """The context in which no other thread can use the environment."""
-        return nullcontext() if self.lock is None else self.lock
+        return _NO_LOCK if self.lock is None else self.lock
 
     # -- episodes ---------------------------------------------------------------------------------
 

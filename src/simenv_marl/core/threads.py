@@ -194,7 +194,9 @@ class ThreadDriver(Driver):
 
     def _decider(self, hook: Hook, event: Any, away: bool = False) -> Taker:
         deliver = event.deliver
-        rule = reporting_rule(hook, event, lambda report: self._decider(hook, report))
+        rule: Any = hook.rule
+        if event.report is not None:
+            rule = reporting_rule(hook, event, lambda report: self._decider(hook, report))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             self._event = (event, args, kwargs)

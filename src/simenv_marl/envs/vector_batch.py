@@ -223,6 +223,8 @@ class SimulationBatch:
 
     def _end_of(self, episode: Episode) -> tuple[bool, bool] | None:
         """The flags terminated and truncated of an episode, as its view reports them; None if it continues."""
+        if episode.unreported_end:  # the next step reports it
+            return None
         if self._kind.joint is None and self._agent in episode.ended:
             return True, False
         return (episode.terminated, episode.truncated) if episode.over else None

@@ -17,8 +17,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from ..core.episode import Episode
-from ..core.plan import DeferredPolicy, Plan
-from ..core.planner import PlannerPolicy, is_planner
+from ..core.plan import Plan
+from ..core.planner import DeferredPolicy, PlannerPolicy, is_planner
 from ..core.point import Point
 from ..core.reuse import reuse_resources
 from ..core.roster import two_arguments

@@ -146,5 +146,5 @@ def _describe_point(bound: Any) -> dict[str, str]:
         "actions": str(definition.action_space),
     }
     uses = ("action_mask_mapping", "choices", "apply", "removed_by", "goal_space")
-    description["uses"] = ", ".join(name for name in uses if getattr(definition, name))
-    return description
+    used = ", ".join(name for name in uses if getattr(definition, name))
+    return {**description, "uses": used or "no masks, choices, removals or goals"}

@@ -207,7 +207,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
                 continue
             first = run if number == 1 else first
             report.episodes[run.result if len(run.actions) < subject.max_steps else "cut"] += 1
-        report.statistics, findings = statistics.results()
+        report.statistics, findings = statistics.results({name for run in subject.plain.values() for name in run.calls})
         episodes = sum(report.episodes.values())
         if episodes:
             report.findings += findings

@@ -21,12 +21,8 @@ import numpy as np
 from ..errors import short_repr
 from ..simulation import Sentinel
 
-MOST_PARTS: Final = 50_000
-"""The largest number of parts. Larger models are compared by the parts that both fingerprints have."""
-
-ABSENT: Final = Sentinel("nothing")
-"""In differences, the value of a part that does not exist."""
-
+MOST_PARTS: Final = 50_000  # larger models are compared by the parts that both fingerprints have
+ABSENT: Final = Sentinel("nothing")  # in differences, the value of a part that does not exist
 STATE: Final = "state of the generator"
 
 _ATOMS: Final = (int, float, complex, str, bytes, bool, type(None), range, type(Ellipsis), Enum, np.generic)

@@ -83,9 +83,7 @@ def set_up(plan: Plan, seed: int) -> Iterator[tuple[Any, Callable[[], Any]]]:
 def watching_rules(plan: Plan, decided: Callable[[str], Callable[[Any], None]]) -> Iterator[None]:
     """Watch the rules of a plan's decision points, in environments and in plain runs.
 
-    Args:
-        plan: The plan.
-        decided: Called with the name of a point when its rule begins. It returns a callable of the rule's result.
+    ``decided`` is called with the name of a point when its rule begins, and returns a callable of the rule's result.
     """
     points = list(dict.fromkeys(bound.point for bound in plan.points))
     for point in points:

@@ -225,15 +225,10 @@ class Runner:
     def run_randomly(
         self, env: Any, seed: int, *, salt: int = 0, most: int | None = None, beside: Any = None, collect: Any = None
     ) -> Run:
-        """Play an episode with random legal actions in an AEC environment. Seed, agent and salt determine the actions.
+        """Play an episode with random legal actions in an AEC environment; a salt gives others with the same seed.
 
-        Args:
-            env: The environment.
-            seed: The seed of the episode.
-            salt: A number for other actions with the same seed.
-            most: The number of steps after which the episode is broken off.
-            beside: Another environment, which is stepped in turns with this one.
-            collect: Called with the environment, the agent and the result of ``last()`` at each step.
+        The episode is broken off after ``most`` steps. The environment ``beside`` is stepped in turns with this one.
+        ``collect`` is called with the environment, the agent and the result of ``last()`` at each step.
         """
         run = Run()
 
@@ -298,10 +293,16 @@ def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[st
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
 _LIBRARY: Final = random.__file__.rpartition("random.py")[0]
+_CLOCKS: Final = (
+    time.time,
+    time.time_ns,
+    time.monotonic,
+    time.perf_counter,
+    datetime.datetime.now,
+    datetime.date.today,
+)
 _CHANCE: Final[dict[Any, str]] = {
-    **{clock: f"the clock is read (time.{clock.__name__})" for clock in (time.time, time.time_ns, time.monotonic)},
-    **{clock: f"the clock is read (time.{clock.__name__})" for clock in (time.perf_counter, time.process_time)},
-    **dict.fromkeys((datetime.datetime.now, datetime.datetime.today, datetime.date.today), "the clock is read"),
+    **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},
     **dict.fromkeys((random.random, random.getrandbits), "Python's global generator is used"),
     os.urandom: "the operating system is asked for random bits (as by a generator without a seed)",
 }
@@ -327,10 +328,8 @@ def describe_with_place(error: BaseException) -> str:
 
 
 def _caller(frame: Any) -> str:
-    """Return the place in the model, or in a package, from which the standard library was called; empty if nowhere."""
-    while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
-        path = frame.f_code.co_filename
-        if ("site-packages" in path or not path.startswith(_LIBRARY)) and not path.startswith("<"):
-            return "" if "numpy" in path else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"
+    """Return the place in the model from which the standard library was called; empty if this library called it."""
+    while frame is not None and frame.f_code.co_filename.startswith((_LIBRARY, "<")):
         frame = frame.f_back
-    return ""
+    path = frame.f_code.co_filename if frame is not None else _PACKAGE
+    return "" if path.startswith(_PACKAGE) else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"

@@ -4,34 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import short_repr
 from .internals import MASK, Plan, point_of
 from .report import Finding, PointStatistics, Range, finding
 
-
-@dataclass
-class _Spread:
-    """The smallest, largest and mean values of an array, element by element."""
-
-    low: NDArray[Any]
-    high: NDArray[Any]
-    total: NDArray[Any]
-    number: int = 1
-
-    def add(self, array: NDArray[Any]) -> None:
-        if array.shape == self.total.shape:
-            self.low, self.high = np.minimum(self.low, array), np.maximum(self.high, array)
-            self.total, self.number = self.total + array, self.number + 1
-
-    def ranges(self, name: str) -> Iterator[Range]:
-        for place in np.ndindex(self.total.shape):
-            values = self.low[place], self.total[place] / self.number, self.high[place]
-            yield Range(f"{name}{list(place)}" if place else name, *map(float, values))
+_MOST: Final = 5_000_000
+"""The largest number of numbers that are stored of an array."""
 
 
 @dataclass
@@ -40,7 +22,7 @@ class _Collected:
 
     point: Any
     decisions: int = 0
-    spreads: dict[str, _Spread] = field(default_factory=dict)  # of the reward and the components of observations
+    values: dict[str, list[Any]] = field(default_factory=dict)  # the rewards, and the arrays of observations
     legal: Any = False  # for each action of a masked space, whether it was legal at least once
     unfit: str = ""  # an observation outside of its space
 
@@ -54,33 +36,39 @@ class _Collected:
             for number, part in enumerate(value):
                 self.record(f"{name}.{number}", part)
         elif isinstance(value, (np.ndarray, np.generic, int, float)):
-            array = np.asarray(value, float)
-            if name in self.spreads:
-                self.spreads[name].add(array)
-            else:
-                self.spreads[name] = _Spread(array, array, array)
+            array, known = np.array(value), self.values.setdefault(name, [])
+            if not known or (array.shape == known[0].shape and len(known) * array.size < _MOST):
+                known.append(array)
 
-    def results(self) -> tuple[PointStatistics, list[Finding]]:
+    def results(self, called: set[str]) -> tuple[PointStatistics, list[Finding]]:
         """Return the statistics, and what is wrong or worth knowing."""
         name = self.point.point.name
         start = int(getattr(self.point.definition.action_space, "start", 0))
         never = tuple((np.flatnonzero(~self.legal) + start).tolist()) if isinstance(self.legal, np.ndarray) else ()
-        ranges = {spread: tuple(self.spreads[spread].ranges(spread)) for spread in self.spreads}
-        rewards = ranges.pop("reward", (None,))[0]
-        components = tuple(part for parts in ranges.values() for part in parts)
+        rewards = next(_ranges("reward", self.values.get("reward", [])), None)
+        components = tuple(part for key in self.values if key != "reward" for part in _ranges(key, self.values[key]))
         agents = self.point.agent or "agents named by each call"
         statistics = PointStatistics(name, agents, self.decisions, components, rewards, never)
         if not self.decisions:
-            return statistics, [finding("never_called", point=name)]
+            return statistics, [] if name in called else [finding("never_called", point=name)]
         findings = []
         if self.unfit:
             findings.append(finding("outside", self.unfit, point=name))
         if never:
             findings.append(finding("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=name))
-        if rewards and self.spreads["reward"].number > 1 and rewards.minimum == rewards.maximum:
+        number = len(self.values.get("reward", ()))
+        if rewards and number > 1 and rewards.minimum == rewards.maximum:
             kind = "same_rewards" if rewards.minimum else "zero_rewards"
-            findings.append(finding(kind, f"{self.spreads['reward'].number} rewards of {rewards.mean:.6g}", point=name))
+            findings.append(finding(kind, f"{number} rewards of {rewards.mean:.6g}", point=name))
         return statistics, findings
+
+
+def _ranges(name: str, values: list[Any]) -> Iterator[Range]:
+    """Yield the ranges of all elements of arrays of the same shape."""
+    array = np.array(values, float)
+    for place in np.ndindex(array.shape[1:]) if values else ():
+        part = array[(slice(None), *place)]
+        yield Range(f"{name}{list(place)}" if place else name, float(part.min()), float(part.mean()), float(part.max()))
 
 
 class Statistics:
@@ -111,7 +99,7 @@ class Statistics:
 
         return collect
 
-    def results(self) -> tuple[tuple[PointStatistics, ...], list[Finding]]:
-        """Return the statistics of all points, and what is wrong or worth knowing."""
-        results = [collected.results() for collected in self._points.values()]
+    def results(self, called: set[str]) -> tuple[tuple[PointStatistics, ...], list[Finding]]:
+        """Return the statistics of all points, of which some were called in plain runs, and what is wrong."""
+        results = [collected.results(called) for collected in self._points.values()]
         return tuple(statistics for statistics, _ in results), [one for _, found in results for one in found]

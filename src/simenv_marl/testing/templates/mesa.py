@@ -48,11 +48,11 @@ class Rabbit(CellAgent):
 class MyModel(mesa.Model):
     """A meadow on which grass grows, and rabbits."""
 
-    def __init__(self, width: int = 16, rabbits: int = 20, rng: int | None = None) -> None:
+    def __init__(self, rng: int | None = None) -> None:
         super().__init__(rng=rng)  # the model's own generators: the same seed brings the same run
-        self.grid = OrthogonalVonNeumannGrid((width, width), torus=True, random=self.random)
-        self.grass = self.rng.random((width, width))
-        for cell in self.random.sample(list(self.grid.all_cells), rabbits):
+        self.grid = OrthogonalVonNeumannGrid((16, 16), torus=True, random=self.random)
+        self.grass = self.rng.random((16, 16))
+        for cell in self.random.sample(list(self.grid.all_cells), 20):
             Rabbit(self, cell, 2.0)
 
     def step(self) -> None:
@@ -90,19 +90,15 @@ class MySimulation(SteppedSimulation):
 
     points = {Rabbit.choose_cell: move}  # the model's classes stay as they are
 
-    def __init__(self, days: int = 100, **parameters: Any) -> None:
-        super().__init__(MyModel, days, **parameters)
-
-    def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Say who is going to decide: all rabbits there are. So a round of the parallel view is a day."""
-        return [(rabbit,) for rabbit in self.model.agents]
+    def __init__(self) -> None:
+        super().__init__(MyModel, 100)
 
 
 # -- 4. The environment, training, and what it is worth -------------------------------------------
 
 
 def env() -> Any:
-    """Make the environment: a ``pettingzoo.AECEnv``; use ``parallel_env`` for learners that act in rounds."""
+    """Make the environment: a ``pettingzoo.AECEnv``."""
     return aec_env(MySimulation)
 
 

@@ -134,7 +134,7 @@ def test_points_by_name(capsys):
         (":Walk", "not of the form module:Simulation"),
         ("walkin:Walk", "did you mean walking?"),
         ("walking:Wlak", "did you mean Walk?"),
-        ("walking:Xyz", "it has the simulations Walk, Limping\n"),
+        ("walking:Xyz", "walking has no 'Xyz'"),
         ("walking:Walk.nothing", "Walk has no 'nothing'"),
         ("simenv_marl.registraton:x", "did you mean simenv_marl.registration"),
         ("broken_walk:Walk", "needs 'no_such_package_at_all'"),
@@ -157,11 +157,8 @@ def test_what_cannot_be_looked_at(command, target, told, capsys):
         [],
         ["chek", "walking:Walk"],
         ["check"],
-        ["check", "walking:Walk", "--seed", "-1"],
-        ["check", "walking:Walk", "--episodes", "0"],
         ["check", "walking:Walk", "--time-limit", "never"],
-        ["check", "walking:Walk", "--time-limit", "0"],
-        ["check", "walking:Walk", "--time-limit", "inf"],
+        ["wire-check", "--options", "[1]", "simulator"],
     ],
 )
 def test_wrong_arguments(arguments, capsys):
@@ -169,6 +166,15 @@ def test_wrong_arguments(arguments, capsys):
         main(arguments)
     assert caught.value.code == 2
     assert "usage" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("seed", "-1"), ("episodes", "0"), ("max-steps", "0"), ("time-limit", "0"), ("time-limit", "inf")],
+)
+def test_numbers_that_cannot_be_used(option, value, capsys):
+    assert main(["check", "walking:Walk", f"--{option}", value]) == 2
+    assert option.replace("-", "_") in capsys.readouterr().err
 
 
 def test_less_than_a_second_is_a_limit_too(capsys):

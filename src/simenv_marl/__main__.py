@@ -9,13 +9,14 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import math
 import os
 import pkgutil
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from .errors import OptionValueError, SimEnvError, describe_error, did_you_mean
 from .testing.templates import KINDS, write_template
@@ -61,40 +62,33 @@ def _parser() -> argparse.ArgumentParser:
     for command in (check, inspect):
         command("simulation", metavar="module:Simulation", help="a class, an instance, or a factory without arguments")
         command("--points", nargs="+", metavar="NAME", help="decision points (default: the simulation's own)")
-        command("--seed", type=_SEED, default=0, metavar="N", help="the first seed (default: 0)")
-    check("--episodes", type=_NUMBER, default=10, metavar="N", help="random episodes (default: 10)")
-    check("--max-steps", type=_NUMBER, default=1000, metavar="N", help="the longest run, in decisions (default: 1000)")
-    check("--time-limit", type=_SECONDS, default=60.0, metavar="SECONDS", help="for the whole check (default: 60)")
+        command("--seed", type=int, default=0, metavar="N", help="the first seed (default: 0)")
+    check("--episodes", type=int, default=10, metavar="N", help="random episodes (default: 10)")
+    check("--max-steps", type=int, default=1000, metavar="N", help="the longest run, in decisions (default: 1000)")
+    check("--time-limit", type=float, default=60.0, metavar="SECONDS", help="for the whole check (default: 60)")
     wire = add("wire-check", _wire_check, "test a simulator in another process, and report what it does wrong")
-    wire("--seed", type=_SEED, default=1, metavar="N", help="the seed of the episodes (default: 1)")
-    wire("--options", type=_JSON, default={}, metavar="JSON", help="the options in the start message (default: {})")
-    wire("--decisions", type=_NUMBER, default=1000, metavar="N", help="the longest episode (default: 1000)")
-    wire("--timeout", type=_SECONDS, default=30.0, metavar="SECONDS", help="the longest wait for a line (default: 30)")
+    wire("--seed", type=int, default=1, metavar="N", help="the seed of the episodes (default: 1)")
+    wire(
+        "--options",
+        type=_json,
+        default={},
+        metavar="JSON",
+        help="the options in the start message (default: {})",
+    )
+    wire("--decisions", type=int, default=1000, metavar="N", help="the longest episode (default: 1000)")
+    wire("--timeout", type=float, default=30.0, metavar="SECONDS", help="the longest wait for a line (default: 30)")
     for command in (check, inspect, wire):
         command("--json", action="store_true", help="print JSON instead of text")
     wire("program", metavar="COMMAND", nargs=argparse.REMAINDER, help="the program and its arguments")
     return parser
 
 
-def _checked(convert: Callable[[str], Any], accepts: Callable[[Any], bool], what: str) -> Callable[[str], Any]:
-    """Return a converter of arguments that refuses values which are not what they should be."""
-
-    def converted(text: str) -> Any:
-        try:
-            value = convert(text)
-        except ValueError:
-            value = None
-        if value is None or not accepts(value):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
-        return value
-
-    return converted
-
-
-_NUMBER: Final = _checked(int, lambda value: value >= 1, "a whole number of at least 1")
-_SEED: Final = _checked(int, lambda value: value >= 0, "a whole number of at least 0")
-_SECONDS: Final = _checked(float, lambda value: 0 < value < math.inf, "a positive number of seconds")
-_JSON: Final = _checked(json.loads, lambda value: isinstance(value, dict), "a JSON object")
+def _json(text: str) -> dict[str, Any]:
+    """Convert an argument to a dict."""
+    with suppress(ValueError):
+        if isinstance(value := json.loads(text), dict):
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} is not a JSON object")
 
 
 def _new(options: argparse.Namespace) -> str:
@@ -146,17 +140,12 @@ def _find(text: str) -> Any:
     module_name, _, path = text.partition(":")
     if not (module_name and path):
         raise OptionValueError(f"{text!r} is not of the form module:Simulation, such as examples.shop:Shop")
-    found: Any = _find_module(module_name)
-    for name in path.split("."):
-        if not hasattr(found, name):
-            members = vars(found).items()
-            simulations = [key for key, value in members if hasattr(value, "run") and hasattr(value, "reset")]
-            hint = did_you_mean(name, dir(found))
-            if simulations and not hint:
-                hint = f"; it has the simulations {', '.join(simulations)}"
-            raise OptionValueError(f"{getattr(found, '__name__', found)} has no {name!r}{hint}")
-        found = getattr(found, name)
-    return found
+    module = _find_module(module_name)
+    try:
+        return attrgetter(path)(module)
+    except AttributeError as error:
+        hint = did_you_mean(error.name, dir(error.obj))
+        raise OptionValueError(f"{getattr(error.obj, '__name__', error.obj)} has no {error.name!r}{hint}") from None
 
 
 def _find_module(name: str) -> Any:
@@ -170,9 +159,7 @@ def _find_module(name: str) -> Any:
         folders = importlib.import_module(parent).__path__ if parent else [os.getcwd()]
         modules = [module.name for module in pkgutil.iter_modules(folders)]
         hint = did_you_mean(last, modules, f"{parent}." if parent else "")
-        raise OptionValueError(
-            f"there is no module {missing!r}{hint} (looked for in {os.getcwd()} and on Python's path)"
-        ) from None
+        raise OptionValueError(f"there is no module {missing!r}{hint} (looked for in {folders[0]})") from None
     except Exception as error:
         raise OptionValueError(f"the module {name!r} cannot be imported: {describe_error(error)}") from error
 

@@ -8,26 +8,14 @@ what is wrong. ``inspect_simulation`` lists the decision points and their calls.
 """
 
 from .check import check_simulation, inspect_simulation
-from .report import (
-    CheckReport,
-    ComponentStatistics,
-    EpisodeStatistics,
-    Finding,
-    Inspection,
-    PointDescription,
-    PointStatistics,
-    Timing,
-)
+from .report import CheckReport, Finding, Inspection, PointStatistics, Range
 
 __all__ = [
     "CheckReport",
-    "ComponentStatistics",
-    "EpisodeStatistics",
     "Finding",
     "Inspection",
-    "PointDescription",
     "PointStatistics",
-    "Timing",
+    "Range",
     "check_simulation",
     "inspect_simulation",
 ]

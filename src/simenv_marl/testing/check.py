@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -17,15 +17,11 @@ from ..errors import OptionValueError, SimEnvError, short_repr
 from ..simulation import TRUNCATED
 from .checks import CHECKS, Report, Subject
 from .internals import Plan, fitting_views, make_environment
-from .report import SEVERITIES, CheckReport, Inspection, PointDescription, finding, order_of
-from .runs import Run, Runner, TimeUp, describe_with_place, play_rules, quietly, seed_global_generators, within
+from .report import SEVERITIES, CheckReport, Inspection, order_of
+from .runs import Run, Runner, describe_with_place, quietly, seed_global_generators
 
-_WARNINGS: Final = {
-    "refuses to end": "refusal",
-    "several objects decide at": "shared_agent",
-    "did not appear in the episode": "absent_agents",
-}
-"""Texts in the warnings of environments, and the findings that say the same."""
+_WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appear in the episode")
+"""Texts in the warnings of environments that are findings."""
 
 
 def check_simulation(
@@ -70,56 +66,37 @@ def check_simulation(
     for name, number in (("episodes", episodes), ("max_steps", max_steps)):
         if isinstance(number, bool) or not isinstance(number, int) or number < 1:
             raise OptionValueError(f"{name} must be a positive integer, not {short_repr(number)}")
-    if not time_limit > 0:
+    if not 0 < time_limit < math.inf:
         raise OptionValueError(f"time_limit must be a positive number of seconds, not {short_repr(time_limit)}")
-    report = Report()
+    report, calls = Report(), ""
     with quietly() as caught:
+        for pattern in _WARNINGS:
+            warnings.filterwarnings("always", f".*{pattern}")
         try:
             plan = Plan.draw_up(simulation, points, options)
             make_environment(plan, "aec")
+            subject = Subject(plan=plan, seeds=tuple(map(int, chosen)), episodes=episodes, max_steps=max_steps)
+            subject.seconds, subject.end, subject.own = time_limit / 4, time.monotonic() + time_limit, fingerprint
+            for check in CHECKS:
+                if check is CHECKS[0] or subject.playable:
+                    check(subject, report)
+            if subject.late:
+                report.add("out_of_time", f"after {time_limit:g} seconds")
+            calls = order_of(subject.plain[subject.seeds[0]].calls)
         except SimEnvError:
             raise
-        except Exception as error:  # of the model's constructor
-            name = getattr(simulation, "__name__", None) or type(simulation).__name__
-            return CheckReport(str(name), (finding("unmade", describe_with_place(error)),), ())
-        for pattern in _WARNINGS:
-            warnings.filterwarnings("always", f".*{pattern}")
-        subject = Subject(
-            plan=plan,
-            max_steps=max_steps,
-            seconds=time_limit / 4,
-            own=fingerprint,
-            seeds=tuple(map(int, chosen)),
-            episodes=episodes,
-            end=time.monotonic() + time_limit,
-        )
-        _run_checks(subject, report)
+        except (Exception, SystemExit) as error:  # of the model's constructor, for example
+            report.add_error(Run(error=error), "while the simulation was made or reset")
     for warning in caught:
-        message = str(warning.message)
-        report.add(next(name for pattern, name in _WARNINGS.items() if pattern in message), message[:300])
-    if subject.late:
-        report.add("out_of_time", seconds=time_limit)
-    plain = subject.plain.get(subject.seeds[0])
+        report.add("warned", str(warning.message)[:300])
     return CheckReport(
-        simulation=plan.name,
+        simulation=str(getattr(simulation, "__name__", None) or type(simulation).__name__),
         findings=tuple(sorted(dict.fromkeys(report.findings), key=lambda f: SEVERITIES.index(f.severity))),
         checked=tuple(report.checked),
-        observations=report.observations,
+        statistics=report.statistics,
         episodes=report.episodes,
-        calls=order_of(plain.calls) if plain else "",
-        timing=report.timing,
+        calls=calls,
     )
-
-
-def _run_checks(subject: Subject, report: Report) -> None:
-    for check in CHECKS:
-        try:
-            check(subject, report)
-        except (Exception, SystemExit) as error:  # an unexpected exception of the model
-            report.add_error(error, "while it was checked")
-            return
-        if not subject.playable:
-            return
 
 
 def inspect_simulation(
@@ -133,13 +110,8 @@ def inspect_simulation(
 ) -> Inspection:
     """List the decision points of a simulation and the order of their calls, by running one episode of its own rules.
 
-    Args:
-        simulation: A simulation (which is copied), its class, or a zero-argument factory.
-        points: The decision points, as ``generate_env`` takes them.
-        seed: The seed of the episode.
-        max_steps: The number of decisions after which the episode is cut.
-        time_limit: The time after which the episode is cut, in seconds.
-        **options: The options of the environments, as ``aec_env`` takes them.
+    The arguments are those of ``check_simulation``. The episode is cut after ``max_steps`` decisions, or after
+    ``time_limit`` seconds.
 
     Returns:
         The inspection; ``print`` it.
@@ -152,50 +124,27 @@ def inspect_simulation(
         plan = Plan.draw_up(simulation, points, options)
         seed_global_generators(seed)
         run = Runner(plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None).run_plainly(seed)
-        agents: dict[str, None] = dict.fromkeys(plan.roster)
-        if run.entries and not plan.complete and run.error is None:
-            env = make_environment(plan.amended({"max_steps": max_steps}), "aec")
-            seed_global_generators(seed)
-            with suppress(Exception, SystemExit):  # report the agents that were seen until then
-                within(time_limit, lambda: play_rules(env, seed, agents))
-            env.close()
         views = fitting_views(plan)
+    how = "truncated (a limit of time)" if run.result is TRUNCATED else "terminated (an end of the task)"
+    how = describe_with_place(run.error) if run.error is not None else "cut" if run.cut else how
     return Inspection(
         simulation=plan.name,
         points=tuple(_describe_point(bound) for bound in plan.active),
         views=views,
         calls=order_of(run.calls),
         counts=dict(Counter(run.calls)),
-        ended=_describe_end(run),
-        agents=tuple(agents),
+        ended=f"{len(run.entries)} decisions, then {how}",
     )
 
 
-def _describe_point(bound: Any) -> PointDescription:
+def _describe_point(bound: Any) -> dict[str, str]:
     definition = bound.definition
-    details = {
-        "a mask says which actions are legal": definition.action_mask_mapping is not None,
-        "the legal answers come with each call": definition.choices is not None,
-        "actions are carried out in place of the rule": definition.apply is not None,
-        f"agents end by {', '.join(definition.removed_by)}": definition.removed_by,
-        f"has goals in {definition.goal_space}": definition.goal_space is not None,
+    description = {
+        "point": bound.point.name,
+        "agent": bound.agent or "named by each call",
+        "observations": str(definition.observation_space),
+        "actions": str(definition.action_space),
     }
-    return PointDescription(
-        name=bound.point.name,
-        agents=bound.agent or "agents named by each call",
-        observation_space=str(definition.observation_space),
-        action_space=str(definition.action_space),
-        details=tuple(text for text, applies in details.items() if applies),
-    )
-
-
-def _describe_end(run: Run) -> str:
-    number = f"{len(run.entries)} decisions"
-    if run.cut:
-        return f"cut after {number}"
-    if isinstance(run.error, TimeUp):
-        return f"stopped by the time limit after {number}"
-    if run.error is not None:
-        return f"{number}, then {describe_with_place(run.error)}"
-    how = "truncated (a limit of time)" if run.result is TRUNCATED else "terminated (an end of the task)"
-    return f"{number}, then {how}"
+    uses = ("action_mask_mapping", "choices", "apply", "removed_by", "goal_space")
+    used = ", ".join(name for name in uses if getattr(definition, name))
+    return {**description, "uses": used or "no masks, choices, removals or goals"}

@@ -1,22 +1,19 @@
 """Fingerprints: everything that a simulation holds after a run, to compare two runs.
 
 Models need not be comparable. Therefore their attributes are followed down to numbers, strings, arrays and the states
-of random generators. Each of these *parts* has a path, which a difference reports. Objects that cannot be compared
-(open files, generators, locks) are left out, and their kinds are recorded.
+of random generators. Each of these *parts* has a path, which a difference reports. What cannot be followed (open files,
+generators, locks) is compared by its class.
 """
 
 from __future__ import annotations
 
 import random
 import re
-import warnings
-import weakref
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property, partial
-from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from functools import cached_property
+from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any, Final
 
 import numpy as np
@@ -24,125 +21,94 @@ import numpy as np
 from ..errors import short_repr
 from ..simulation import Sentinel
 
-MOST_PARTS: Final = 50_000
-"""The largest number of parts. Larger models are compared by this many parts."""
+MOST_PARTS: Final = 50_000  # larger models are compared by the parts that both fingerprints have
+ABSENT: Final = Sentinel("nothing")  # in differences, the value of a part that does not exist
+STATE: Final = "state of the generator"
 
-ABSENT: Final = Sentinel("nothing")
-"""In differences, the value of a part that does not exist."""
-
-_ATOMS: Final = (int, float, complex, str, bytes, bool, type(None), range, type(Ellipsis), type(NotImplemented))
+_ATOMS: Final = (int, float, complex, str, bytes, bool, type(None), range, type(Ellipsis), Enum, np.generic)
 _NAMED: Final = (type, FunctionType, BuiltinFunctionType, ModuleType)
+
+Fingerprint = dict[str, Any]
+"""The parts of an object, by path."""
 
 Difference = tuple[str, Any, Any]
 """A path, the value here and the value there, of which one may be ``ABSENT``."""
 
 
-@dataclass(frozen=True)
-class Fingerprint:
-    """All parts of a simulation at one moment."""
+def fingerprint(name: str, root: Any, *, follow: bool = True) -> Fingerprint:
+    """Return the fingerprint of any object; all paths begin with its name.
 
-    parts: dict[str, Any]  # by path
-    left_out: frozenset[str]  # the kinds of objects that cannot be compared
-    complete: bool  # whether there were at most MOST_PARTS
-
-    def differences(self, other: Fingerprint, ignored: frozenset[str] = frozenset()) -> list[Difference]:
-        """Return the differences in all parts but those whose paths, as ``general`` writes them, are ignored."""
-        found = []
-        for path in dict.fromkeys([*self.parts, *other.parts]):
-            here, there = self.parts.get(path, ABSENT), other.parts.get(path, ABSENT)
-            comparable = (here is not ABSENT or self.complete) and (there is not ABSENT or other.complete)
-            if comparable and not _same(here, there) and general(path) not in ignored:
-                found.append((path, here, there))
-        return found
-
-
-def fingerprint(name: str, root: Any) -> Fingerprint:
-    """Return the fingerprint of any object; all paths begin with its name."""
-    parts: dict[str, Any] = {}
-    left_out: set[str] = set()
-    met: dict[int, str] = {}
-    alive = []  # temporary objects, so that their ids are not reused
-    # Breadth first, so that a long history in the model does not hide the rest.
-    queue = deque([(name, root)])
+    Without ``follow``, only lists, tuples and dicts are followed.
+    """
+    parts: Fingerprint = {}
+    found: dict[int, tuple[str, Any]] = {}  # paths of objects, which are referred to so that no id is used again
+    queue = deque([(name, root)])  # breadth first, so that a long history in the model does not hide the rest
     while queue and len(parts) < MOST_PARTS:
         path, value = queue.popleft()
-        if isinstance(value, Enum):
-            parts[path] = str(value)
-        elif isinstance(value, _ATOMS):
+        if isinstance(value, _ATOMS):
             parts[path] = value
-        elif isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
+        elif isinstance(value, np.ndarray) and value.dtype != object:
             parts[path] = value.copy()
         elif isinstance(value, _NAMED):
-            parts[path] = title(value)
-        elif id(value) in met:
-            parts[path] = f"the same object as {met[id(value)]}"
+            parts[path] = class_name(value)
+        elif isinstance(value, (random.Random, np.random.Generator, np.random.RandomState)):
+            parts[f"{path} ({STATE})"] = _state_of(value)
+        elif id(value) in found:
+            parts[path] = f"the same object as {found[id(value)][0]}"
         else:
-            parts[path] = title(type(value))
+            parts[path] = class_name(type(value))
+            if not follow and not isinstance(value, (list, tuple, dict)):
+                continue
             if not isinstance(value, (tuple, frozenset)):  # equal ones may or may not be the same object
-                met[id(value)] = path
-            alive.append(value)
+                found[id(value)] = path, value
             try:
-                queue += list(_members(path, value))
+                queue += [(path + end, part) for end, part in _members(value)]
             except Exception:  # an open file, a lock, a generator, for whatever reason
-                left_out.add(title(type(value)))
-    return Fingerprint(parts, frozenset(left_out), not queue)
+                continue
+    return parts
 
 
-def _members(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield what a value holds, by path. Raises an exception if that is unknown."""
-    if isinstance(value, random.Random):
-        yield f"{path} (state of the generator)", str(value.getstate())
-    elif isinstance(value, (np.random.Generator, np.random.RandomState)):
-        generator: Any = value
-        bits = getattr(generator, "bit_generator", None) or generator._bit_generator
-        yield f"{path} (state of the generator)", str(bits.state)
-    elif isinstance(value, (set, frozenset)):
-        # It has no order: of objects that are not atoms, only the number of each kind.
-        yield f"{path} (members)", ", ".join(sorted(repr(item) for item in value if isinstance(item, _ATOMS)))
-        others = Counter(title(type(item)) for item in value if not isinstance(item, _ATOMS))
-        yield f"{path} (kinds)", str(sorted(others.items()))
-    elif isinstance(value, weakref.ref):
-        yield f"{path}()", value()
-    elif isinstance(value, (MethodType, partial)):
-        yield f"{path} (itself)", _reduced(value)
-    else:
-        attributes = list(_attributes(path, value))
-        yield from attributes
-        if isinstance(value, (list, tuple, deque, np.ndarray)):
-            items = value.ravel() if isinstance(value, np.ndarray) else value
-            yield from ((f"{path}[{number}]", item) for number, item in enumerate(items))
-        elif isinstance(value, Mapping):
-            yield from _items(path, value)
-        elif not attributes and not hasattr(value, "__dict__"):
-            yield f"{path} (itself)", _reduced(value)
+def _state_of(generator: Any) -> str:
+    """Return the state of a random generator as a text."""
+    if isinstance(generator, random.Random):
+        return str(generator.getstate())
+    bits = generator.bit_generator if isinstance(generator, np.random.Generator) else generator._bit_generator
+    return str(bits.state)
 
 
-def _attributes(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield instance attributes, in ``__dict__`` and in slots, but not those that are computed once when first read."""
-    state = object.__getstate__(value)
-    for attributes in state if isinstance(state, tuple) else (state,):
-        for name, part in (attributes or {}).items():
-            if not isinstance(getattr(type(value), str(name), None), cached_property):
-                yield f"{path}.{name}", part
-
-
-def _items(path: str, values: Any) -> Iterator[tuple[str, Any]]:
-    for number, (key, value) in enumerate(list(values.items())):
-        if isinstance(key, (*_ATOMS, np.generic, tuple, Enum)) and len(text := repr(key)) < 80:
-            yield f"{path}[{text}]", value
-        else:
-            yield f"{path} (key {number})", key
-            yield f"{path}[key {number}]", value
-
-
-def _reduced(value: Any) -> Any:
-    """Return what a pickle of an object holds. Raises an exception if it cannot be pickled."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+def _members(value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield what a value holds, by the end of its path. Raises an exception if that is unknown."""
+    attributes = object.__getstate__(value)
+    for state in attributes if isinstance(attributes, tuple) else (attributes,):
+        for name, part in (state or {}).items():
+            if not isinstance(getattr(type(value), str(name), None), cached_property):  # computed when it is first read
+                yield f".{name}", part
+    if isinstance(value, (set, frozenset)):  # it has no order: of other objects, only the classes
+        yield " (members)", sorted(repr(item) if isinstance(item, _ATOMS) else class_name(type(item)) for item in value)
+    elif isinstance(value, (list, tuple, deque, np.ndarray)):
+        items = value.ravel() if isinstance(value, np.ndarray) else value
+        yield from ((f"[{number}]", item) for number, item in enumerate(items))
+    elif isinstance(value, Mapping):
+        for number, (key, item) in enumerate(list(value.items())):
+            simple = all(isinstance(part, _ATOMS) for part in (key if isinstance(key, tuple) else (key,)))
+            yield f"[{key!r}]" if simple else f"[key {number}]", item
+            if not simple:
+                yield f" (key {number})", key
+    elif attributes is None and not hasattr(value, "__dict__"):  # an iterator or a counter, for example
         reduced = value.__reduce_ex__(4)
-    if isinstance(reduced, str):
-        return reduced
-    return [list(part) if isinstance(part, Iterator) else part for part in reduced[1:]]
+        yield " (itself)", [list(part) if isinstance(part, Iterator) else part for part in reduced[1:]]
+
+
+def differences(one: Fingerprint, other: Fingerprint, ignored: frozenset[str] = frozenset()) -> list[Difference]:
+    """Return the differences in all parts but those whose paths, as ``general`` writes them, are ignored."""
+    cut = max(len(one), len(other)) >= MOST_PARTS
+    found = []
+    for path in dict.fromkeys([*one, *other]):
+        here, there = one.get(path, ABSENT), other.get(path, ABSENT)
+        comparable = not cut or (path in one and path in other)
+        if comparable and not _same(here, there) and general(path) not in ignored:
+            found.append((path, here, there))
+    return found
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -156,18 +122,7 @@ def _same(one: Any, other: Any) -> bool:
 
 def alike(one: Any, other: Any) -> bool:
     """Return whether two objects have the same parts."""
-    return not fingerprint("", one).differences(fingerprint("", other))
-
-
-def brief(value: Any, depth: int = 3) -> Any:
-    """Copy what is cheap to compare of a rule's result: atoms, arrays, containers of these; for others, their class."""
-    if isinstance(value, (list, tuple)) and depth and len(value) <= 1000:
-        return type(value).__name__, [brief(part, depth - 1) for part in value]
-    if isinstance(value, dict) and depth and len(value) <= 1000:
-        return [(brief(key, depth - 1), brief(part, depth - 1)) for key, part in value.items()]
-    if isinstance(value, (np.ndarray, np.generic)) and value.dtype != object:
-        return value.copy()
-    return value if isinstance(value, (*_ATOMS, Enum)) else f"<{title(type(value))}>"
+    return not differences(fingerprint("", one), fingerprint("", other))
 
 
 def general(path: str) -> str:
@@ -175,10 +130,9 @@ def general(path: str) -> str:
     return re.sub(r"\[[^\]]*\]", "[]", path)
 
 
-def title(thing: Any) -> str:
+def class_name(thing: Any) -> str:
     """Return the name of a class, function or module."""
-    name = getattr(thing, "__qualname__", None) or getattr(thing, "__name__", None)
-    return str(name) if name else type(thing).__qualname__
+    return str(getattr(thing, "__qualname__", None) or getattr(thing, "__name__", thing))
 
 
 def describe_differences(parts: list[Difference], here: str = "first", there: str = "then") -> str:

@@ -13,7 +13,7 @@ from ..core.context import environment_context
 from ..core.driver import SimulationExit
 from ..core.plan import Plan
 from ..core.rng import GlobalRandom
-from ..decision import DecisionPoint, Definition
+from ..decision import DecisionPoint
 from ..envs.make import VIEWS, view_class
 from ..hooks.patches import Installation
 from ..hooks.stacks import outside_simulation, stack_of
@@ -21,32 +21,18 @@ from ..simulation import make_simulation, resetter
 
 __all__ = [
     "MASK", "Plan", "SimulationExit", "fitting_views", "make_environment", "make_simulation", "outside_simulation",
-    "redefined", "set_up", "watching_rules",
+    "point_of", "set_up", "watching_rules",
 ]  # fmt: skip
-
-Begin = Callable[[str], Callable[[Any], None]]
-"""Called with the name of a decision point when its rule begins to decide. It returns a callable of the decision, which
-is called unless the rule raises."""
 
 _PLAIN_RUNS: Final[list[Any]] = []
 """The simulations whose main loops run without an environment now."""
 
 
-def redefined(plan: Plan, change: Callable[[Any], Definition]) -> Plan:
-    """Return a plan with changed definitions of its active points, of which each is passed to ``change``."""
-    for bound in plan.active:
-        plan = plan.redefined(bound.point, change(bound))
-    return plan
-
-
-def make_environment(plan: Plan, view: str) -> Any:
-    """Make an environment of a plan.
-
-    Raises:
-        ViewError: The plan does not allow the view.
-    """
+def make_environment(plan: Plan, view: str, **options: Any) -> Any:
+    """Make an environment of a plan with changed options."""
     if view != "joint" and plan.options.flatten:
-        plan = plan.amended({"flatten": False})
+        options["flatten"] = False
+    plan = plan.amended(options)
     return view_class(plan, view)(plan)
 
 
@@ -60,6 +46,11 @@ def fitting_views(plan: Plan) -> tuple[str, ...]:
     return tuple(found)
 
 
+def point_of(env: Any, agent: str) -> Any:
+    """Return the decision point at which an agent of an AEC environment decides."""
+    return env._point(agent)
+
+
 @contextmanager
 def set_up(plan: Plan, seed: int) -> Iterator[tuple[Any, Callable[[], Any]]]:
     """Make a simulation for a run without an environment, with the handlers and random generators of a plan.
@@ -68,7 +59,7 @@ def set_up(plan: Plan, seed: int) -> Iterator[tuple[Any, Callable[[], Any]]]:
         The simulation, and a function that resets it and runs its main loop.
     """
     rng = GlobalRandom() if plan.options.global_rng else None
-    held = Installation(plan.patches)
+    installation = Installation(plan.patches)
 
     def start() -> Any:
         if rng is not None:
@@ -85,15 +76,18 @@ def set_up(plan: Plan, seed: int) -> Iterator[tuple[Any, Callable[[], Any]]]:
             simulation = make_simulation(plan.source)
             yield simulation, start
     finally:
-        held.uninstall()
+        installation.uninstall()
 
 
 @contextmanager
-def watching_rules(plan: Plan, begin: Begin) -> Iterator[None]:
-    """Watch the rules of a plan's decision points, in environments and in plain runs."""
+def watching_rules(plan: Plan, decided: Callable[[str], Callable[[Any], None]]) -> Iterator[None]:
+    """Watch the rules of a plan's decision points, in environments and in plain runs.
+
+    ``decided`` is called with the name of a point when its rule begins, and returns a callable of the rule's result.
+    """
     points = list(dict.fromkeys(bound.point for bound in plan.points))
     for point in points:
-        point.hook.replace_rule(_watched(point, begin))
+        point.hook.replace_rule(_watched(point, decided))
     try:
         yield
     finally:
@@ -101,7 +95,7 @@ def watching_rules(plan: Plan, begin: Begin) -> Iterator[None]:
             point.hook.replace_rule()
 
 
-def _watched(point: DecisionPoint, begin: Begin) -> Callable[..., Any]:
+def _watched(point: DecisionPoint, decided: Callable[[str], Callable[[Any], None]]) -> Callable[..., Any]:
     """Return a rule that reports each of its decisions. A generator or coroutine reports the value it ends with."""
     rule: Any = point.rule
 
@@ -110,7 +104,7 @@ def _watched(point: DecisionPoint, begin: Begin) -> Callable[..., Any]:
         # In a reset or a mapping, rules do not count as decisions.
         if not (_PLAIN_RUNS if stack is None else stack.decides(point.hook)):
             return rule(*args, **kwargs)
-        end = begin(point.name)
+        end = decided(point.name)
         value = rule(*args, **kwargs)
         if point.hook.kind == "generator":
             return generator(value, end)

@@ -6,9 +6,10 @@ its time is up, an exit is raised in whatever Python code the model is executing
 
 from __future__ import annotations
 
-import copy
 import ctypes
+import datetime
 import io
+import os
 import random
 import sys
 import threading
@@ -18,14 +19,14 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, Final, TypeVar
-from zlib import crc32
 
 import numpy as np
 
-from ..errors import error_text
+from ..errors import error_notes, error_text
 from ..simulation import RULE
-from .fingerprint import Difference, Fingerprint, alike, brief, describe_differences, fingerprint
+from .fingerprint import Difference, Fingerprint, alike, describe_differences, differences, fingerprint
 from .internals import MASK, Plan, SimulationExit, outside_simulation, set_up, watching_rules
 
 Result = TypeVar("Result")
@@ -85,11 +86,6 @@ def global_generators() -> dict[str, Any]:
     return {"Python's random": random.getstate(), "numpy.random": np.random.get_state(legacy=False)}
 
 
-def drawn_since(states: dict[str, Any]) -> set[str]:
-    """Return the names of the global generators whose states have changed."""
-    return {name for name, state in global_generators().items() if not alike(state, states[name])}
-
-
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
     """Ignore what a model prints, and its warnings; leave the global generators as they were.
@@ -116,34 +112,19 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
 
 
 @dataclass
-class Step:
-    """What an agent got at its turn."""
-
-    observation: Any
-    reward: float
-    terminated: bool
-    truncated: bool
-    info: dict[str, Any]
-
-
-@dataclass
 class Run:
-    """What is recorded of a run.
+    """What is recorded of a run."""
 
-    Its entries are the decisions in plain runs and with RULE (the point's name, and what its rule returned), and the
-    steps in episodes of random actions (the agent's name, and a ``Step``).
-    """
-
-    entries: list[tuple[str, Any]] = field(default_factory=list)
+    entries: list[tuple[str, Fingerprint]] = field(default_factory=list)  # points and decisions, or agents and steps
     actions: list[Any] = field(default_factory=list)  # the random ones
     simulation: Any = None
     fingerprint: Fingerprint | None = None  # of the simulation at its end, or when it was cut
     cut: bool = False  # whether it has reached its limit of decisions
     error: BaseException | None = None
-    result: Any = None  # what the simulation's run() returned, in a plain run
+    result: Any = None  # what run() returned in a plain run, or how an episode of random actions ended
     drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
-    seconds: float = 0.0
-    latest: float = field(default_factory=time.monotonic)  # the time of the latest step
+    latest: float = field(default_factory=time.monotonic)  # the time of the latest entry
+    seconds: float = 0.0  # its limit
 
     @property
     def calls(self) -> list[str]:
@@ -152,28 +133,27 @@ class Run:
 
     def play(self, seconds: float, function: Callable[[], Any]) -> Run:
         """Call a function that plays this run; record its error and the global generators."""
-        states = global_generators()
+        states, self.seconds = global_generators(), seconds
         try:
             within(seconds, function)
         except (Exception, SystemExit) as error:
             if not self.cut:
                 self.error = error
-        self.drawn = drawn_since(states)
+        self.drawn = {name for name, state in global_generators().items() if not alike(state, states[name])}
         return self
 
-    def difference(self, other: Run, here: str = "first", there: str = "then") -> str:
+    def difference(self, other: Run) -> str:
         """Describe the first difference from the entries of another run; empty if there is none."""
         pairs = zip(self.entries, other.entries, strict=False)
         for number, ((name, value), (other_name, other_value)) in enumerate(pairs, 1):
             if name != other_name:
-                return f"step {number} is {here} of {name}, {there} of {other_name}"
-            parts = fingerprint(name, value).differences(fingerprint(name, other_value))
-            if parts:
-                return f"in step {number}, {describe_differences(parts, here, there)}"
+                return f"step {number} is first of {name}, then of {other_name}"
+            if parts := differences(value, other_value):
+                return f"in step {number}, {describe_differences(parts)}"
         if other.error is not None:
             return f"the second one raises {describe_with_place(other.error)}"
         if len(self.entries) != len(other.entries):
-            return f"there are {here} {len(self.entries)} steps, {there} {len(other.entries)}"
+            return f"there are first {len(self.entries)} steps, then {len(other.entries)}"
         return ""
 
 
@@ -183,7 +163,7 @@ class Runner:
 
     plan: Plan
     max_steps: int
-    seconds: float
+    seconds: float = 30.0  # for a single run
     own: Callable[[Any], Any] | None = None  # the user's callable by which simulations are compared
     unstable: frozenset[str] = frozenset()  # parts that are not compared
 
@@ -199,18 +179,16 @@ class Runner:
         """Return the parts in which the simulations differ after two runs."""
         if run.fingerprint is None or other.fingerprint is None:
             return []
-        return run.fingerprint.differences(other.fingerprint, self.unstable)
+        return differences(run.fingerprint, other.fingerprint, self.unstable)
 
     def run_plainly(self, seed: int) -> Run:
         """Run the simulation's own loop; only the results of its rules are recorded."""
         run = Run()
 
         def start() -> None:
-            with set_up(self.plan, seed) as (simulation, main):
-                run.simulation, begun = simulation, time.perf_counter()
+            with set_up(self.plan, seed) as (run.simulation, main):
                 run.result = main()
-                run.seconds = time.perf_counter() - begun
-                run.fingerprint = self.look(simulation)
+                run.fingerprint = self.look(run.simulation)
 
         return self._record(run, start)
 
@@ -219,9 +197,7 @@ class Runner:
         run = Run(simulation=env.simulation)
 
         def start() -> None:
-            begun = time.perf_counter()
-            play_rules(env, seed)
-            run.seconds = time.perf_counter() - begun
+            _play_rules(env, seed)
             run.fingerprint = self.look(run.simulation)
 
         return self._record(run, start)
@@ -235,44 +211,46 @@ class Runner:
                 if not run.cut:
                     run.cut, run.fingerprint = True, self.look(run.simulation)
                 raise Cut
-            run.entries.append((name, "left without a decision"))
+            run.entries.append((name, {}))
+            run.latest = time.monotonic()
 
             def end(value: Any) -> None:
-                run.entries[place] = name, brief(value)
+                run.entries[place] = name, fingerprint(f"the decision of {name}", value, follow=False)
 
             return end
 
         with watching_rules(self.plan, begin):
             return run.play(self.seconds, start)
 
-    def run_randomly(self, *games: tuple[Any, int], salt: int = 0) -> list[Run]:
-        """Play episodes with random legal actions, in turns; each in an AEC environment and with a seed.
+    def run_randomly(
+        self, env: Any, seed: int, *, salt: int = 0, most: int | None = None, beside: Any = None, collect: Any = None
+    ) -> Run:
+        """Play an episode with random legal actions in an AEC environment; a salt gives others with the same seed.
 
-        The actions depend on seed, agent and salt alone. An error is that of the last run.
+        The episode is broken off after ``most`` steps. The environment ``beside`` is stepped in turns with this one.
+        ``collect`` is called with the environment, the agent and the result of ``last()`` at each step.
         """
-        runs = [Run() for _ in games]
+        run = Run()
 
         def start() -> None:
-            left = [_random_steps(run, env, seed, salt) for run, (env, seed) in zip(runs, games, strict=True)]
-            while left:
-                left = [steps for steps in left if next(steps, False)]
+            other = _random_steps(Run(), beside, seed + 1, salt) if beside is not None else iter(())
+            for agent, step in islice(_random_steps(run, env, seed, salt), most):
+                if collect is not None:
+                    collect(env, agent, step)
+                next(other, None)
 
-        seed_global_generators(games[0][1])
-        runs[-1].play(self.seconds, start)
-        return runs
+        seed_global_generators(seed)
+        return run.play(self.seconds, start)
 
-    def sources_of_chance(self, seed: int) -> list[str]:
-        """Run the simulation, and find its sources of chance: clocks, entropy, global generators.
-
-        Returns:
-            Each as the end of a sentence, with the place of the call.
-        """
+    def sources_of_chance(self, seed: int) -> str:
+        """Run the simulation, and say where it uses clocks, entropy and Python's global generator."""
         found: dict[str, None] = {}
 
         def profile(frame: Any, event: str, argument: Any) -> None:
-            source = _source_of_chance(frame, event, argument)
-            place = _caller(frame) if source else None
-            if place:
+            source = _CHANCE.get(argument) if event == "c_call" else None
+            if frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
+                source = "a random.Random is made without a seed"
+            if source and (place := _caller(frame)):
                 found[f"{source} at {place}"] = None
 
         before = sys.getprofile()
@@ -281,42 +259,33 @@ class Runner:
             self.run_plainly(seed)
         finally:
             sys.setprofile(before)
-        return list(found)
+        return "; ".join(list(found)[:3])
 
 
-def play_rules(env: Any, seed: int, selected: dict[str, None] | None = None) -> None:
-    """Play an episode in any view with ``RULE`` throughout; collect the agents that the AEC view selects."""
+def _play_rules(env: Any, seed: int) -> None:
+    """Play an episode in any view with ``RULE`` throughout."""
     env.reset(seed=seed)
     if not hasattr(env, "agents"):
         while not any(env.step(RULE)[2:4]):
             pass
         return
     while env.agents:
-        if not hasattr(env, "agent_selection"):
-            env.step(RULE)
-            continue
-        agent = env.agent_selection
-        if selected is not None:
-            selected[agent] = None
-        env.step(None if env.terminations[agent] or env.truncations[agent] else RULE)
+        over = hasattr(env, "agent_selection") and (env.terminations | env.truncations)[env.agent_selection]
+        env.step(None if over else RULE)
 
 
-def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[bool]:
-    """Play one step at a time, and record it."""
+def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[str, Any]]:
+    """Play one step at a time, record it, and yield the agent and the result of ``last()``."""
     env.reset(seed=seed)
-    spaces: dict[str, Any] = {}
     while env.agents:
-        agent = env.agent_selection
-        step, action = Step(*env.last()), None
-        run.entries.append((agent, step))
-        run.latest = time.monotonic()
-        if not (step.terminated or step.truncated):
-            if agent not in spaces:
-                spaces[agent] = copy.deepcopy(env.action_space(agent))
-                spaces[agent].seed(crc32(f"{seed} {agent} {salt}".encode(errors="surrogatepass")))
-            action = spaces[agent].sample(step.info.get(MASK))
+        agent, step, action = env.agent_selection, env.last(), None
+        run.entries.append((agent, fingerprint(agent, step)))
+        run.latest, run.result = time.monotonic(), "truncated" if step[3] else "terminated"
+        if not (step[2] or step[3]):
+            for _ in range(1 + salt):  # the space is seeded by the reset
+                action = env.action_space(agent).sample(step[4].get(MASK))
             run.actions.append(action)
-        yield True
+        yield agent, step
         env.step(action)
 
 
@@ -324,7 +293,20 @@ def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[bool]:
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
 _LIBRARY: Final = random.__file__.rpartition("random.py")[0]
-_CLOCKS: Final = {"time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time"}
+_CLOCKS: Final = (
+    time.time,
+    time.time_ns,
+    time.monotonic,
+    time.perf_counter,
+    datetime.datetime.now,
+    datetime.date.today,
+)
+_CHANCE: Final[dict[Any, str]] = {
+    **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},
+    **dict.fromkeys((random.random, random.getrandbits), "Python's global generator is used"),
+    os.urandom: "the operating system is asked for random bits (as by a generator without a seed)",
+}
+"""Builtin functions that are sources of chance."""
 
 
 def place_of(error: BaseException) -> str:
@@ -338,36 +320,16 @@ def place_of(error: BaseException) -> str:
 
 
 def describe_with_place(error: BaseException) -> str:
-    """Describe an error: its class, the beginning of its text, and where it was raised."""
+    """Describe an error: its class, the beginning of its text, where it was raised, and this library's notes."""
     text, place = " ".join(error_text(error).split()), place_of(error)
     text = text if len(text) <= 400 else f"{text[:396]} ..."
-    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "")
-
-
-def _source_of_chance(frame: Any, event: str, function: Any) -> str:
-    """Describe the source of chance that a call uses, as a profiler sees it; empty if it uses none."""
-    if event == "call" and frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
-        return "a random.Random is made without a seed"
-    if event != "c_call":
-        return ""
-    module, name = getattr(function, "__module__", None), getattr(function, "__name__", "")
-    owner = getattr(function, "__self__", None)
-    if module == "time" and name in _CLOCKS:
-        return f"the clock is read (time.{name})"
-    if name in ("now", "utcnow", "today") and getattr(owner, "__module__", "") == "datetime":
-        return f"the clock is read (datetime.{name})"
-    if name == "urandom":
-        return "the operating system is asked for random bits (as by a generator without a seed)"
-    if name in ("random", "getrandbits") and owner is getattr(random.random, "__self__", None):
-        return "Python's global generator is used"
-    return ""
+    notes = "".join(f"\n{note.removeprefix('simenv_marl: ')}" for note in error_notes(error)[:2])
+    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "") + notes
 
 
 def _caller(frame: Any) -> str:
-    """Return the place in the model, or in a package, from which the standard library was called; empty if nowhere."""
-    while frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
-        path = frame.f_code.co_filename
-        if ("site-packages" in path or not path.startswith(_LIBRARY)) and not path.startswith("<"):
-            return "" if "numpy" in path else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"
+    """Return the place in the model from which the standard library was called; empty if this library called it."""
+    while frame is not None and frame.f_code.co_filename.startswith((_LIBRARY, "<")):
         frame = frame.f_back
-    return ""
+    path = frame.f_code.co_filename if frame is not None else _PACKAGE
+    return "" if path.startswith(_PACKAGE) else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"

@@ -12,11 +12,7 @@ from typing import Final
 
 from ...errors import OptionValueError, short_repr
 
-KINDS: Final = {
-    "plain": "stable-baselines3",
-    "simpy": "simpy cma",
-    "mesa": "mesa cma",
-}
+KINDS: Final = {"plain": "stable-baselines3", "simpy": "simpy", "mesa": "mesa"}
 """The kinds of templates, and the packages that each needs besides ``simenv-marl[experiments]``."""
 
 
@@ -25,10 +21,8 @@ def write_template(kind: str, name: str, folder: Path | None = None) -> str:
 
     Args:
         kind: One of ``KINDS``.
-        name: The name of the new module. Its classes are named after it: ``water_tank`` has a ``WaterTankModel`` and a
-            ``WaterTankSimulation``.
-        folder: The folder to write to; it is created if it does not exist. None: a folder of that name in the current
-            one.
+        name: The name of the new module. ``water_tank`` has a ``WaterTankModel`` and a ``WaterTankSimulation``.
+        folder: The folder to write to, which may be new. None: a folder of that name in the current one.
 
     Returns:
         What was written, and what to do next.

@@ -1,22 +1,17 @@
-"""MyModel: rabbits in Mesa that are born and starve, and one policy, shared by all of them, that learns where to go.
+"""MyModel: rabbits in Mesa that are born and starve, and one policy, shared by all of them. Replace the model by yours.
 
-``python -m simenv_marl.testing.templates.mesa`` trains the policy and compares it with the model's own rule. It needs
-``pip install "simenv-marl[experiments]" mesa cma``. ``--quick`` only shows that everything runs.
-
-Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
+``python -m simenv_marl.testing.templates.mesa`` trains the policy and compares it with the model's own rule.
 """
 
 import sys
 from typing import Any
 
-import cma
 import mesa
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from mesa.discrete_space import CellAgent, OrthogonalVonNeumannGrid
 
 from simenv_marl import SteppedSimulation, aec_env, difference, evaluate, make_step
-from simenv_marl.data import collect_episodes
 
 # -- 1. The model: Mesa's agents, and a rule of their own -----------------------------------------
 
@@ -53,11 +48,11 @@ class Rabbit(CellAgent):
 class MyModel(mesa.Model):
     """A meadow on which grass grows, and rabbits."""
 
-    def __init__(self, width: int = 16, rabbits: int = 20, rng: int | None = None) -> None:
+    def __init__(self, rng: int | None = None) -> None:
         super().__init__(rng=rng)  # the model's own generators: the same seed brings the same run
-        self.grid = OrthogonalVonNeumannGrid((width, width), torus=True, random=self.random)
-        self.grass = self.rng.random((width, width))
-        for cell in self.random.sample(list(self.grid.all_cells), rabbits):
+        self.grid = OrthogonalVonNeumannGrid((16, 16), torus=True, random=self.random)
+        self.grass = self.rng.random((16, 16))
+        for cell in self.random.sample(list(self.grid.all_cells), 20):
             Rabbit(self, cell, 2.0)
 
     def step(self) -> None:
@@ -95,20 +90,16 @@ class MySimulation(SteppedSimulation):
 
     points = {Rabbit.choose_cell: move}  # the model's classes stay as they are
 
-    def __init__(self, days: int = 100, **parameters: Any) -> None:
-        super().__init__(MyModel, days, **parameters)
-
-    def expected_calls(self, point: str) -> list[tuple[Any, ...]]:
-        """Say who is going to decide: all rabbits there are. So a round of the parallel view is a day."""
-        return [(rabbit,) for rabbit in self.model.agents]
+    def __init__(self) -> None:
+        super().__init__(MyModel, 100)
 
 
 # -- 4. The environment, training, and what it is worth -------------------------------------------
 
 
-def env(**options: Any) -> Any:
-    """Make the environment: a ``pettingzoo.AECEnv``; use ``parallel_env`` for learners that act in rounds."""
-    return aec_env(MySimulation, **options)
+def env() -> Any:
+    """Make the environment: a ``pettingzoo.AECEnv``."""
+    return aec_env(MySimulation)
 
 
 def policy_of(weights: Any) -> Any:
@@ -116,26 +107,17 @@ def policy_of(weights: Any) -> Any:
     return lambda seen: (seen @ np.asarray(weights)).argmax(-1)
 
 
-def train(rounds: int, meadows: int) -> Any:
-    """Train one policy for all rabbits by evolution (CMA-ES), and return it. Every candidate meets the same meadows."""
-    search = cma.CMAEvolutionStrategy(np.zeros(2), 1.0, {"seed": 1, "verbose": -9})
-    for number in range(rounds):
-        seeds = range(number * meadows, (number + 1) * meadows)
-        weights, costs = search.ask(), []
-        for candidate in weights:  # a policy is asked for all rabbits of all meadows that wait for it
-            found = collect_episodes(MySimulation, {Rabbit.choose_cell: policy_of(candidate)}, seeds=seeds)
-            costs.append(-float(found[Rabbit.choose_cell].rewards.sum()))
-        search.tell(weights, costs)
-    return policy_of(search.result.xfavorite)
+def train(candidates: int, meadows: int) -> Any:
+    """Train one policy for all rabbits by random search: all candidates meet the same meadows, and the best wins."""
+    policies = [policy_of(weights) for weights in np.random.default_rng(1).normal(size=(candidates, 2))]
+    contenders: dict[str, Any] = {str(number): {Rabbit.choose_cell: policy} for number, policy in enumerate(policies)}
+    found = evaluate(MySimulation, contenders, seeds=range(meadows), batched=True)
+    return policies[int(found.summary()["mean"].idxmax())]
 
 
 if __name__ == "__main__":
-    quick = "--quick" in sys.argv
-    trained = train(*(2, 1) if quick else (4, 2))
-    policies: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: trained}}  # {}: the model as it is
+    quick = "--quick" in sys.argv  # only to see that everything runs
+    policies: dict[str, Any] = {"rule": {}, "trained": {Rabbit.choose_cell: train(*(5, 1) if quick else (20, 2))}}
     seeds = range(100_000, 100_005 if quick else 100_030)  # meadows that it was not trained on
-    found = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True)
     print("What all rabbits have eaten; differences are paired by seed, with 95 % intervals:")
-    print(found.summary().round(1).to_string())
-    print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.testing.templates.mesa:MySimulation")
+    print(evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True).summary().round(1).to_string())

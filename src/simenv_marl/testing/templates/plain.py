@@ -1,9 +1,6 @@
-"""MyModel: a home battery, and an agent that learns when to charge it.
+"""MyModel: a home battery, and an agent that learns when to charge it. Replace the model by yours, section by section.
 
-``python -m simenv_marl.testing.templates.plain`` trains the agent and compares it with the model's own rule. It needs
-``pip install "simenv-marl[experiments]" stable-baselines3``. ``--quick`` only shows that everything runs.
-
-Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
+``python -m simenv_marl.testing.templates.plain`` trains the agent and compares it with the model's own rule.
 """
 
 import math
@@ -27,9 +24,9 @@ class MyModel:
     def __init__(self, seed: int | None = None) -> None:
         self.random = random.Random(seed)  # the model's own generator: the same seed brings the same run
         self.hour, self.charge, self.cost = 0, 5.0, 0.0
-        self.update_weather()
+        self.begin_hour()
 
-    def update_weather(self) -> None:
+    def begin_hour(self) -> None:
         """Draw what the sun brings, what the house uses, and what a kWh costs in this hour."""
         clock = self.hour % 24
         daylight = max(0.0, math.sin((clock - 6) / 12 * math.pi))
@@ -41,14 +38,14 @@ class MyModel:
         """The rule, as sold with most batteries: store what the sun leaves over, and give what the house lacks."""
         return self.sun - self.use
 
-    def update_hour(self) -> None:
+    def end_hour(self) -> None:
         """Let one hour go by."""
         flow = min(max(self.choose_flow(), -self.power, -self.charge), self.power, self.capacity - self.charge)
         self.charge += flow * (1 - self.losses) if flow > 0 else flow
         bought = self.use - self.sun + flow
         self.cost += bought * (self.price if bought > 0 else 0.05)  # what is fed into the grid earns little
         self.hour += 1
-        self.update_weather()
+        self.begin_hour()
 
 
 # -- 2. The decision: what the agent sees, what it can do, and what it is rewarded for ------------
@@ -85,20 +82,16 @@ class MySimulation(SimulationInterface):
     def run(self) -> Any:
         """Run the model's own loop. It is suspended at each decision; nothing here has to be stepped."""
         while self.model.hour < 7 * 24:
-            self.model.update_hour()
+            self.model.end_hour()
         return TRUNCATED  # time is up, but the house goes on: no end of the task
-
-    def time(self) -> float:
-        """The hour, for ``info["time"]``."""
-        return float(self.model.hour)
 
 
 # -- 4. The environment, training, and what it is worth -------------------------------------------
 
 
-def env(**options: Any) -> Any:
-    """Make the environment: a ``gymnasium.Env``, as all of Gymnasium's learners and wrappers take it."""
-    return single_env(MySimulation, **options)
+def env() -> Any:
+    """Make the environment: a ``gymnasium.Env``."""
+    return single_env(MySimulation)
 
 
 def train(steps: int) -> Any:
@@ -113,14 +106,8 @@ def train(steps: int) -> Any:
 
 
 if __name__ == "__main__":
-    quick = "--quick" in sys.argv
-    policies: dict[str, Any] = {
-        "rule": {},
-        "trained": {"battery_0": train(1500 if quick else 100_000)},
-    }  # {}: the model as it is
+    quick = "--quick" in sys.argv  # only to see that everything runs
+    policies: dict[str, Any] = {"rule": {}, "trained": {"battery_0": train(1500 if quick else 100_000)}}
     seeds = range(100_000, 100_005 if quick else 100_030)  # weeks that it was not trained on
-    found = evaluate(MySimulation, policies, seeds=seeds, baseline="rule")
     print("Minus the costs of a week; differences are paired by seed, with 95 % intervals:")
-    print(found.summary().round(2).to_string())
-    print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.testing.templates.plain:MySimulation")
+    print(evaluate(MySimulation, policies, seeds=seeds, baseline="rule").summary().round(2).to_string())

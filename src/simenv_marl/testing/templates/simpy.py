@@ -1,34 +1,23 @@
-"""MyModel: a paint shop in SimPy, and an agent that learns which job comes next.
+"""MyModel: a paint shop in SimPy, and an agent that learns which job comes next. Replace the model by yours.
 
-``python -m simenv_marl.testing.templates.simpy`` trains the agent and compares it with the model's own rule. It needs
-``pip install "simenv-marl[experiments]" simpy cma``. ``--quick`` only shows that everything runs.
-
-Replace the model by yours, section by section. Section 1 knows nothing of reinforcement learning and stays that way.
+``python -m simenv_marl.testing.templates.simpy`` trains the agent and compares it with the model's own rule.
 """
 
 import random
 import sys
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections import namedtuple
 from typing import Any
 
-import cma
 import numpy as np
 import simpy
 from gymnasium.spaces import Box, Discrete
 
 from simenv_marl import TRUNCATED, SimulationInterface, difference, evaluate, make_step, single_env
-from simenv_marl.data import collect_episodes
 
 # -- 1. The model: SimPy's processes, and a rule of its own ---------------------------------------
 
 
-@dataclass(eq=False)
-class Job:
-    """An order: how many minutes it takes, and when it is due."""
-
-    minutes: float
-    due: float
+Job = namedtuple("Job", ["minutes", "due"])  # how long it takes, and when it is to be ready
 
 
 class MyModel:
@@ -38,18 +27,18 @@ class MyModel:
         self.random = random.Random(seed)  # the model's own generator: the same seed brings the same run
         self.clock = simpy.Environment()
         self.waiting: list[Job] = []
-        self.late = 0.0  # of the finished jobs, in minutes
+        self.late = 0.0  # minutes of all finished jobs
         self.clock.process(self.receive_orders())
         self.clock.process(self.paint())
 
-    def receive_orders(self) -> Generator[simpy.Event, Any, None]:
+    def receive_orders(self) -> Any:
         """Let jobs come in: one in four is urgent."""
         while True:
             due = self.clock.now + self.random.choice([20.0, 120.0, 120.0, 120.0])
             self.waiting.append(Job(self.random.choice([4.0, 8.0, 20.0]), due))
             yield self.clock.timeout(self.random.expovariate(1 / 11.0))
 
-    def paint(self) -> Generator[simpy.Event, Any, None]:
+    def paint(self) -> Any:
         """Paint one job after the other, as long as there are any."""
         while True:
             if self.waiting:
@@ -57,37 +46,30 @@ class MyModel:
                 self.waiting.remove(job)
                 yield self.clock.timeout(job.minutes)
                 self.late += max(0.0, self.clock.now - job.due)
-            else:
-                yield self.clock.timeout(1.0)
+            yield self.clock.timeout(1.0)  # a minute to clean up, or to wait
 
-    def choose_job(self) -> Job:
+    def choose_job(self) -> Any:
         """The rule: first come, first served."""
         return self.waiting[0]
-
-    def minutes_late(self) -> float:
-        """Add up how late all jobs are by now, finished or waiting."""
-        return self.late + sum(max(0.0, self.clock.now - job.due) for job in self.waiting)
 
 
 # -- 2. The decision: what the agent sees, what it can do, and what it is rewarded for ------------
 
-SLOTS = 8  # among how many jobs the agent can choose; those that come after them wait until there is room
 
-
-def observe(shop: MyModel) -> np.ndarray[Any, Any]:
-    """See a row for each job: that it is there, its minutes, and the time that is left for it."""
-    rows = np.zeros((SLOTS, 3), np.float32)
+def observe(shop: MyModel) -> Any:
+    """See a row for each of the first eight jobs: that it is there, its minutes, and the time that is left for it."""
+    rows = np.zeros((8, 3), np.float32)
     for row, job in zip(rows, shop.waiting, strict=False):
         row[:] = 1, job.minutes / 20, (job.due - shop.clock.now - job.minutes) / 60
     return rows.clip(-10, 10)
 
 
 dispatch = make_step(
-    observation_space=Box(-10, 10, (SLOTS, 3), np.float32),
+    observation_space=Box(-10, 10, (8, 3), np.float32),
     observation_space_mapping=observe,  # gets the arguments of the decision call
-    action_space=Discrete(SLOTS),
-    choices=lambda shop: shop.waiting[:SLOTS],  # the action is an index
-    reward_mapping=difference(lambda shop: -shop.minutes_late() / 60),  # since the last decision
+    action_space=Discrete(8),
+    choices=lambda shop: shop.waiting[:8],  # the action is an index
+    reward_mapping=difference(lambda shop: -shop.late / 60),  # since the last decision
     agent="dispatcher_0",
 )
 
@@ -115,12 +97,10 @@ class MySimulation(SimulationInterface):
 
 # -- 4. The environment, training, and what it is worth -------------------------------------------
 
-OPTIONS: dict[str, Any] = {"skip_forced": True}  # one waiting job is no choice, and is not asked for
 
-
-def env(**options: Any) -> Any:
+def env() -> Any:
     """Make the environment: a ``gymnasium.Env``, with ``action_masks()`` for learners that know masks."""
-    return single_env(MySimulation, **(OPTIONS | options))
+    return single_env(MySimulation, skip_forced=True)  # one waiting job is no choice
 
 
 def policy_of(weights: Any) -> Any:
@@ -128,31 +108,17 @@ def policy_of(weights: Any) -> Any:
     return lambda seen: np.where(seen[..., 0] > 0, seen[..., 1:] @ np.asarray(weights), -np.inf).argmax(-1)
 
 
-def train(rounds: int, days: int) -> Any:
-    """Train by evolution (CMA-ES), and return a policy. Every candidate meets the same days."""
-    search = cma.CMAEvolutionStrategy(np.zeros(2), 1.0, {"seed": 1, "verbose": -9})
-    for number in range(rounds):
-        seeds = range(number * days, (number + 1) * days)
-        weights, costs = search.ask(), []
-        for candidate in weights:
-            found = collect_episodes(MySimulation, {"dispatcher_0": policy_of(candidate)}, seeds=seeds, **OPTIONS)
-            rewards, times = found["dispatcher_0"].rewards, np.asarray(found["dispatcher_0"].times)
-            costs.append(-float(np.sum(rewards * 0.9995**times)))  # discounted by the minute, not by the decision
-        search.tell(weights, costs)
-    return policy_of(search.result.xfavorite)
+def train(candidates: int, days: int) -> Any:
+    """Train by random search: all candidates meet the same days, and the best becomes the policy."""
+    policies = [policy_of(weights) for weights in np.random.default_rng(1).normal(size=(candidates, 2))]
+    contenders: dict[str, Any] = {str(number): {"dispatcher_0": policy} for number, policy in enumerate(policies)}
+    found = evaluate(MySimulation, contenders, seeds=range(days), batched=True)
+    return policies[int(found.summary()["mean"].idxmax())]
 
 
 if __name__ == "__main__":
-    quick = "--quick" in sys.argv
-    trained = train(*(2, 2) if quick else (12, 10))
-    policies: dict[str, Any] = {
-        "rule": {},  # the model as it is
-        "shortest first": {"dispatcher_0": policy_of([-1, 0])},  # a rule of thumb
-        "trained": {"dispatcher_0": trained},
-    }
+    quick = "--quick" in sys.argv  # only to see that everything runs
+    policies: dict[str, Any] = {"rule": {}, "trained": {"dispatcher_0": train(*(5, 2) if quick else (40, 20))}}
     seeds = range(100_000, 100_005 if quick else 100_050)  # days that it was not trained on
-    found = evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True, **OPTIONS)
     print("Minus the hours late in a day; differences are paired by seed, with 95 % intervals:")
-    print(found.summary().round(1).to_string())
-    print("Next: put your model into section 1, and run pytest. For a full report:")
-    print("python -m simenv_marl check simenv_marl.testing.templates.simpy:MySimulation")
+    print(evaluate(MySimulation, policies, seeds=seeds, baseline="rule", batched=True).summary().round(1).to_string())

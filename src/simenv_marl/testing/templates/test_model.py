@@ -5,9 +5,6 @@ from simenv_marl.testing.templates.plain import MySimulation
 
 
 def test_there_is_nothing_to_complain_of() -> None:
-    """With the rule throughout, environments repeat the plain run; seeds, resets, spaces, rewards and agents are right.
-
-    Gymnasium and PettingZoo run their own tests. ``print(report)`` shows all that was looked at.
-    """
+    """With the rule throughout, environments repeat the plain run; seeds, resets, spaces and rewards are right."""
     report = check_simulation(MySimulation, episodes=2, max_steps=300)
     assert {finding.severity for finding in report.findings} <= {"note"}, str(report)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.spread import import_extra
-from .evaluation import check_metric, check_probability, interval, numbers
+from .evaluation import check_metric, check_probability, interval, is_proportion, numbers
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -31,7 +31,8 @@ class Effects:
 
     Attributes:
         main: One row for each level of each factor, the index: ``mean`` (of the value at this level), the bounds of its
-            interval ``low`` and ``high``, ``effect`` (the mean minus the mean of all), and ``count``.
+            interval ``low`` and ``high`` (as ``Evaluation.summary`` has them, nan where nothing is known), ``effect``
+            (the mean minus the mean of all), and ``count``.
         interactions: One row for each pair of factors, the strongest first. ``strength`` is the standard deviation of
             the differences between the means of their combinations and the sum of both main effects.
         metric: The name of the value.
@@ -111,13 +112,15 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    main = []
+    main, zero_or_one = [], is_proportion(table[metric])
     for codes, own in coded.values():
         for code in range(len(own)):
             here = values[codes == code]
             by_seed = here.groupby(table["seed"].to_numpy()[codes == code]).mean()
             sample = by_seed if len(by_seed) > 1 else here
-            main.append([here.mean(), *interval(sample.to_numpy(), confidence), here.mean() - values.mean(), len(here)])
+            proportion = zero_or_one and len(sample) == len(here)  # not means of several runs
+            low, high, _ = interval(sample.to_numpy(), confidence, proportion=proportion)
+            main.append([here.mean(), low, high, here.mean() - values.mean(), len(here)])
     index = pandas.MultiIndex.from_tuples(
         [(name, level) for name, own in levels.items() for level in own], names=["factor", "level"]
     )

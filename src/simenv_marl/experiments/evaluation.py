@@ -1,12 +1,11 @@
 """Compares contenders on the same seeds, with confidence intervals."""
 
-import warnings
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import inf, isfinite, nan
-from typing import TYPE_CHECKING, Any, Final, Unpack
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +41,6 @@ __all__ = ["Evaluation", "evaluate"]
 FIRST: Final = 16
 """The number of seeds before the first check of the intervals' width: intervals of fewer seeds are unreliable."""
 
-RESAMPLES: Final = 5_000
-"""The number of bootstrap samples for an interval; always the same samples, for reproducible intervals."""
-
-CORRECTED: Final = 10_000
-"""The largest number of values with bias correction: it needs one mean per value, and has no effect on more values."""
-
-AT_ONCE: Final = 4_000_000
-"""The number of values that are drawn at once."""
-
 MOST_SEEDS: Final = 10_000_000
 """A difference that needs more seeds than this counts as none."""
 
@@ -79,6 +69,9 @@ class Evaluation:
         values = self.values()
         return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
 
+    def __str__(self) -> str:
+        return f"{self!r}\n{self.summary().to_string()}"
+
     def values(self, metric: str = "return") -> "DataFrame":
         """Return the team's values: one row for each seed, one column for each contender."""
         check_metric(metric, self.frame.columns)
@@ -90,20 +83,30 @@ class Evaluation:
     def summary(self, metric: str = "return") -> "DataFrame":
         """Return the mean of the team's values for each contender, with its confidence interval.
 
+        Intervals are by Student's t; those of bools, and of numbers that are all 0 or 1, by Wilson's score.
+
         Returns:
             A table indexed by contender, with the columns ``mean``, ``low`` and ``high``. With a baseline also
             ``difference``, ``difference_low`` and ``difference_high``: the mean paired difference from the baseline on
-            the same seeds.
+            the same seeds. Bounds of which nothing is known are nan; the column ``note``, which is there only then,
+            says why.
         """
         values = self._numbers(metric)
-        columns = ["mean", "low", "high"]
-        rows = {name: [own.mean(), *interval(own, self.confidence)] for name, own in values.items()}
+        proportion = is_proportion(self.values(metric))
+        columns, rows, notes = ["mean", "low", "high"], {}, {}
+        for name, own in values.items():
+            low, high, notes[name] = interval(own, self.confidence, proportion=proportion)
+            rows[name] = [own.mean(), low, high]
         if self.baseline is not None:
             columns += ["difference", "difference_low", "difference_high"]
-            for name, own in values.items():
-                difference = own - values[self.baseline]
-                rows[name] += [difference.mean(), *interval(difference, self.confidence)]
-        return _by_contender(rows, columns)
+            for name, difference in self._differences(metric).items():
+                low, high, note = interval(difference, self.confidence)
+                rows[name] += [difference.mean(), low, high]
+                notes[name] = notes[name] or (note and f"differences: {note}")
+            itself = values[self.baseline] - values[self.baseline]
+            rows[self.baseline] += [itself.mean()] * 3
+        table = _by_contender(rows, columns)
+        return table.assign(note=notes) if any(notes.values()) else table
 
     def improvement(self, metric: str = "return") -> "DataFrame":
         """Estimate the probability that a contender has a higher value than the baseline on a seed. Ties count half.
@@ -116,8 +119,9 @@ class Evaluation:
         """
         rows = {}
         for name, difference in self._differences(metric).items():
-            better = np.where(np.isnan(difference), nan, (np.sign(difference) + 1) / 2)
-            rows[name] = [better.mean(), *interval(better, self.confidence)]
+            better = (np.sign(difference) + 1) / 2  # nan where a value is missing
+            low, high, _ = interval(better, self.confidence, proportion=not (difference == 0).any())
+            rows[name] = [better.mean(), *np.clip([low, high], 0.0, 1.0)]
         return _by_contender(rows, ["probability", "low", "high"])
 
     def seeds_needed(self, difference: float, *, power: float = 0.8, metric: str = "return") -> "Series[float]":
@@ -181,9 +185,8 @@ class Evaluation:
 
     def _widest(self) -> float:
         """Return the width of the widest interval of a difference or, without a baseline, of a mean; nan if unknown."""
-        samples = self._numbers("return") if self.baseline is None else self._differences("return")
-        bounds = [interval(own, self.confidence) for own in samples.values()]
-        return float(np.max([high - low for low, high in bounds], initial=0.0))
+        summary, prefix = self.summary(), "" if self.baseline is None else "difference_"
+        return float((summary[f"{prefix}high"] - summary[f"{prefix}low"]).max(skipna=False))
 
 
 def _by_contender(rows: Mapping[str, Iterable[float]], columns: list[str]) -> "DataFrame":
@@ -334,38 +337,45 @@ def numbers(values: Any, metric: str) -> Any:
         raise OptionValueError(f"metric={short_repr(metric)} is not a column of numbers") from None
 
 
-def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:
-    """Return a confidence interval of the mean, by SciPy's bootstrap (BCa, or percentile for very many values).
+def is_proportion(values: Any) -> bool:
+    """Return whether the values of a ``DataFrame`` or ``Series`` are bools, or 0 and 1 alone, of which both occur."""
+    if values.to_numpy().dtype == np.bool_:
+        return True
+    return set(np.unique(values.dropna())) == {0, 1}
 
-    The bounds are nan if there are fewer than two values, or one that is not finite.
-    """
-    stats = import_extra("scipy.stats", "an interval")
-    if len(values) < 2 or not np.isfinite(values).all():
-        return nan, nan
-    if (values == values[0]).all():
-        return float(values[0]), float(values[0])
-    batch = max(1, min(500, AT_ONCE // len(values)))
-    for method in ("BCa", "percentile")[len(values) > CORRECTED :]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about degenerate samples, which the other method handles
-            bounds = stats.bootstrap(
-                (values,), np.mean, confidence_level=confidence, n_resamples=RESAMPLES, batch=batch, method=method,
-                vectorized=True, rng=np.random.default_rng(0),
-            ).confidence_interval  # fmt: skip
-        low, high = float(bounds.low), float(bounds.high)
-        if isfinite(low) and isfinite(high):
-            break
-    return low, high
+
+class Interval(NamedTuple):
+    """A confidence interval. Bounds of which nothing is known are nan, and ``note`` says why."""
+
+    low: float
+    high: float
+    note: str = ""
+
+
+def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool = False) -> Interval:
+    """Return a confidence interval of the mean: by Student's t or, of a proportion, by Wilson's score."""
+    stats, number = import_extra("scipy.stats", "an interval"), len(values)
+    if number < 2:
+        return Interval(nan, nan, "a single value")
+    if not np.isfinite(values).all():
+        return Interval(nan, nan, "a value is missing or not finite")
+    if proportion:
+        bounds = stats.binomtest(round(values.sum()), number).proportion_ci(confidence, method="wilson")
+        return Interval(float(bounds.low), float(bounds.high))
+    if np.ptp(values) <= 1e-12 * np.abs(values).max():  # they differ by rounding errors at most
+        return Interval(nan, nan, "all are equal")
+    low, high = stats.t.interval(confidence, number - 1, values.mean(), stats.sem(values))
+    return Interval(float(low), float(high))
 
 
 def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
     """Return the number of seeds that detects a mean difference, by the paired t-test.
 
-    The number is infinity if it is too large, and nan if there are fewer than two differences on present seeds, which
-    give the variance.
+    The number is infinity if it is too large, and nan if the present differences, which give the variance, have no
+    interval.
     """
     stats = import_extra("scipy.stats", "the number of seeds")
-    if len(differences) < 2 or not np.isfinite(differences).all():
+    if interval(differences, confidence).note:
         return nan
     ratio = float(np.std(differences, ddof=1)) / abs(difference)
 

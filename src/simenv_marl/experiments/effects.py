@@ -59,14 +59,7 @@ class Effects:
     def plot(self, *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw the main effects of all factors and, below them, the strongest interactions.
 
-        Args:
-            figure: The figure to draw in. None: a new figure.
-
-        Returns:
-            The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
-
-        Raises:
-            MissingExtraError: Matplotlib is missing.
+        ``figure`` and the result are as in ``plot_timeline``.
         """
         from .figures import draw_effects
 
@@ -199,9 +192,9 @@ def sobol_indices(
     Args:
         frame: The result of ``run_experiment`` for ``design(..., method="saltelli")``. The value of a row is its mean
             over the seeds.
-        metric: The value: ``"return"``, ``"length"`` or the name of a metric.
-        contender: The contender whose runs are used.
-        agent: The agent whose rows are used. Default: the team.
+        metric: As ``effects`` takes it.
+        contender: As ``effects`` takes it.
+        agent: As ``effects`` takes it.
         confidence: The confidence level of the error bounds.
 
     Returns:

@@ -91,20 +91,20 @@ class Evaluation:
             the same seeds. Bounds of which nothing is known are nan; the column ``note``, which is there only then,
             says why.
         """
-        values = self._numbers(metric)
-        proportion = is_proportion(self.values(metric))
+        values = self.values(metric)
         columns, rows, notes = ["mean", "low", "high"], {}, {}
-        for name, own in values.items():
-            low, high, notes[name] = interval(own, self.confidence, proportion=proportion)
-            rows[name] = [own.mean(), low, high]
+        proportion = is_proportion(values)
+        for name, own in numbers(values, metric).items():
+            sample = own.to_numpy()
+            low, high, notes[name] = interval(sample, self.confidence, proportion=proportion)
+            rows[name] = [sample.mean(), low, high]
         if self.baseline is not None:
             columns += ["difference", "difference_low", "difference_high"]
             for name, difference in self._differences(metric).items():
                 low, high, note = interval(difference, self.confidence)
                 rows[name] += [difference.mean(), low, high]
                 notes[name] = notes[name] or (note and f"differences: {note}")
-            itself = values[self.baseline] - values[self.baseline]
-            rows[self.baseline] += [itself.mean()] * 3
+            rows[self.baseline] += [0.0] * 3
         table = _by_contender(rows, columns)
         return table.assign(note=notes) if any(notes.values()) else table
 
@@ -127,7 +127,7 @@ class Evaluation:
     def seeds_needed(self, difference: float, *, power: float = 0.8, metric: str = "return") -> "Series[float]":
         """Estimate the number of seeds that would detect a difference from the baseline.
 
-        The estimate uses the variance on the present seeds.
+        The estimate is that of the paired t-test, at ``confidence``, with the variance on the present seeds.
 
         Args:
             difference: The mean difference to detect.
@@ -135,8 +135,7 @@ class Evaluation:
             metric: The name of the value.
 
         Returns:
-            The number of seeds by contender (by the paired t-test, at ``confidence``); infinity if no number of seeds
-            is large enough.
+            The number of seeds by contender; infinity if no number is large enough, nan if the variance is unknown.
 
         Raises:
             OptionValueError: There is no baseline, or an argument has an invalid value.
@@ -145,24 +144,14 @@ class Evaluation:
         check_probability("power", power, 0.8)
         if difference == 0:
             raise OptionValueError("difference must not be 0: no number of seeds is enough to detect that")
-        rows = {
-            name: [seeds_needed(own, difference, self.confidence, power)]
-            for name, own in self._differences(metric).items()
-        }
+        differences = self._differences(metric)
+        rows = {name: [seeds_needed(own, difference, self.confidence, power)] for name, own in differences.items()}
         return _by_contender(rows, ["seeds"])["seeds"]
 
     def plot(self, metric: str = "return", *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw each seed as a line across the contenders and, with a baseline, the difference on each seed.
 
-        Args:
-            metric: The name of the value.
-            figure: The figure to draw in. None: a new figure.
-
-        Returns:
-            The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
-
-        Raises:
-            MissingExtraError: Matplotlib is missing.
+        ``figure`` and the result are as in ``plot_timeline``.
         """
         from .figures import draw_evaluation
 
@@ -171,17 +160,13 @@ class Evaluation:
         )
         return result
 
-    def _numbers(self, metric: str) -> dict[str, NDArray[np.float64]]:
-        """Return the team's values by contender, in the order of the seeds."""
-        return {name: own.to_numpy() for name, own in numbers(self.values(metric), metric).items()}
-
     def _differences(self, metric: str) -> dict[str, NDArray[np.float64]]:
-        """Return the differences from the baseline, by other contender."""
+        """Return the differences from the baseline, by other contender, in the order of the seeds."""
         if self.baseline is None:
             raise OptionValueError("there is no baseline to compare with; give evaluate a baseline=")
-        values = self._numbers(metric)
-        base = values.pop(self.baseline)
-        return {name: own - base for name, own in values.items()}
+        values = numbers(self.values(metric), metric)
+        differences = values.sub(values[self.baseline], axis=0).drop(columns=self.baseline)
+        return {name: own.to_numpy() for name, own in differences.items()}
 
     def _widest(self) -> float:
         """Return the width of the widest interval of a difference or, without a baseline, of a mean; nan if unknown."""
@@ -215,12 +200,11 @@ def evaluate(
     """Evaluate contenders on the same seeds.
 
     Args:
-        simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
+        simulation: As ``simulate_many`` takes it.
         contenders: A dict from the name of a contender to its policies, as ``simulate`` takes them. ``{}`` is the model
-            as it is.
+            as it is. Agents without a policy follow their rule, and have returns like all others.
         seeds: The seeds of the simulations, all different.
-        points: The decision points, as ``generate_env`` takes them. Agents without a policy of the contender follow
-            their rule, and have returns like all others.
+        points: As ``simulate_many`` takes them.
         baseline: The contender that the others are compared with.
         metric: A callable of the simulation after its end, whose column is ``metric``, or a dict from column to
             callable. A metric returns a number, a string or None.
@@ -232,9 +216,9 @@ def evaluate(
             at most this wide; ``seeds`` are then the seeds that may be used. The width is checked from 16 seeds on, at
             growing distances.
         batched: Whether the policies are those of ``simulate_many``, which answer many decisions at once.
-        batch_size: The largest number of simulations that are suspended together, if ``batched``.
-        workers: The number of worker processes: see ``simulate_many``.
-        progress: Whether to show a progress bar, by ``tqdm``.
+        batch_size: As ``simulate_many`` takes it, if ``batched``.
+        workers: As ``simulate_many`` takes them.
+        progress: As ``simulate_many`` takes it.
         **options: The options of ``simulate``.
 
     Returns:
@@ -302,7 +286,7 @@ def _run_part(simulation: Any, runner: Runner, name: str, seeds: list[int], plan
 
 
 def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
-    """Check arguments that ``run_experiment`` does not have."""
+    """Check the arguments that ``run_experiment`` does not have."""
     if not contenders:
         raise OptionValueError("contenders must be a dict, such as {'rule': {}}, but there are none")
     if baseline is not None and baseline not in list(contenders):
@@ -369,11 +353,7 @@ def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool
 
 
 def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
-    """Return the number of seeds that detects a mean difference, by the paired t-test.
-
-    The number is infinity if it is too large, and nan if the present differences, which give the variance, have no
-    interval.
-    """
+    """Return the number of seeds that detects a mean difference: see ``Evaluation.seeds_needed``."""
     stats = import_extra("scipy.stats", "the number of seeds")
     if interval(differences, confidence).note:
         return nan

@@ -360,11 +360,10 @@ def _colour(axes: Axes, cells: NDArray[np.float64], **colours: Any) -> Any:
     return axes.add_collection(PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours))
 
 
-def _colour_bar(axes: Axes, scale: Any, extend: str) -> Any:
+def _colour_bar(axes: Axes, scale: Any, extend: str) -> None:
     """Draw the scale of colours beside axes."""
     bar = axes.figure.colorbar(scale, ax=axes, extend=extend, fraction=0.04, pad=0.01, aspect=30)
     bar.outline.set_visible(False)
-    return bar
 
 
 def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
@@ -398,9 +397,7 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     rewards = np.concatenate([row.rewards for row in rows])
     # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
-    low, high = rewards.min(), rewards.max()
-    extend = ("neither", "min", "max", "both")[int(low < -most) + 2 * int(high > most)]
+    extend = ("neither", "min", "max", "both")[int(rewards.min() < -most) + 2 * int(rewards.max() > most)]
     colours = LinearSegmentedColormap.from_list("reward", REWARDS)
     scale = _colour(axes, _cells(rows, slim=False), array=rewards, cmap=colours, clim=(-most, most))
-    bar = _colour_bar(axes, scale, extend)
-    bar.ax.set_ylim(-most if low < 0 else 0.0, most if high > 0 or low == 0 else 0.0)
+    _colour_bar(axes, scale, extend)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 from simenv_marl.errors import OptionValueError
 from simenv_marl.experiments import design, effects, run_experiment, sobol_indices
@@ -152,8 +153,21 @@ def test_intervals_are_over_seeds_and_not_over_what_other_factors_do():
     ]  # fmt: skip
     found = effects(pd.DataFrame(rows)).main
     for a in ("quiet0", "loud0"):
-        assert found.loc[("a", a), ["mean", "low", "high"]].tolist() == [50, 50, 50]
-    low, high = found.loc[("a", "loud4"), ["low", "high"]]
-    assert 44 <= low < 50 < high <= 56
+        assert found.loc[("a", a), "mean"] == 50
+        assert found.loc[("a", a), ["low", "high"]].isna().all()  # the same on all seeds
+    expected = stats.t.interval(0.95, 3, 50, stats.sem([44, 48, 52, 56]))
+    assert found.loc[("a", "loud4"), ["low", "high"]].tolist() == pytest.approx(expected)
     alone = effects(pd.DataFrame([row for row in rows if row["seed"] == 1])).main
     assert alone.loc[("a", "quiet0"), "low"] < 50 < alone.loc[("a", "quiet0"), "high"]
+
+
+def test_shares_have_the_intervals_of_shares():
+    rows = [
+        {"a": a, "contender": "rule", "seed": seed, "agent": "team", "return": 0.0, "length": 1, "won": seed < 3 * a,
+         "status": "ok", "error": None}
+        for a in (0, 1) for seed in range(12)
+    ]  # fmt: skip
+    found = effects(pd.DataFrame(rows), "won").main
+    for a in (0, 1):
+        expected = stats.binomtest(3 * a, 12).proportion_ci(0.95, method="wilson")
+        assert found.loc[("a", a), ["low", "high"]].tolist() == pytest.approx(list(expected))

@@ -4,7 +4,6 @@ import builtins
 import subprocess
 import sys
 import threading
-import tracemalloc
 import warnings
 
 import numpy as np
@@ -153,10 +152,8 @@ def test_the_summary_is_paired_by_seed():
     assert summary.loc["rule", ["difference", "difference_low", "difference_high"]].tolist() == [0.0, 0.0, 0.0]
     apart = (values["some"] - values["rule"]).to_numpy()
     assert summary.loc["some", "difference"] == pytest.approx(apart.mean())
-    expected = stats.bootstrap((apart,), np.mean, n_resamples=9999, rng=1).confidence_interval
-    assert summary.loc["some", ["difference_low", "difference_high"]].tolist() == pytest.approx(
-        [expected.low, expected.high], abs=0.2 * (expected.high - expected.low) + 1e-9
-    )
+    expected = stats.ttest_rel(values["some"], values["rule"]).confidence_interval(0.95)
+    assert summary.loc["some", ["difference_low", "difference_high"]].tolist() == pytest.approx(list(expected))
     assert (summary["low"] < summary["mean"]).all()
     assert (summary["mean"] < summary["high"]).all()
     assert list(evaluate(Shop, CONTENDERS, seeds=[1, 2], points=POINTS).summary().columns) == ["mean", "low", "high"]
@@ -173,26 +170,70 @@ def test_wider_intervals_are_surer():
 
 def test_intervals_are_those_of_scipy():
     values = np.random.default_rng(3).exponential(size=40)
-    expected = stats.bootstrap((values,), np.mean, n_resamples=5000, rng=np.random.default_rng(0)).confidence_interval
-    assert interval(values, 0.95) == interval(values, 0.95) == tuple(expected)
-    assert interval(np.array([1.0, 1.0]), 0.95) == (1, 1)
-    assert np.isnan(interval(np.array([1.0, np.nan]), 0.95)).all()
+    expected = stats.ttest_1samp(values, 0).confidence_interval(0.9)
+    assert interval(values, 0.9) == (pytest.approx(expected.low), pytest.approx(expected.high), "")
+    wins = np.array([0.0] * 7 + [1.0])
+    expected = stats.binomtest(1, 8).proportion_ci(0.9, method="wilson")
+    assert interval(wins, 0.9, proportion=True) == (*expected, "")
+    assert interval(np.zeros(8), 0.9, proportion=True).high > 0.1
 
 
-def test_intervals_of_very_many_seeds_take_little_memory():
-    values = np.random.default_rng(3).normal(size=40_000)
-    tracemalloc.start()
-    try:
-        low, high = interval(values, 0.95)
-        assert tracemalloc.get_traced_memory()[1] < 200e6
-    finally:
-        tracemalloc.stop()
-    assert [low, high] == pytest.approx(values.mean() + np.array([-1.96, 1.96]) / 200, abs=3e-4)
+@pytest.mark.parametrize("proportion", [False, True])
+@pytest.mark.parametrize(
+    ("values", "note"),
+    [([], "a single"), ([1.0], "a single"), ([1.0, np.nan], "missing"), ([1.0, np.inf], "missing")],
+)
+def test_nothing_is_known_of_one_value_or_of_missing_ones(values, note, proportion):
+    low, high, why = interval(np.array(values), 0.95, proportion=proportion)
+    assert np.isnan([low, high]).all()
+    assert note in why
+
+
+@pytest.mark.parametrize("values", [[2.0] * 5, [0.1 + 0.2, 0.3, 0.3], [0.0, 0.0]], ids=str)
+def test_nothing_is_known_of_equal_values(values):
+    low, high, why = interval(np.array(values), 0.95)
+    assert np.isnan([low, high]).all()
+    assert "equal" in why
+
+
+def test_the_summary_says_why_there_is_no_interval():
+    contenders = {"a": {}, "same": {}, "some": {"keeper": some}}
+    found = evaluate(Shop, contenders, seeds=SEEDS, points=POINTS, baseline="a", metric={"one": lambda shop: 1})
+    summary = found.summary()
+    assert summary.loc["a", ["difference", "difference_low", "difference_high"]].tolist() == [0, 0, 0]
+    assert summary.loc["same", ["difference_low", "difference_high"]].isna().all()
+    assert summary["note"].to_dict() == {"a": "", "same": "differences: all are equal", "some": ""}
+    assert set(found.summary("one")["note"]) == {"all are equal"}
+    assert np.isnan(found.seeds_needed(1.0)["same"])
+    assert str(found) == f"{found!r}\n{summary.to_string()}"
+    found = evaluate(Shop, contenders, seeds=[1], points=POINTS)
+    assert set(found.summary()["note"]) == {"a single value"}
+    found.plot()
+
+
+def test_shares_have_intervals_by_wilsons_score():
+    metric = {
+        "never": lambda shop: False,
+        "odd": lambda shop: shop.seed % 2 == 1,
+        "more": lambda shop: int(shop.seed < 3),
+        "count": lambda shop: 2 * (shop.seed < 3),
+    }
+    found = evaluate(Shop, {"rule": {}}, seeds=SEEDS, points=POINTS, metric=metric)
+    for name, number in {"never": 0, "odd": 6, "more": 3}.items():
+        expected = stats.binomtest(number, 12).proportion_ci(0.95, method="wilson")
+        assert found.summary(name).loc["rule", ["low", "high"]].tolist() == pytest.approx(list(expected))
+    values = 2.0 * (np.arange(12) < 3)
+    expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
+    assert found.summary("count").loc["rule", ["low", "high"]].tolist() == pytest.approx(list(expected))
 
 
 def test_the_probability_of_improvement_counts_ties_half():
     found = evaluate(Shop, {"a": {}, "same": {}, "much": {"keeper": much}}, seeds=SEEDS, points=POINTS, baseline="a")
-    assert found.improvement()["probability"].to_dict() == {"same": 0.5, "much": 1.0}
+    improvement = found.improvement()
+    assert improvement["probability"].to_dict() == {"same": 0.5, "much": 1.0}
+    expected = stats.binomtest(12, 12).proportion_ci(0.95, method="wilson")
+    assert improvement.loc["much", ["low", "high"]].tolist() == pytest.approx(list(expected))
+    assert improvement.loc["same", ["low", "high"]].isna().all()
 
 
 def test_how_many_seeds_would_tell_a_difference():
@@ -213,13 +254,16 @@ def test_the_number_of_seeds_is_that_of_the_t_test():
     apart = np.random.default_rng(0).normal(size=200)
     number = seeds_needed(apart / apart.std(ddof=1), 0.5, 0.95, 0.8)
     assert number == pytest.approx(34, abs=1)  # as tables of power have it
-    assert seeds_needed(np.zeros(3), 0.5, 0.95, 0.8) == 2
+    assert np.isnan(seeds_needed(np.zeros(3), 0.5, 0.95, 0.8))
     assert seeds_needed(apart, 1e-9, 0.95, 0.8) == float("inf")
 
 
 def test_it_stops_as_soon_as_intervals_are_narrow_enough():
-    found = evaluate(Shop, CONTENDERS, seeds=range(400), points=POINTS, baseline="rule", width=1e9)
+    contenders = {"rule": {}, "some": {"keeper": some}}
+    found = evaluate(Shop, contenders, seeds=range(400), points=POINTS, baseline="rule", width=1e9)
     assert len(found.values()) == 16
+    unknown = evaluate(Shop, CONTENDERS, seeds=range(40), points=POINTS, baseline="rule", width=1e9)
+    assert len(unknown.values()) == 40  # all differences are equal
     found = evaluate(Shop, {"rule": {}}, seeds=range(400), points=POINTS, width=2.0)
     summary = found.summary()
     assert 16 < len(found.values()) < 400

@@ -34,17 +34,16 @@ def collect_episodes(
     other agents follow their rule. An episode without decisions yields no trajectory and is not an error.
 
     Args:
-        simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
+        simulation: As ``simulate_many`` takes it.
         policies: The policies, as ``simulate_many`` takes them. ``RULE`` is a policy like any other. A policy may
             return a tuple of the actions and a dict of arrays of shape ``(batch, ...)`` (log-probabilities, values).
             The arrays become ``extras``; the dict must always have the same keys.
-        seeds: The seeds of the simulations, non-negative integers.
-        points: The decision points, as ``generate_env`` takes them.
+        seeds: As ``simulate_many`` takes them.
+        points: As ``simulate_many`` takes them.
         collect: A callable of a simulation that has just ended. What it returns is in ``collected``.
-        batch_size: The largest number of simulations that are suspended together, in each worker process. At most 256
-            are suspended while the policies take less time than the simulations.
-        workers: The number of worker processes: see ``simulate_many``.
-        progress: Whether to show a progress bar, by ``tqdm``.
+        batch_size: As ``simulate_many`` takes it.
+        workers: As ``simulate_many`` takes them.
+        progress: As ``simulate_many`` takes it.
         **options: The options of ``aec_env``. ``max_steps`` truncates episodes. Every agent that has a policy counts as
             declared, whatever ``possible_agents`` says.
 
@@ -53,11 +52,7 @@ def collect_episodes(
 
     Raises:
         OptionValueError: An argument has an invalid value, or the extras do not fit the decisions.
-        InvalidActionError: A policy did not return one legal action for each decision.
-        MissingExtraError: joblib or tqdm is missing.
-        SimEnvError: Something else cannot work. The subclass tells what.
-        BaseException: Any exception of a model, a mapping or a policy, with a note that names the seed. All other
-            simulations are unwound first.
+        BaseException: All other errors are those of ``simulate_many``.
     """
     episodes = list(enumerate(checked_seeds(seeds)))
     check_numbers(batch_size, workers)
@@ -124,14 +119,9 @@ Part = tuple[dict[int, Records], list[Any]]
 """The results of some episodes: the records by the place of their policy, and what ``collect`` returned."""
 
 
-def _play_part(
-    planned: tuple[Any, Any, Any, Any],
-    collect: Callable[[Any], Any] | None,
-    batch_size: int,
-    episodes: list[tuple[int, int]],
-) -> Part:
+def _play_part(arguments: tuple[Any, ...], collect: Any, batch_size: int, episodes: list[tuple[int, int]]) -> Part:
     """Play a part of the episodes, in a worker process."""
-    return _play(*learners_plan(*planned), collect, batch_size, episodes, None)
+    return _play(*learners_plan(*arguments), collect, batch_size, episodes, None)
 
 
 def _play(

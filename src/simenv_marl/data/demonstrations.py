@@ -46,16 +46,16 @@ def record_dataset(
     Args:
         dataset_id: The name of the data set, such as ``"greenhouse/rule-v0"``. With several policies: a dict from their
             keys to such names. Policies without a name decide, but are not recorded.
-        simulation: As ``collect_episodes`` takes it.
+        simulation: As ``simulate_many`` takes it.
         policies: The policies: ``RULE``, a callable, or a ``Mixture``, as ``collect_episodes`` takes them. The rule's
             decisions are known as actions if the point has a ``rule_action_mapping`` or needs none.
-        seeds: The seeds of the simulations, non-negative integers.
-        points: The decision points, as ``generate_env`` takes them.
+        seeds: As ``simulate_many`` takes them.
+        points: As ``simulate_many`` takes them.
         metadata: Metadata for Minari: see ``save_dataset``. ``algorithm_name`` defaults to the name of the policy. The
             result of ``provenance`` is always added.
-        batch_size: The largest number of simulations that are suspended together: see ``collect_episodes``.
-        workers: The number of worker processes: see ``collect_episodes``.
-        progress: Whether to show a progress bar: see ``collect_episodes``.
+        batch_size: As ``simulate_many`` takes it.
+        workers: As ``simulate_many`` takes them.
+        progress: As ``simulate_many`` takes it.
         **options: The options of ``aec_env``.
 
     Returns:
@@ -63,10 +63,8 @@ def record_dataset(
         none of them is left on disk.
 
     Raises:
-        OptionValueError: The data set exists already, or an argument has an invalid value.
-        DefinitionError: The actions that correspond to the rule's decisions are unknown.
-        MissingExtraError: Minari is missing.
-        SimEnvError: As ``collect_episodes`` raises it; this holds for all other errors, too.
+        BaseException: Any error of ``collect_episodes`` or ``save_dataset``. What can be checked before is checked
+            before anything runs.
     """
     if not isinstance(policies, Mapping) or not policies:
         raise OptionValueError(f"policies must be a dict from agents or points to policies, not {short_repr(policies)}")

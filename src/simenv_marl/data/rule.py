@@ -152,11 +152,10 @@ def compare_with_rule(
     of the plain model, unless ``others`` names policies that decide.
 
     Args:
-        simulation: As ``collect_episodes`` takes it.
-        policies: The policies to compare, as ``collect_episodes`` takes them. Their actions are not checked for being
-            legal.
-        seeds: The seeds of the simulations.
-        points: The decision points, as ``generate_env`` takes them.
+        simulation: As ``simulate_many`` takes it.
+        policies: The policies to compare, as ``collect_episodes`` takes them. Their actions may be illegal.
+        seeds: As ``simulate_many`` takes them.
+        points: As ``simulate_many`` takes them.
         others: Policies that decide instead of the rule, as ``collect_episodes`` takes policies. They are not compared.
         tolerance: The largest difference between numbers in two actions that agree. It applies to ``Box`` spaces of
             floats.
@@ -168,8 +167,7 @@ def compare_with_rule(
     Raises:
         DefinitionError: The actions that correspond to the rule's decisions are unknown.
         OptionValueError: An argument has an invalid value.
-        InvalidActionError: A policy did not return one action for each decision.
-        SimEnvError: As ``collect_episodes`` raises it; this holds for all other errors, too.
+        BaseException: All other errors are those of ``collect_episodes``.
     """
     if not isinstance(policies, Mapping) or not all(callable(policy) for policy in policies.values()):
         raise OptionValueError(

@@ -39,19 +39,13 @@ ENDS: Final = {"x": "terminated", "|": "truncated"}
 
 
 @dataclass(frozen=True)
-class _Part:
-    """One array of the actions of a policy or of one of its agents."""
+class _Component:
+    """One number of the actions of a policy or of one of its agents."""
 
-    name: str  # its place in the action; empty if the action is one array
-    values: NDArray[Any]  # (decisions, width)
+    part: str  # the place of its array in the action; empty if the action is one array
+    values: NDArray[Any]  # of the decisions
     labels: Mapping[int, str] | None  # of the policy's values in all episodes, where each has a colour
-    limits: tuple[float, float]  # of the policy's values in all episodes
-
-    @property
-    def components(self) -> list[str]:
-        """The names of its components."""
-        width = self.values.shape[1]
-        return [f"{self.name}[{place}]" for place in range(width)] if width > 1 else [self.name]
+    limits: tuple[float, float]  # of the array's values in all episodes
 
 
 @dataclass(frozen=True)
@@ -60,10 +54,9 @@ class TimelineRow:
 
     key: Any  # of its policy
     agent: str
-    turn: int  # of its first decision
     times: NDArray[Any]  # of its decisions
     end: float  # the time of its end
-    parts: list[_Part]  # of its actions
+    actions: dict[str, _Component]  # by the name of the component
     rewards: NDArray[np.float64]
     known: NDArray[np.bool_]
     by_rule: NDArray[np.bool_]
@@ -122,9 +115,7 @@ def plot_timeline(
         raise OptionValueError(
             f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has decided in it"
         )
-    rows: list[TimelineRow] = []
-    for key, found in deciding.items():
-        rows += _rows(key, found, _parts(found, _names(key, action_names)), number)
+    rows = [row for key, found in deciding.items() for row in _rows(key, found, _names(key, action_names), number)]
     if agents is not None:
         rows = _choose(rows, agents, number)
     begin, end = min(row.times[0] for row in rows), max(row.end for row in rows)
@@ -157,10 +148,10 @@ def _names(key: Any, action_names: Any) -> Mapping[Any, Any]:
     return dict(enumerate(action_names))
 
 
-def _parts(found: Trajectories, names: Mapping[Any, Any]) -> list[_Part]:
-    """Split the actions of a policy into their arrays. Some actions may be unknown."""
-    parts = []
-    for name, array in leaves(found.actions):
+def _components(found: Trajectories, names: Mapping[Any, Any]) -> dict[str, _Component]:
+    """Split the actions of a policy into their components, by name. Some actions may be unknown."""
+    components = {}
+    for part, array in leaves(found.actions):
         own_names = names
         if array.dtype == object:  # values without a shape are distinguished by their text
             texts, array = np.unique([str(action) for action in array], return_inverse=True)
@@ -171,12 +162,15 @@ def _parts(found: Trajectories, names: Mapping[Any, Any]) -> list[_Part]:
         labels = {int(value): str(own_names.get(value, int(value))) for value in distinct}
         finite = known[np.isfinite(known)]
         limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
-        parts.append(_Part(name, values, labels if 0 < len(labels) <= NAMED else None, limits))
-    return parts
+        for place, column in enumerate(values.T):
+            name = f"{part}[{place}]" if values.shape[1] > 1 else part
+            components[name] = _Component(part, column, labels if 0 < len(labels) <= NAMED else None, limits)
+    return components
 
 
-def _rows(key: Any, found: Trajectories, parts: list[_Part], episode: int) -> Iterator[TimelineRow]:
+def _rows(key: Any, found: Trajectories, names: Mapping[Any, Any], episode: int) -> Iterator[TimelineRow]:
     """Yield the row of each agent that a policy answered for in the episode."""
+    actions = _components(found, names)
     for place in np.flatnonzero(found.episodes[found.starts] == episode):
         start, last = int(found.starts[place]), int(found.starts[place] + found.lengths[place]) - 1
         rows = slice(start, last + 1)
@@ -188,10 +182,9 @@ def _rows(key: Any, found: Trajectories, parts: list[_Part], episode: int) -> It
         yield TimelineRow(
             key=key,
             agent=found.names[found.agents[start]],
-            turn=int(found.turns[start]),
             times=times,
             end=end,
-            parts=[replace(part, values=part.values[rows]) for part in parts],
+            actions={name: replace(own, values=own.values[rows]) for name, own in actions.items()},
             rewards=found.rewards[rows],
             known=found.known[rows],
             by_rule=found.by_rule[rows],
@@ -216,10 +209,10 @@ def _choose(rows: Sequence[TimelineRow], agents: Any, episode: int) -> list[Time
 def _panels(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
     """Group the rows by policy; make one group of them if there are many policies with like actions."""
     keys = list(dict.fromkeys(row.key for row in rows))
-    kinds = {tuple((*part.components, part.labels is None) for part in row.parts) for row in rows}
+    kinds = {tuple((name, own.labels is None) for name, own in row.actions.items()) for row in rows}
     if len(keys) <= CHARTED or len(kinds) > 1:
         return [[row for row in rows if row.key == key] for key in keys]
-    return [sorted(rows, key=lambda row: row.turn)]
+    return [sorted(rows, key=lambda row: row.times[0])]
 
 
 def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> None:
@@ -229,18 +222,20 @@ def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> No
 
     by_rule, known = any(row.by_rule.any() for row in rows), all(row.known.all() for row in rows)
     dot: dict[str, Any] = {"marker": "o", "linewidth": 0, "markersize": 4}
-    marks: list[tuple[bool, str, dict[str, Any]]] = [
-        (by_rule and charts, "policy", dot | {"color": COLOURS[0]}),
-        (by_rule and charts, "rule", dot | {"color": COLOURS[0] if known else UNKNOWN, "markerfacecolor": "white"}),
-        (by_rule and not charts, "by rule", {"color": INK, "linewidth": 2}),
-        (not known and not charts, "by rule, action unknown", {"color": UNKNOWN, "linewidth": 2}),
-    ]
+    marks: dict[str, dict[str, Any]] = {}
+    if by_rule and charts:
+        marks["policy"] = dot | {"color": COLOURS[0]}
+        marks["rule"] = dot | {"color": COLOURS[0] if known else UNKNOWN, "markerfacecolor": "white"}
+    elif by_rule:
+        marks["by rule"] = {"color": INK, "linewidth": 2}
+        if not known:
+            marks["by rule, action unknown"] = {"color": UNKNOWN, "linewidth": 2}
     for mark, text in ENDS.items():
-        occurs = any(mark in row.marks for row in rows)
-        marks.append((occurs, text, {"marker": mark, "color": INK, "linewidth": 0, "markersize": 6}))
-    handles = {text: Line2D([], [], **look) for occurs, text, look in marks if occurs}
+        if any(mark in row.marks for row in rows):
+            marks[text] = {"marker": mark, "color": INK, "linewidth": 0, "markersize": 6}
     above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "bbox_transform": axes.transAxes}
-    axes.add_artist(Legend(axes, list(handles.values()), list(handles), ncols=6, borderaxespad=0.2, **above))
+    handles = [Line2D([], [], **look) for look in marks.values()]
+    axes.add_artist(Legend(axes, handles, list(marks), ncols=6, borderaxespad=0.2, **above))
 
 
 # -- few agents: charts ---------------------------------------------------------------------------
@@ -248,18 +243,17 @@ def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> No
 
 def _draw_charts(rows: Sequence[TimelineRow], make: Callable[..., Any], begin: float, end: float) -> list[list[Any]]:
     """Draw charts of the actions and one of the rewards for each agent; return them as one column."""
-    numbers = [min(len(row.parts), DRAWN) for row in rows]
-    heights = [height for number in numbers for height in [1.0] * number + [0.6]]
-    figure = make(9.5, 0.9 + sum(0.75 + 0.95 * number for number in numbers))
+    parts = [list(dict.fromkeys(own.part for own in row.actions.values()))[:DRAWN] for row in rows]
+    heights = [height for own in parts for height in [1.0] * len(own) + [0.6]]
+    figure = make(9.5, 0.9 + sum(0.75 + 0.95 * len(own) for own in parts))
     column = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0].tolist()
     remaining = iter(column)
-    for row, number in zip(rows, numbers, strict=True):
-        *charts, rewards = islice(remaining, number + 1)
-        for axes, part in zip(charts, row.parts, strict=False):
+    for row, own in zip(rows, parts, strict=True):
+        *charts, rewards = islice(remaining, len(own) + 1)
+        for axes, part in zip(charts, own, strict=True):
             _chart_actions(axes, row, part)
-        charts[0].set_title(
-            row.agent if title_of(row.key) in ("", row.agent) else f"{row.agent}  ({title_of(row.key)})"
-        )
+        title = title_of(row.key)
+        charts[0].set_title(row.agent if title in ("", row.agent) else f"{row.agent}  ({title})")
         rewards.vlines(row.times, 0.0, row.rewards, color=INK, linewidth=1.4 if len(row.times) <= 150 else 0.7)
         rewards.axhline(0.0, color=PALE, linewidth=0.8, zorder=1)
         rewards.set_ylabel("reward")
@@ -275,12 +269,14 @@ def _draw_charts(rows: Sequence[TimelineRow], make: Callable[..., Any], begin: f
     return [column]
 
 
-def _chart_actions(axes: Axes, row: TimelineRow, part: _Part) -> None:
-    """Draw a line for each component of the actions, with a dot for each decision."""
+def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
+    """Draw a line for each component of a part of the actions, with a dot for each decision."""
     hollow: dict[str, Any] = {"color": "white", "linewidths": 0.9, "zorder": 3}
     size = 14 if len(row.times) <= 150 else 5
     by_policy, by_rule = row.known & ~row.by_rule, row.known & row.by_rule
-    for name, heights, colour in zip(part.components[:DRAWN], part.values.T.astype(float), COLOURS, strict=False):
+    components = {name: own for name, own in row.actions.items() if own.part == part}
+    for (name, component), colour in zip(list(components.items())[:DRAWN], COLOURS, strict=False):
+        heights = component.values.astype(float)
         line = np.where(row.known, heights, np.nan)
         axes.step(row.times, line, where="post", color=colour, linewidth=0.8, alpha=0.5, zorder=2)
         axes.scatter(row.times[by_policy], heights[by_policy], size, **hollow | {"color": colour}, label=name)
@@ -288,14 +284,15 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: _Part) -> None:
     if not row.known.all():  # their heights are unknown
         times, ground = row.times[~row.known], axes.get_xaxis_transform()
         axes.scatter(times, np.full(len(times), 0.04), 12, edgecolors=UNKNOWN, transform=ground, **hollow)
-    axes.set_ylabel(part.name or "action")
-    low, high = part.limits
+    axes.set_ylabel(part or "action")
+    first = next(iter(components.values()))  # all of them have the same labels and limits
+    low, high = first.limits
     margin = 0.12 * (high - low or 1.0)
     axes.set_ylim(low - margin, high + margin)
-    if part.labels is not None:
-        axes.set_yticks(list(part.labels), list(part.labels.values()))
-    if len(part.components) > 1:
-        more = len(part.components) - DRAWN
+    if first.labels is not None:
+        axes.set_yticks(list(first.labels), list(first.labels.values()))
+    if len(components) > 1:
+        more = len(components) - DRAWN
         beside: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.05), "handletextpad": 0.1}
         axes.legend(title=f"and {more} more" if more > 0 else None, fontsize=8, title_fontsize=8, **beside)
 
@@ -305,13 +302,20 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: _Part) -> None:
 
 def _draw_panels(panels: list[list[TimelineRow]], make: Callable[..., Any], component: str | None) -> list[list[Any]]:
     """Draw a row for each agent, coloured by its actions and by its rewards; return the axes in two columns."""
-    components = _components(panels, component)
+    every = dict.fromkeys(name for rows in panels for name in rows[0].actions)
+    if component is not None and component not in every:
+        raise OptionValueError(
+            f"no action has a component {short_repr(component)}; there are {', '.join(map(repr, every))}"
+            f"{did_you_mean(component, every)}"
+        )
     heights = np.clip([0.16 * len(rows) for rows in panels], 1.2, 6.0)
     heights = np.maximum(1.2, heights * min(1.0, 9.0 / heights.sum()))
     figure = make(11.0, 1.0 + 0.3 * len(panels) + heights.sum())
     grid = figure.subplots(len(panels), 2, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
-    for (left, right), rows, (number, place) in zip(grid, panels, components, strict=True):
-        _colour_actions(left, rows, number, place)
+    for (left, right), rows in zip(grid, panels, strict=True):
+        names = list(rows[0].actions)
+        name = component if component in names else names[0]
+        _colour_actions(left, rows, name)
         _colour_rewards(right, rows)
         points = 72 * left.get_window_extent().height / figure.dpi / len(rows)  # the height of a row
         size = float(np.clip(0.8 * points, 1.5, 6.0))
@@ -325,27 +329,11 @@ def _draw_panels(panels: list[list[TimelineRow]], make: Callable[..., Any], comp
         left.set_yticks(range(0, len(rows), step), [row.agent for row in rows[::step]])
         left.set_ylim(len(rows) - 0.4, -0.6)
         title = title_of(rows[0].key) if len({row.key for row in rows}) == 1 else ""
-        names = [name for part in rows[0].parts for name in part.components]
-        what = f"action {rows[0].parts[number].components[place]}, one of {len(names)}" if len(names) > 1 else "action"
+        what = f"action {name}, one of {len(names)}" if len(names) > 1 else "action"
         left.set_title(f"{title}, {len(rows)} agents: {what}".removeprefix(", "))
         right.set_title("reward")
     columns: list[list[Any]] = grid.T.tolist()
     return columns
-
-
-def _components(panels: list[list[TimelineRow]], component: str | None) -> list[tuple[int, int]]:
-    """Return the part and its column by which the rows of each panel are coloured."""
-    places = [
-        {name: (number, place) for number, part in enumerate(parts) for place, name in enumerate(part.components)}
-        for parts in (rows[0].parts for rows in panels)
-    ]
-    names = dict.fromkeys(name for own in places for name in own)
-    if component is not None and component not in names:
-        raise OptionValueError(
-            f"no action has a component {short_repr(component)}; there are {', '.join(map(repr, names))}"
-            f"{did_you_mean(component, names)}"
-        )
-    return [own.get(component or "", (0, 0)) for own in places]
 
 
 def _cells(rows: Sequence[TimelineRow], *, slim: bool) -> NDArray[np.float64]:
@@ -372,27 +360,26 @@ def _colour(axes: Axes, cells: NDArray[np.float64], **colours: Any) -> Any:
     return axes.add_collection(PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours))
 
 
-def _colour_bar(axes: Axes, scale: Any, extend: str) -> Any:
+def _colour_bar(axes: Axes, scale: Any, extend: str) -> None:
     """Draw the scale of colours beside axes."""
     bar = axes.figure.colorbar(scale, ax=axes, extend=extend, fraction=0.04, pad=0.01, aspect=30)
     bar.outline.set_visible(False)
-    return bar
 
 
-def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], number: int, place: int) -> None:
-    """Colour the decisions by a component of their actions: its part, and its column in it."""
+def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
+    """Colour the decisions by a component of their actions."""
     from matplotlib.patches import Patch
 
-    parts = [row.parts[number] for row in rows]
-    values = np.concatenate([part.values[:, place] for part in parts])
+    components = [row.actions[name] for row in rows]
+    values = np.concatenate([own.values for own in components])
     known = np.concatenate([row.known for row in rows])
     _colour(axes, _cells(rows, slim=False), facecolors="white")  # white while the agent lives
     cells = _cells(rows, slim=True)
     if not known.all():
         _colour(axes, cells[~known], facecolors=UNKNOWN)
-    labels = {value: label for part in parts for value, label in (part.labels or {}).items()}
+    labels = {value: label for own in components for value, label in (own.labels or {}).items()}
     if not 0 < len(labels) <= NAMED:
-        limits = min(part.limits[0] for part in parts), max(part.limits[1] for part in parts)
+        limits = min(own.limits[0] for own in components), max(own.limits[1] for own in components)
         scale = _colour(axes, cells[known], array=values[known].astype(float), cmap="viridis", clim=limits)
         _colour_bar(axes, scale, "neither")
         return
@@ -410,9 +397,7 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     rewards = np.concatenate([row.rewards for row in rows])
     # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
-    low, high = rewards.min(), rewards.max()
-    extend = ("neither", "min", "max", "both")[int(low < -most) + 2 * int(high > most)]
+    extend = ("neither", "min", "max", "both")[int(rewards.min() < -most) + 2 * int(rewards.max() > most)]
     colours = LinearSegmentedColormap.from_list("reward", REWARDS)
     scale = _colour(axes, _cells(rows, slim=False), array=rewards, cmap=colours, clim=(-most, most))
-    bar = _colour_bar(axes, scale, extend)
-    bar.ax.set_ylim(-most if low < 0 else 0.0, most if high > 0 or low == 0 else 0.0)
+    _colour_bar(axes, scale, extend)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
-from .evaluation import check_metric, check_probability, interval, numbers
+from .evaluation import check_metric, check_probability, interval, is_proportion, numbers
 from .runner import RUN_COLUMNS, TEAM
 
 if TYPE_CHECKING:
@@ -31,7 +31,8 @@ class Effects:
 
     Attributes:
         main: One row for each level of each factor, the index: ``mean`` (of the value at this level), the bounds of its
-            interval ``low`` and ``high``, ``effect`` (the mean minus the mean of all), and ``count``.
+            interval ``low`` and ``high`` (as ``Evaluation.summary`` has them, nan where nothing is known), ``effect``
+            (the mean minus the mean of all), and ``count``.
         interactions: One row for each pair of factors, the strongest first. ``strength`` is the standard deviation of
             the differences between the means of their combinations and the sum of both main effects.
         metric: The name of the value.
@@ -58,14 +59,7 @@ class Effects:
     def plot(self, *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw the main effects of all factors and, below them, the strongest interactions.
 
-        Args:
-            figure: The figure to draw in. None: a new figure.
-
-        Returns:
-            The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
-
-        Raises:
-            MissingExtraError: Matplotlib is missing.
+        ``figure`` and the result are as in ``plot_timeline``.
         """
         from .figures import draw_effects
 
@@ -111,13 +105,15 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    main = []
+    main, zero_or_one = [], is_proportion(table[metric])
     for codes, own in coded.values():
         for code in range(len(own)):
             here = values[codes == code]
             by_seed = here.groupby(table["seed"].to_numpy()[codes == code]).mean()
             sample = by_seed if len(by_seed) > 1 else here
-            main.append([here.mean(), *interval(sample.to_numpy(), confidence), here.mean() - values.mean(), len(here)])
+            proportion = zero_or_one and len(sample) == len(here)  # not means of several runs
+            low, high, _ = interval(sample.to_numpy(), confidence, proportion=proportion)
+            main.append([here.mean(), low, high, here.mean() - values.mean(), len(here)])
     index = pandas.MultiIndex.from_tuples(
         [(name, level) for name, own in levels.items() for level in own], names=["factor", "level"]
     )
@@ -196,9 +192,9 @@ def sobol_indices(
     Args:
         frame: The result of ``run_experiment`` for ``design(..., method="saltelli")``. The value of a row is its mean
             over the seeds.
-        metric: The value: ``"return"``, ``"length"`` or the name of a metric.
-        contender: The contender whose runs are used.
-        agent: The agent whose rows are used. Default: the team.
+        metric: As ``effects`` takes it.
+        contender: As ``effects`` takes it.
+        agent: As ``effects`` takes it.
         confidence: The confidence level of the error bounds.
 
     Returns:

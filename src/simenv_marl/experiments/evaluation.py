@@ -1,12 +1,11 @@
 """Compares contenders on the same seeds, with confidence intervals."""
 
-import warnings
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import inf, isfinite, nan
-from typing import TYPE_CHECKING, Any, Final, Unpack
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +41,6 @@ __all__ = ["Evaluation", "evaluate"]
 FIRST: Final = 16
 """The number of seeds before the first check of the intervals' width: intervals of fewer seeds are unreliable."""
 
-RESAMPLES: Final = 5_000
-"""The number of bootstrap samples for an interval; always the same samples, for reproducible intervals."""
-
-CORRECTED: Final = 10_000
-"""The largest number of values with bias correction: it needs one mean per value, and has no effect on more values."""
-
-AT_ONCE: Final = 4_000_000
-"""The number of values that are drawn at once."""
-
 MOST_SEEDS: Final = 10_000_000
 """A difference that needs more seeds than this counts as none."""
 
@@ -79,6 +69,9 @@ class Evaluation:
         values = self.values()
         return f"<Evaluation: {', '.join(values.columns)} on {len(values)} seeds>"
 
+    def __str__(self) -> str:
+        return f"{self!r}\n{self.summary().to_string()}"
+
     def values(self, metric: str = "return") -> "DataFrame":
         """Return the team's values: one row for each seed, one column for each contender."""
         check_metric(metric, self.frame.columns)
@@ -90,20 +83,30 @@ class Evaluation:
     def summary(self, metric: str = "return") -> "DataFrame":
         """Return the mean of the team's values for each contender, with its confidence interval.
 
+        Intervals are by Student's t; those of bools, and of numbers that are all 0 or 1, by Wilson's score.
+
         Returns:
             A table indexed by contender, with the columns ``mean``, ``low`` and ``high``. With a baseline also
             ``difference``, ``difference_low`` and ``difference_high``: the mean paired difference from the baseline on
-            the same seeds.
+            the same seeds. Bounds of which nothing is known are nan; the column ``note``, which is there only then,
+            says why.
         """
-        values = self._numbers(metric)
-        columns = ["mean", "low", "high"]
-        rows = {name: [own.mean(), *interval(own, self.confidence)] for name, own in values.items()}
+        values = self.values(metric)
+        columns, rows, notes = ["mean", "low", "high"], {}, {}
+        proportion = is_proportion(values)
+        for name, own in numbers(values, metric).items():
+            sample = own.to_numpy()
+            low, high, notes[name] = interval(sample, self.confidence, proportion=proportion)
+            rows[name] = [sample.mean(), low, high]
         if self.baseline is not None:
             columns += ["difference", "difference_low", "difference_high"]
-            for name, own in values.items():
-                difference = own - values[self.baseline]
-                rows[name] += [difference.mean(), *interval(difference, self.confidence)]
-        return _by_contender(rows, columns)
+            for name, difference in self._differences(metric).items():
+                low, high, note = interval(difference, self.confidence)
+                rows[name] += [difference.mean(), low, high]
+                notes[name] = notes[name] or (note and f"differences: {note}")
+            rows[self.baseline] += [0.0] * 3
+        table = _by_contender(rows, columns)
+        return table.assign(note=notes) if any(notes.values()) else table
 
     def improvement(self, metric: str = "return") -> "DataFrame":
         """Estimate the probability that a contender has a higher value than the baseline on a seed. Ties count half.
@@ -116,14 +119,15 @@ class Evaluation:
         """
         rows = {}
         for name, difference in self._differences(metric).items():
-            better = np.where(np.isnan(difference), nan, (np.sign(difference) + 1) / 2)
-            rows[name] = [better.mean(), *interval(better, self.confidence)]
+            better = (np.sign(difference) + 1) / 2  # nan where a value is missing
+            low, high, _ = interval(better, self.confidence, proportion=not (difference == 0).any())
+            rows[name] = [better.mean(), *np.clip([low, high], 0.0, 1.0)]
         return _by_contender(rows, ["probability", "low", "high"])
 
     def seeds_needed(self, difference: float, *, power: float = 0.8, metric: str = "return") -> "Series[float]":
         """Estimate the number of seeds that would detect a difference from the baseline.
 
-        The estimate uses the variance on the present seeds.
+        The estimate is that of the paired t-test, at ``confidence``, with the variance on the present seeds.
 
         Args:
             difference: The mean difference to detect.
@@ -131,8 +135,7 @@ class Evaluation:
             metric: The name of the value.
 
         Returns:
-            The number of seeds by contender (by the paired t-test, at ``confidence``); infinity if no number of seeds
-            is large enough.
+            The number of seeds by contender; infinity if no number is large enough, nan if the variance is unknown.
 
         Raises:
             OptionValueError: There is no baseline, or an argument has an invalid value.
@@ -141,24 +144,14 @@ class Evaluation:
         check_probability("power", power, 0.8)
         if difference == 0:
             raise OptionValueError("difference must not be 0: no number of seeds is enough to detect that")
-        rows = {
-            name: [seeds_needed(own, difference, self.confidence, power)]
-            for name, own in self._differences(metric).items()
-        }
+        differences = self._differences(metric)
+        rows = {name: [seeds_needed(own, difference, self.confidence, power)] for name, own in differences.items()}
         return _by_contender(rows, ["seeds"])["seeds"]
 
     def plot(self, metric: str = "return", *, figure: "Figure | SubFigure | None" = None) -> "Figure | SubFigure":
         """Draw each seed as a line across the contenders and, with a baseline, the difference on each seed.
 
-        Args:
-            metric: The name of the value.
-            figure: The figure to draw in. None: a new figure.
-
-        Returns:
-            The figure. A notebook shows a new figure that is the last value of a cell; ``savefig`` saves it.
-
-        Raises:
-            MissingExtraError: Matplotlib is missing.
+        ``figure`` and the result are as in ``plot_timeline``.
         """
         from .figures import draw_evaluation
 
@@ -167,23 +160,18 @@ class Evaluation:
         )
         return result
 
-    def _numbers(self, metric: str) -> dict[str, NDArray[np.float64]]:
-        """Return the team's values by contender, in the order of the seeds."""
-        return {name: own.to_numpy() for name, own in numbers(self.values(metric), metric).items()}
-
     def _differences(self, metric: str) -> dict[str, NDArray[np.float64]]:
-        """Return the differences from the baseline, by other contender."""
+        """Return the differences from the baseline, by other contender, in the order of the seeds."""
         if self.baseline is None:
             raise OptionValueError("there is no baseline to compare with; give evaluate a baseline=")
-        values = self._numbers(metric)
-        base = values.pop(self.baseline)
-        return {name: own - base for name, own in values.items()}
+        values = numbers(self.values(metric), metric)
+        differences = values.sub(values[self.baseline], axis=0).drop(columns=self.baseline)
+        return {name: own.to_numpy() for name, own in differences.items()}
 
     def _widest(self) -> float:
         """Return the width of the widest interval of a difference or, without a baseline, of a mean; nan if unknown."""
-        samples = self._numbers("return") if self.baseline is None else self._differences("return")
-        bounds = [interval(own, self.confidence) for own in samples.values()]
-        return float(np.max([high - low for low, high in bounds], initial=0.0))
+        summary, prefix = self.summary(), "" if self.baseline is None else "difference_"
+        return float((summary[f"{prefix}high"] - summary[f"{prefix}low"]).max(skipna=False))
 
 
 def _by_contender(rows: Mapping[str, Iterable[float]], columns: list[str]) -> "DataFrame":
@@ -212,12 +200,11 @@ def evaluate(
     """Evaluate contenders on the same seeds.
 
     Args:
-        simulation: A simulation (which is copied for each seed), its class, a zero-argument factory, or a ``Variant``.
+        simulation: As ``simulate_many`` takes it.
         contenders: A dict from the name of a contender to its policies, as ``simulate`` takes them. ``{}`` is the model
-            as it is.
+            as it is. Agents without a policy follow their rule, and have returns like all others.
         seeds: The seeds of the simulations, all different.
-        points: The decision points, as ``generate_env`` takes them. Agents without a policy of the contender follow
-            their rule, and have returns like all others.
+        points: As ``simulate_many`` takes them.
         baseline: The contender that the others are compared with.
         metric: A callable of the simulation after its end, whose column is ``metric``, or a dict from column to
             callable. A metric returns a number, a string or None.
@@ -229,9 +216,9 @@ def evaluate(
             at most this wide; ``seeds`` are then the seeds that may be used. The width is checked from 16 seeds on, at
             growing distances.
         batched: Whether the policies are those of ``simulate_many``, which answer many decisions at once.
-        batch_size: The largest number of simulations that are suspended together, if ``batched``.
-        workers: The number of worker processes: see ``simulate_many``.
-        progress: Whether to show a progress bar, by ``tqdm``.
+        batch_size: As ``simulate_many`` takes it, if ``batched``.
+        workers: As ``simulate_many`` takes them.
+        progress: As ``simulate_many`` takes it.
         **options: The options of ``simulate``.
 
     Returns:
@@ -299,7 +286,7 @@ def _run_part(simulation: Any, runner: Runner, name: str, seeds: list[int], plan
 
 
 def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
-    """Check arguments that ``run_experiment`` does not have."""
+    """Check the arguments that ``run_experiment`` does not have."""
     if not contenders:
         raise OptionValueError("contenders must be a dict, such as {'rule': {}}, but there are none")
     if baseline is not None and baseline not in list(contenders):
@@ -334,38 +321,41 @@ def numbers(values: Any, metric: str) -> Any:
         raise OptionValueError(f"metric={short_repr(metric)} is not a column of numbers") from None
 
 
-def interval(values: NDArray[np.float64], confidence: float) -> tuple[float, float]:
-    """Return a confidence interval of the mean, by SciPy's bootstrap (BCa, or percentile for very many values).
+def is_proportion(values: Any) -> bool:
+    """Return whether the values of a ``DataFrame`` or ``Series`` are bools, or 0 and 1 alone, of which both occur."""
+    if values.to_numpy().dtype == np.bool_:
+        return True
+    return set(np.unique(values.dropna())) == {0, 1}
 
-    The bounds are nan if there are fewer than two values, or one that is not finite.
-    """
-    stats = import_extra("scipy.stats", "an interval")
-    if len(values) < 2 or not np.isfinite(values).all():
-        return nan, nan
-    if (values == values[0]).all():
-        return float(values[0]), float(values[0])
-    batch = max(1, min(500, AT_ONCE // len(values)))
-    for method in ("BCa", "percentile")[len(values) > CORRECTED :]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about degenerate samples, which the other method handles
-            bounds = stats.bootstrap(
-                (values,), np.mean, confidence_level=confidence, n_resamples=RESAMPLES, batch=batch, method=method,
-                vectorized=True, rng=np.random.default_rng(0),
-            ).confidence_interval  # fmt: skip
-        low, high = float(bounds.low), float(bounds.high)
-        if isfinite(low) and isfinite(high):
-            break
-    return low, high
+
+class Interval(NamedTuple):
+    """A confidence interval. Bounds of which nothing is known are nan, and ``note`` says why."""
+
+    low: float
+    high: float
+    note: str = ""
+
+
+def interval(values: NDArray[np.float64], confidence: float, *, proportion: bool = False) -> Interval:
+    """Return a confidence interval of the mean: by Student's t or, of a proportion, by Wilson's score."""
+    stats, number = import_extra("scipy.stats", "an interval"), len(values)
+    if number < 2:
+        return Interval(nan, nan, "a single value")
+    if not np.isfinite(values).all():
+        return Interval(nan, nan, "a value is missing or not finite")
+    if proportion:
+        bounds = stats.binomtest(round(values.sum()), number).proportion_ci(confidence, method="wilson")
+        return Interval(float(bounds.low), float(bounds.high))
+    if np.ptp(values) <= 1e-12 * np.abs(values).max():  # they differ by rounding errors at most
+        return Interval(nan, nan, "all are equal")
+    low, high = stats.t.interval(confidence, number - 1, values.mean(), stats.sem(values))
+    return Interval(float(low), float(high))
 
 
 def seeds_needed(differences: NDArray[np.float64], difference: float, confidence: float, power: float) -> float:
-    """Return the number of seeds that detects a mean difference, by the paired t-test.
-
-    The number is infinity if it is too large, and nan if there are fewer than two differences on present seeds, which
-    give the variance.
-    """
+    """Return the number of seeds that detects a mean difference: see ``Evaluation.seeds_needed``."""
     stats = import_extra("scipy.stats", "the number of seeds")
-    if len(differences) < 2 or not np.isfinite(differences).all():
+    if interval(differences, confidence).note:
         return nan
     ratio = float(np.std(differences, ddof=1)) / abs(difference)
 

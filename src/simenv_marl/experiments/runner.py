@@ -48,11 +48,7 @@ class Outcome(NamedTuple):
 
 
 class Returns(tuple[float, ...]):
-    """The returns of an episode's agents: a tuple of numbers, for ``sum`` and ``max``, and a mapping by agent.
-
-    Example:
-        ``returns["waterer_0"]``, ``returns.get("waterer_0", 0.0)``, ``min(returns)``, ``returns.items()``
-    """
+    """The returns of an episode's agents: a tuple of numbers, for ``sum`` and ``max``, and a mapping by agent."""
 
     _by_agent: dict[str, float]
 
@@ -180,26 +176,15 @@ def make_runner(
 
 @dataclass(frozen=True)
 class Runner:
-    """Runs episodes of contenders. Workers get a copy.
-
-    Attributes:
-        contenders: By name, the policies of each contender.
-        points: The decision points, as ``generate_env`` takes them.
-        policy_points: The points that policies name. They are used if the points are not known otherwise.
-        options: The options of the episodes.
-        metrics: By name, callables of a simulation after its end.
-        team: A callable that combines the returns of an episode. None: their sum.
-        batch_size: The largest number of simulations that are suspended together, if policies answer many decisions at
-            once. 0: they answer one decision at a time.
-    """
+    """Runs episodes of contenders, with arguments of ``evaluate``. Workers get a copy."""
 
     contenders: Mapping[str, Policies]
     points: Any
-    policy_points: Sequence[Any]
+    policy_points: Sequence[Any]  # the points that policies name; they are used if the points are not known otherwise
     options: Mapping[str, Any]
     metrics: Mapping[str, Callable[[Any], Any]]
     team: Callable[[Returns], Any] | None
-    batch_size: int
+    batch_size: int  # 0 if policies answer one decision at a time
 
     def plan(self, simulation: Any, contender: str) -> Plan:
         """Return the plan of a contender's episodes. All agents whose rewards count decide in it."""
@@ -233,9 +218,7 @@ class Runner:
             run(plan, seeds, self.batch_size, finish, tally)
             return
         for place, seed in enumerate(seeds):
-            with noting(f"while the simulation was made; seed {seed}"):
-                session = Session(plan)
-            _run_alone(session, seed, place, finish, tally)
+            _run_alone(plan, seed, place, finish, tally)
 
     def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
         """Return agent, return, length and metrics for each agent and for the team."""
@@ -248,34 +231,38 @@ class Runner:
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
 
 
-def _run_alone(session: Session, seed: int, place: int, finish: Callable[..., Any], tally: Tally) -> None:
+def _run_alone(plan: Plan, seed: int, place: int, finish: Callable[..., Callable[[], None]], tally: Tally) -> None:
     """Run an episode whose policies answer one decision at a time."""
+    with noting(f"while the simulation was made; seed {seed}"):
+        session = Session(plan)
     try:
         with outside_simulation():
             episode = session.start(seed, None)
-            own_random = session.plan.options.global_rng
             tally.moved(episode)
-            while (agent := episode.pending) is not None:
-                tally.count(place, agent)
-                if agent.is_planner:
-                    agent.consultations += 1
-                try:
-                    with episode.context() if own_random else nullcontext():
-                        action = agent.policy(agent.observation, agent.info)
-                except BaseException as error:
-                    episode.fail(error)
-                    raise
-                episode.step(action)
+            while episode.pending is not None:
+                tally.count(place, episode.pending)
+                episode.step(_ask(episode, episode.pending))
                 tally.moved(episode)
             session.end()
             with noting(f"after the simulation's end; seed {seed}"):
                 report = finish(place, session.simulation)
+                session.close()
+                report()
     except BaseException as error:
         close_after(error, session.close, "the simulation")
         raise
-    with noting(f"after the simulation's end; seed {seed}"):
-        session.close()
-        report()
+
+
+def _ask(episode: Episode, agent: Agent) -> Any:
+    """Return the action of the policy of the agent that the episode waits for."""
+    if agent.is_planner:
+        agent.consultations += 1
+    try:
+        with episode.context() if episode.plan.options.global_rng else nullcontext():
+            return agent.policy(agent.observation, agent.info)
+    except BaseException as error:
+        episode.fail(error)
+        raise
 
 
 class Tally:
@@ -301,20 +288,14 @@ class Tally:
         """Do nothing: returns do not depend on the answers."""
 
     def moved(self, episode: Episode) -> None:
-        """Add the reward when an episode reaches its next decision or its end: see ``Watcher``."""
-        if episode.pending is not None:
-            self._pay(episode.pending)
-        for agent in episode.just_ended:
-            self._pay(agent)
+        """Add the rewards when an episode reaches its next decision or its end: see ``Watcher``."""
+        paid = [*episode.just_ended, *(episode.agents.values() if episode.over else ())]
         episode.just_ended = []
-        if episode.over:
-            for agent in episode.agents.values():
-                self._pay(agent)
-
-    def _pay(self, agent: Agent) -> None:
-        account = agent.notes
-        if account is not None:
-            account[0] += agent.reward
+        if episode.pending is not None:
+            paid.append(episode.pending)
+        for agent in paid:
+            if agent.notes is not None:
+                agent.notes[0] += agent.reward
 
     def outcome(self, place: int, simulation: Any, metrics: Mapping[str, Callable[[Any], Any]]) -> Outcome:
         """Return the results of an episode that is over."""

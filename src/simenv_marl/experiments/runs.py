@@ -81,18 +81,18 @@ def run_experiment(
         make: A callable that gets the factors of a row as keyword arguments and returns a simulation or a ``Variant``;
             or a ``Variant``, whose parameters the factors become. It is called anew for each run.
         design: One row for each combination of factors, as ``design`` makes it: a ``DataFrame``, or data for one.
-        contenders: Contenders besides ``"rule"``, the model as it is: a dict from a name to policies for ``simulate``.
-        seeds: The seeds of the simulations, all different.
-        points: The decision points, as ``generate_env`` takes them.
+        contenders: As ``evaluate`` takes them. ``"rule"``, the model as it is, is always added.
+        seeds: As ``evaluate`` takes them.
+        points: As ``evaluate`` takes them.
         metric: As ``evaluate`` takes it.
-        team: As ``evaluate`` takes it. None: the sum of the returns.
+        team: As ``evaluate`` takes it.
         store: The folder of the experiment. It is created if it is missing.
-        batched: Whether the policies are those of ``simulate_many``. The seeds of a row then run together.
-        batch_size: The largest number of seeds that run together, if ``batched``.
-        workers: The number of worker processes: see ``simulate_many``. All of them write to the folder.
-        progress: Whether to show a progress bar with the remaining time, by ``tqdm``.
+        batched: As ``evaluate`` takes it. The seeds of a row then run together.
+        batch_size: As ``evaluate`` takes it.
+        workers: As ``evaluate`` takes them. All of them write to the folder.
+        progress: As ``evaluate`` takes it. The bar shows the remaining time.
         retry_errors: Whether failed runs are repeated.
-        **options: The options of ``simulate``.
+        **options: As ``evaluate`` takes them.
 
     Returns:
         One row for each agent of each run, and one for the team (``agent`` is ``"team"``), in the order of the design,

@@ -83,18 +83,16 @@ class Store:
         """
         header = self.folder / HEADER
         try:
-            if not header.exists():
-                others = self.folder.iterdir() if self.folder.exists() else ()
-                strange = any(not path.name.startswith((HEADER, ".")) for path in others)
-                if strange and not header.exists():  # another process may have written it meanwhile
+            found = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
+            if not header.exists():  # checked after the others were listed: another process may be writing both
+                if any(not name.startswith((HEADER, ".")) for name in found):
                     raise OptionValueError(f"the folder {self.folder} is not empty, and not the store of an experiment")
-            content = json.loads(header.read_bytes()) if header.exists() else None
+                return False
+            content = json.loads(header.read_bytes())
         except OSError as error:
             raise self._unusable(error) from error
         except json.JSONDecodeError as error:
             raise StoreError(f"{header} cannot be read: {error}") from error
-        if content is None:
-            return False
         if not isinstance(content, dict) or content.get("simenv_marl") != VERSION:
             raise OptionValueError(f"{header} was not written by this version of simenv_marl")
         for what, names in (("factors", self.factors), ("metrics", self.metrics)):

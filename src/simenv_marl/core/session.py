@@ -67,7 +67,7 @@ class Session:
     """
 
     __slots__ = (
-        "__weakref__", "_driver", "_installed", "_np_random", "_plan_of_simulation", "_reset", "_rng",
+        "__weakref__", "_driver", "_given_up", "_installed", "_np_random", "_plan_of_simulation", "_reset", "_rng",
         "_was_reset", "episode", "lock", "np_random_seed", "options", "plan", "seed", "simulation", "state",
     )  # fmt: skip
 
@@ -85,6 +85,7 @@ class Session:
         self.np_random_seed: int | None = None
         self._np_random: np.random.Generator | None = None
         self._was_reset = False  # and not closed since
+        self._given_up = False  # whether the simulation refused to unwind on an earlier stack
         self._plan_of_simulation: tuple[Plan, Any, Plan] | None = None
         self._installed: Installation | None = None
         self._driver: Driver | None = None
@@ -119,6 +120,7 @@ class Session:
         before = self._driver
         if before is None or not before.usable:
             if before is not None:
+                self._given_up = self._given_up or before.given_up is not None
                 before.end()  # first, so that an interrupt cannot leave an unknown stack behind
             # With ``global_rng`` each step must enter the simulation's own generators, and so is never direct.
             self._driver = DRIVERS[self.plan.options.driver](
@@ -214,8 +216,9 @@ class Session:
         else:
             self._np_random, self.np_random_seed = None, seed  # made when a seed must be drawn
         self.seed = seed
-        if self._driver is not None and self._driver.given_up is not None:
+        if self._given_up or (self._driver is not None and self._driver.given_up is not None):
             self._make_simulation()  # code that still uses the old one must not meet another episode
+            self._given_up = False
         context = copy_context()
         check = None if self._rng is not None else draws_check(self.simulation, in_thread=self.lock is not None)
         try:

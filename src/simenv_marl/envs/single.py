@@ -30,33 +30,15 @@ class SimulationEnv(OneAgentView):
     _own: Any = None  # its agent during an episode
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan.
-
-        Args:
-            plan: The plan.
-            session: The simulation to use. None: a new one.
-
-        Raises:
-            ViewError: There is not exactly one active agent, or its name is unknown until it decides.
-            SimEnvError: Something else in the plan cannot work.
-        """
+        """Make the environment of a plan: see ``View``."""
         super().__init__(plan, session)
         self._agent = str(plan.one_agent)
         if self._session.episode is not None:
             self._own = self._session.episode.agent(self._agent)
 
-    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        definition = self._plan.active[0].definition
-        return copy.deepcopy((definition.observation_space, definition.action_space))
-
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Check that a plan allows this view.
-
-        Raises:
-            UnknownOptionError: An option is given that only another view takes.
-            ViewError: The plan does not allow the view.
-        """
+        """Check that a plan allows this view: see ``View``."""
         super().check(plan)
         if plan.one_agent is None:
             points = ", ".join(point.point.name for point in plan.active)
@@ -65,28 +47,6 @@ class SimulationEnv(OneAgentView):
                 f" agent; active are {points}. Name the agent with agent=, name one point in points=, answer the"
                 " others with policies=, or use aec_env"
             )
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the simulation and run it to its first decision.
-
-        Args:
-            seed: The seed for the environment's generator, its spaces, and the simulation's ``reset``. None: the
-                simulation gets a seed from the environment's generator.
-            options: Options for the simulation's ``reset``, if it takes them.
-
-        Returns:
-            The observation and the info.
-
-        Raises:
-            NoDecisionError: The simulation ended without a decision.
-            BaseException: Any exception of the model, a mapping or a policy.
-        """
-        with self._session.exclusive():
-            self._own = own = self._start(seed, options).agent(self._agent)
-            assert own is not None
-            if self._shows:
-                self.render()
-            return own.observation, own.info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision and run to the next one.
@@ -117,18 +77,26 @@ class SimulationEnv(OneAgentView):
             return own.observation, own.reward, True, False, own.info
         return own.observation, own.reward, episode.terminated, episode.truncated, own.info
 
-    def _legal(self, episode: Episode) -> list[Any]:
+    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        definition = self._plan.active[0].definition
+        return copy.deepcopy((definition.observation_space, definition.action_space))
+
+    def _first_results(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
+        self._own = own = episode.agent(self._agent)
+        assert own is not None
+        return own.observation, own.info
+
+    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
+        return (self._own.observation,)
+
+    def _masks(self, episode: Episode) -> list[Any]:
         mask = self._own.mask
         return [open_mask(self.action_space) if mask is None else mask]
-
-    def _seen(self, episode: Episode) -> tuple[Any, ...]:
-        return (self._own.observation,)
 
     def _resume_from_replay(self) -> None:
         self._own = self._running().agents[self._agent]
 
     def _clear(self) -> None:
-        super()._clear()
         self._own = None
 
 
@@ -140,11 +108,7 @@ class SimulationGoalEnv(SimulationEnv):
     """
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan.
-
-        Raises:
-            SimEnvError: Something in the plan cannot work.
-        """
+        """Make the environment of a plan: see ``View``."""
         self.check(plan)
         self._definition = plan.active[0].definition
         super().__init__(with_goals(plan), session)
@@ -173,23 +137,21 @@ def with_goals(plan: Plan) -> Plan:
 
 
 def _with_goals(definition: Definition) -> Definition:
-    goal_space, observe = definition.goal_space, definition.observation_space_mapping
-    achieved, desired = definition.achieved_goal_mapping, definition.desired_goal_mapping
-    assert goal_space is not None
-    assert achieved is not None
-    assert desired is not None
-
-    parts = {"observation": observe, "achieved_goal": achieved, "desired_goal": desired}
+    parts: dict[str, Any] = {
+        "observation": definition.observation_space_mapping,
+        "achieved_goal": definition.achieved_goal_mapping,
+        "desired_goal": definition.desired_goal_mapping,
+    }
+    asking = {key for key, part in parts.items() if asks_for_simulation(part)}
 
     def observe_with_goals(*args: Any, **kwargs: Any) -> dict[str, Any]:
         return {key: part(*args, **kwargs) for key, part in parts.items()}
-
-    asking = {key for key, part in parts.items() if asks_for_simulation(part)}
 
     def observe_with_simulation(*args: Any, _simulation: Any, **kwargs: Any) -> dict[str, Any]:
         given = {"_simulation": _simulation}
         return {key: part(*args, **kwargs, **given if key in asking else {}) for key, part in parts.items()}
 
+    goal_space: Any = definition.goal_space
     space = spaces.Dict(
         {"observation": definition.observation_space, "achieved_goal": goal_space, "desired_goal": goal_space}
     )

@@ -106,17 +106,16 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no episode, or all agents have taken their final step.
         """
         agent, observation = self._deciding, None
-        if agent is None:
-            if not self._leaving:
-                raise self._session.refusal()
-            name = self.agent_selection
-            if observe:
-                observation = self.observe(name)
-        else:
+        if agent is not None:
             name = agent.name
             if observe:
                 observation = agent.observation
                 observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
+        elif self._leaving:
+            name = self.agent_selection
+            observation = self.observe(name) if observe else None
+        else:
+            raise self._session.refusal()
         return (
             observation,
             self._cumulative_rewards[name],

@@ -127,19 +127,15 @@ def make_view(recipe: str, module: str, view: str, point: str | None = None, **o
     return env if wrapper is None else wrapper(env)
 
 
-def make_vector_view(
-    recipe: str, module: str, view: str, num_envs: int, point: str | None = None, **options: Any
-) -> Any:
+def make_vector_view(recipe: str, module: str, view: str, point: str | None = None, **options: Any) -> Any:
     """Make a vector environment. ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``."""
     known, options = _recipe(recipe, module, view, point, options)
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
     options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
-    return vector_env(known.simulation, known.points, num_envs=num_envs, view=view, **options)
+    return vector_env(known.simulation, known.points, view=view, **options)
 
 
-def _recipe(
-    name: str, module: str, view: str, point: str | None, options: dict[str, Any]
-) -> tuple[_Recipe, dict[str, Any]]:
+def _recipe(name: str, module: str, view: str, point: str | None, options: Any) -> tuple[_Recipe, dict[str, Any]]:
     """Return a recipe, and its options for a view."""
     if name not in _RECIPES and module != "__main__":
         importlib.import_module(module)  # as in a process that has only the spec

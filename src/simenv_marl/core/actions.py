@@ -33,8 +33,8 @@ _SMALL = 16  # up to this many elements, comparing Python floats is faster than 
 def action_check(space: spaces.Space[Any]) -> Check:
     """Make the function that checks actions against a space.
 
-    The function returns ``ILLEGAL`` for an action outside the space, an action of a ``Discrete`` as a Python integer, and
-    a scalar for a one-element ``Box`` unchanged. All other actions are copied, for a ``Box`` in its dtype.
+    The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action of a ``Discrete``,
+    and a scalar for a one-element ``Box`` unchanged. All other actions are copied, for a ``Box`` in its dtype.
     """
     if isinstance(space, spaces.Discrete):
         return _discrete_check(space)
@@ -145,8 +145,8 @@ def _clipped(space: spaces.Space[Any], action: Any) -> Any:
 def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
     """Make the function that casts a mask of the legal actions of an action space.
 
-    The function returns a new np.int8 array of 0 and 1, of shape ``(n,)``, for a ``Discrete``, or a tuple of these for a
-    ``MultiDiscrete``. It raises ``MaskError`` for another shape, for other values, and if no action is legal.
+    The function returns a new np.int8 array of 0 and 1, of shape ``(n,)``, for a ``Discrete``, or a tuple of these for
+    a ``MultiDiscrete``. It raises ``MaskError`` for another shape, for other values, and if no action is legal.
     """
     if isinstance(space, spaces.MultiDiscrete):
         parts = [_mask_of(int(number), space) for number in space.nvec.ravel()]

@@ -139,10 +139,8 @@ class Options:
         known = [field.name for field in fields(self)]
         for name in options:
             if name not in known:
-                listed = ", ".join(known)
-                raise UnknownOptionError(
-                    f"there is no option {name!r}{did_you_mean(name, known)} (the options are {listed})"
-                )
+                hint = did_you_mean(name, known)
+                raise UnknownOptionError(f"there is no option {name!r}{hint} (the options are {', '.join(known)})")
         return replace(self, **options)
 
 

@@ -33,8 +33,7 @@ def provenance(
         A dict of dicts, lists, strings, numbers, bools and None, ready for ``json.dump``:
 
         - ``simulation``: the dotted name of its class or factory;
-        - ``packages``: the versions of the packages of the simulation and its decision points, by name (None if a
-          package has no version);
+        - ``packages``: the versions (or None) of the packages of the simulation and its decision points, by name;
         - ``variant``, ``parameters``: the variant's name and parameters, if there is one;
         - ``points``: the agent of each active decision point, by dotted name (None: named at each call);
         - ``plugins``: the ``handler``, ``target`` and ``position`` of each;

@@ -212,9 +212,6 @@ def blank(space: spaces.Space[Any]) -> Any:
     return sampled.sample()
 
 
-# -- freshness ------------------------------------------------------------------------------------
-
-
 def _calibrate() -> int:
     """Count the references to an array that only the running ``cast`` holds.
 

@@ -82,11 +82,7 @@ class View:
         return [] if plugins is None else plugins.entries
 
     def provenance(self) -> dict[str, Any]:
-        """Return the provenance of this environment, with the seed of its latest episode, ready for ``json.dump``.
-
-        Returns:
-            The dict that ``simenv_marl.experiments.provenance`` describes.
-        """
+        """Return what ``simenv_marl.experiments.provenance`` describes, with the seed of the latest episode."""
         return describe(self._plan, self._session.seed)
 
     @property

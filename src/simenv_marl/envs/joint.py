@@ -30,14 +30,17 @@ class Joint:
         self.roster, self._flatten = dict(roster), flatten
         observations = {name: deepcopy(point.definition.observation_space) for name, point in roster.items()}
         actions = {name: deepcopy(point.definition.action_space) for name, point in roster.items()}
-        self.observation_space: spaces.Space[Any]
-        self.action_space: spaces.Space[Any]
+        self.observation_space: spaces.Space[Any] = spaces.Dict(observations)
+        self.action_space: spaces.Space[Any] = spaces.Dict(actions)
         if flatten:
             self.observation_space = _concatenate(list(observations.values()))
             self.action_space = _concatenate_actions(list(actions.values()))
-            self._places = _places(actions)
-        else:
-            self.observation_space, self.action_space = spaces.Dict(observations), spaces.Dict(actions)
+            self._places: dict[str, int | slice] = {}  # of each agent's action in the flattened one
+            begin = 0
+            for name, space in actions.items():
+                length = space.shape[0] if space.shape else 1
+                self._places[name] = slice(begin, begin + length) if space.shape else begin
+                begin += length
 
     def actions(self, episode: Episode, action: Any) -> dict[str, Any]:
         """Return the actions of the live agents, or raise ``InvalidActionError`` if one is missing."""
@@ -165,7 +168,7 @@ class SimulationJointEnv(OneAgentView):
 
         Raises:
             InvalidActionError: The action is not legal, or lacks an agent. The environment does not change.
-            BaseException: Any other error of ``SimulationEnv.step``.
+            BaseException: Any other error of ``SimulationAECEnv.step``.
         """
         session = self._session
         if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
@@ -213,14 +216,3 @@ def _concatenate_actions(parts: list[Any]) -> spaces.Space[Any]:
     numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in parts]
     starts = [np.atleast_1d(space.start) for space in parts]
     return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))
-
-
-def _places(parts: Mapping[str, spaces.Space[Any]]) -> dict[str, int | slice]:
-    """Return the place of each agent's action in the flattened one."""
-    places: dict[str, int | slice] = {}
-    begin = 0
-    for agent, space in parts.items():
-        length = space.shape[0] if space.shape else 1
-        places[agent] = slice(begin, begin + length) if space.shape else begin
-        begin += length
-    return places

@@ -17,28 +17,26 @@ from .single import SimulationEnv, single_view
 from .vector import SimulationVectorEnv
 from .worker import Recipe
 
-VIEWS: Final = ("aec", "parallel", "single", "joint")
+_CLASSES: Final[dict[str, Any]] = {
+    "aec": SimulationAECEnv,
+    "parallel": SimulationParallelEnv,
+    "single": SimulationEnv,
+    "joint": SimulationJointEnv,
+}
+VIEWS: Final = tuple(_CLASSES)
 
 
 def view_class(plan: Plan, view: str | None) -> Any:
-    """Return the class of one of ``VIEWS``; None: single if one point with one agent is active, else AEC.
-
-    Raises:
-        OptionValueError: There is no such view.
-        ViewError: The plan does not allow it.
-    """
+    """Return the class of a view. None: single if one point with one agent is active, else AEC."""
     if view is None:
         view = "aec" if plan.one_agent is None else "single"
-    if view == "single":
-        return single_view(plan)
-    found: dict[Any, Any] = {"aec": SimulationAECEnv, "parallel": SimulationParallelEnv, "joint": SimulationJointEnv}
-    if not isinstance(view, str) or view not in found:
+    if view not in VIEWS:
         raise OptionValueError(
             f"view must be None or one of {', '.join(map(repr, VIEWS))}, not"
             f" {short_repr(view)}{did_you_mean(view, VIEWS)}"
         )
-    found[view].check(plan)
-    return found[view]
+    _CLASSES[view].check(plan)
+    return single_view(plan) if view == "single" else _CLASSES[view]
 
 
 @explain_arguments

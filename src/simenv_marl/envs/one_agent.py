@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -19,59 +20,39 @@ class OneAgentView(View, gym.Env[Any, Any]):
     """A view with one agent: a Gymnasium environment."""
 
     _agent: str
-    _own_spaces: tuple[spaces.Space[Any], spaces.Space[Any]] | None = None
     _np_random, _np_random_seed = View.np_random, View.np_random_seed  # where Gymnasium's checks look
 
-    @property
-    def observation_space(self) -> spaces.Space[Any]:
+    # The spaces are made on demand, because many simulations side by side may never need them.
+
+    @cached_property
+    def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The observation space. No other environment shares it."""
-        return self._spaces[0]
+        return self._seeded(self._make_spaces()[0])
 
-    @observation_space.setter
-    def observation_space(self, space: spaces.Space[Any]) -> None:
-        self._own_spaces = space, self._spaces[1]
-
-    @property
-    def action_space(self) -> spaces.Space[Any]:
+    @cached_property
+    def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The action space. No other environment shares it."""
-        return self._spaces[1]
+        return self._seeded(self._make_spaces()[1])
 
-    @action_space.setter
-    def action_space(self, space: spaces.Space[Any]) -> None:
-        self._own_spaces = self._spaces[0], space
-
-    @property
-    def _spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        if self._own_spaces is None:  # made on demand, because many simulations side by side may never need them
-            self._own_spaces = self._make_spaces()
-            seed = self._session.np_random_seed
-            if seed is not None and seed >= 0:
-                self._seed_spaces(seed)
-        return self._own_spaces
-
-    def _seed_spaces(self, seed: int) -> None:
-        for space in self._spaces:
+    def _seeded(self, space: spaces.Space[Any]) -> spaces.Space[Any]:
+        seed = self._session.np_random_seed
+        if seed is not None and seed >= 0:
             seed_space(space, seed, self._agent)
+        return space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the simulation and run it to its first decision.
 
-        Args:
-            seed: The seed for the environment's generator, its spaces, and the simulation's ``reset``. None: the
-                simulation gets a seed from the environment's generator.
-            options: Options for the simulation's ``reset``, if it takes them.
+        The arguments and errors are those of ``SimulationAECEnv.reset``.
 
         Returns:
             The observation and the info.
-
-        Raises:
-            NoDecisionError: The simulation ended without a decision.
-            BaseException: Any exception of the model, a mapping or a policy.
         """
         with self._session.exclusive():
             episode = self._start(seed, options)
-            if seed is not None and self._own_spaces is not None:
-                self._seed_spaces(int(seed))
+            for name in ("observation_space", "action_space") if seed is not None else ():
+                if name in vars(self):
+                    self._seeded(vars(self)[name])
             if self._shows:
                 self.render()
             return self._first_results(episode)

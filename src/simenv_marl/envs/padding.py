@@ -67,10 +67,9 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
             actions = {name: action for name, action in actions.items() if name not in absent}
         try:
             results = cast("Results", super().step(actions))
-        except BaseException:
-            if not view.agents:  # the error has ended the episode
+        finally:
+            if not view.agents:  # an error may have ended the episode
                 self.agents = []
-            raise
         return self._padded(results) if results[0] else results  # they are empty after the end of the episode
 
     def _padded(self, results: Results) -> Results:
@@ -113,10 +112,9 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
             return
         try:
             super().step(action)
-        except BaseException:
-            if not cast("AgentsView", self.unwrapped).agents:  # the error has ended the episode
+        finally:
+            if not cast("AgentsView", self.unwrapped).agents:  # an error has ended the episode
                 self.agents = []
-            raise
         self._cumulative_rewards[selected] = 0.0
         self._update()
 

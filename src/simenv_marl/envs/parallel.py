@@ -61,7 +61,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
 
         Raises:
             UnknownAgentError: An action is for an agent that does not live. The environment does not change.
-            Exception: Any error of ``SimulationAECEnv.step``.
+            BaseException: Any error of ``SimulationAECEnv.step``.
         """
         session = self._session
         if session.lock is not None and not session.lock.held:  # the lock also covers reading the results

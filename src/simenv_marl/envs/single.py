@@ -14,7 +14,6 @@ from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import asks_for_simulation
 from ..core.session import Session
-from ..decision import Definition
 from ..errors import ViewError
 from .one_agent import OneAgentView
 
@@ -49,18 +48,13 @@ class SimulationEnv(OneAgentView):
             )
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Answer the pending decision and run to the next one.
-
-        Args:
-            action: An action in the action space, or ``RULE``.
+        """Answer the pending decision with an action, or ``RULE``, and run to the next one.
 
         Returns:
             Observation, reward (a Python float), terminated, truncated, info.
 
         Raises:
-            InvalidActionError: The action is not legal. The environment does not change.
-            ResetNeededError: There is no running episode.
-            BaseException: Any exception of the model, a mapping or a policy.
+            BaseException: Any error of ``SimulationAECEnv.step``.
         """
         session = self._session
         if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
@@ -101,11 +95,7 @@ class SimulationEnv(OneAgentView):
 
 
 class SimulationGoalEnv(SimulationEnv):
-    """A goal-based single view.
-
-    Made if the decision point has a ``goal_space``. Its observation space is a ``Dict`` of ``observation``,
-    ``achieved_goal`` and ``desired_goal``.
-    """
+    """The single view of a point with a goal: a ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``."""
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the environment of a plan: see ``View``."""
@@ -133,10 +123,7 @@ class SimulationGoalEnv(SimulationEnv):
 
 def with_goals(plan: Plan) -> Plan:
     """Return the same plan with goals in the observations of its one decision point."""
-    return plan.redefined(plan.active[0].point, _with_goals(plan.active[0].definition))
-
-
-def _with_goals(definition: Definition) -> Definition:
+    definition = plan.active[0].definition
     parts: dict[str, Any] = {
         "observation": definition.observation_space_mapping,
         "achieved_goal": definition.achieved_goal_mapping,
@@ -151,12 +138,11 @@ def _with_goals(definition: Definition) -> Definition:
         given = {"_simulation": _simulation}
         return {key: part(*args, **kwargs, **given if key in asking else {}) for key, part in parts.items()}
 
-    goal_space: Any = definition.goal_space
-    space = spaces.Dict(
-        {"observation": definition.observation_space, "achieved_goal": goal_space, "desired_goal": goal_space}
-    )
+    goal: Any = definition.goal_space
+    space = spaces.Dict({"observation": definition.observation_space, "achieved_goal": goal, "desired_goal": goal})
     mapping = observe_with_simulation if asking else observe_with_goals
-    return replace(definition, observation_space=space, observation_space_mapping=mapping)
+    changed = replace(definition, observation_space=space, observation_space_mapping=mapping)
+    return plan.redefined(plan.active[0].point, changed)
 
 
 def single_view(plan: Plan) -> type[SimulationEnv]:

@@ -276,6 +276,14 @@ def test_flatten_may_be_registered(register):
     pettingzoo.make("parallel", ids[-1]).reset()
 
 
+@pytest.mark.parametrize("flatten", [False, True])
+def test_flatten_may_be_an_option_of_a_variant_and_of_the_call(register, flatten):
+    ids = register(Variant("flat", Voyage, options={"flatten": True}), flatten=flatten)
+    assert isinstance(made("flat/Joint-v0").action_space, spaces.Box) is flatten
+    made(ids[0]).reset()
+    pettingzoo.make("parallel", ids[-1]).reset()
+
+
 def test_names_of_points_become_camel_case(register):
     @define(agent="ant_0")
     def choose_2nd_route():

@@ -1,7 +1,7 @@
 """Turns a simulation into reinforcement learning environments, without a change to its main loop.
 
-The simulation stays as it is. The functions in which it decides something become the agents of a PettingZoo
-environment, or one of them becomes the agent of a Gymnasium environment::
+The functions in which it decides something become the agents of a PettingZoo environment, or one of them becomes the
+agent of a Gymnasium environment::
 
     from simenv_marl import RULE, aec_env, make_step
 
@@ -47,27 +47,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "RULE",
-    "TRUNCATED",
-    "Definition",
-    "SimEnvError",
-    "SimulationInterface",
-    "SteppedSimulation",
-    "aec_env",
-    "branch",
-    "difference",
-    "evaluate",
-    "generate_env",
-    "joint_env",
-    "make_step",
-    "parallel_env",
-    "register_simulation",
-    "reseed_generators",
-    "simulate",
-    "simulate_many",
-    "single_env",
-    "vector_env",
-]
+    "RULE", "TRUNCATED", "Definition", "SimEnvError", "SimulationInterface", "SteppedSimulation", "aec_env", "branch",
+    "difference", "evaluate", "generate_env", "joint_env", "make_step", "parallel_env", "register_simulation",
+    "reseed_generators", "simulate", "simulate_many", "single_env", "vector_env",
+]  # fmt: skip
 
 ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote", "testing")
 """The modules in which all other public names are."""

@@ -3,8 +3,8 @@
 import importlib
 import re
 import sys
-from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from dataclasses import replace
+from typing import Any, NamedTuple, Unpack
 
 import gymnasium
 import pettingzoo
@@ -18,12 +18,12 @@ from .errors import OptionValueError, UnknownPointError, short_repr
 from .simulation import RULE
 
 
-@dataclass(frozen=True)
-class _Recipe:
+class _Recipe(NamedTuple):
+    """What ``register_simulation`` was given, and the names of the active decision points."""
+
     simulation: Any
     points: Any
     options: dict[str, Any]
-    flatten: bool
     active: list[str]
 
 
@@ -64,26 +64,27 @@ def register_simulation(
         raise OptionValueError(f"name must consist of letters, digits, _ and -, not {short_repr(name)}")
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
-    flatten = options.pop("flatten", False)
     if is_variant and "flatten" in simulation.options:  # an option of the joint view alone
         others = dict(simulation.options)
-        flatten = flatten or others.pop("flatten")
+        options.setdefault("flatten", others.pop("flatten"))
         simulation = replace(simulation, options=others)
     plan = Plan.draw_up(simulation, points, options)
-    where = {"recipe": f"{name}-v{version}", "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
-    _RECIPES[where["recipe"]] = _Recipe(simulation, points, dict(options), flatten, [b.point.name for b in plan.active])
+    recipe = f"{name}-v{version}"
+    where = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
+    _RECIPES[recipe] = _Recipe(simulation, points, dict(options), [point.point.name for point in plan.active])
+    named = [point.point.name for point in plan.active if point.agent is not None or plan.one_agent is not None]
     made: list[str] = []
-    named = [b.point.name for b in plan.active if b.agent is not None or plan.one_agent is not None]
-    for point, title in zip(named, _titles(named), strict=True):
+    single = [(title, {"view": "single", "point": point}) for point, title in zip(named, _titles(named), strict=True)]
+    entry, vector_entry = f"{__name__}:make_view", f"{__name__}:make_vector_view"
+    for title, kwargs in [*single, ("Joint", {"view": "joint"})]:
         made.append(f"{name}/{title}-v{version}")
-        _register_gymnasium(made[-1], {**where, "view": "single", "point": point})
-    made.append(f"{name}/Joint-v{version}")
-    _register_gymnasium(made[-1], {**where, "view": "joint"})
+        gymnasium.registry.pop(made[-1], None)  # it may be registered again, as when a notebook's cell is rerun
+        gymnasium.register(made[-1], entry, vector_entry_point=vector_entry, kwargs=where | kwargs)
     register: Any = getattr(pettingzoo, "register", None)
     if register is not None:  # PettingZoo has a registry since 1.26
         for view in ("aec", "parallel"):
             getattr(pettingzoo, f"{view}_registry", {}).pop(f"{name}/coop-v{version}", None)
-            register(view, f"{name}/coop_v{version}", f"{__name__}:make_view", kwargs={**where, "view": view})
+            register(view, f"{name}/coop_v{version}", entry, kwargs=where | {"view": view})
         made.append(f"{name}/coop_v{version}")
     return made
 
@@ -102,13 +103,6 @@ def _camel(point: str, parts: int) -> str:
     """The last parts of a dotted name in CamelCase."""
     words = [word for part in point.split(".")[-parts:] for word in part.split("_")]
     return "".join(word[:1].upper() + word[1:] for word in words)
-
-
-def _register_gymnasium(identity: str, kwargs: dict[str, Any]) -> None:
-    gymnasium.registry.pop(identity, None)  # it may be registered again, as when a notebook's cell is rerun
-    gymnasium.register(
-        identity, f"{__name__}:make_view", vector_entry_point=f"{__name__}:make_vector_view", kwargs=kwargs
-    )
 
 
 # -- entry points ---------------------------------------------------------------------------------
@@ -133,19 +127,15 @@ def make_view(recipe: str, module: str, view: str, point: str | None = None, **o
     return env if wrapper is None else wrapper(env)
 
 
-def make_vector_view(
-    recipe: str, module: str, view: str, num_envs: int, point: str | None = None, **options: Any
-) -> Any:
+def make_vector_view(recipe: str, module: str, view: str, point: str | None = None, **options: Any) -> Any:
     """Make a vector environment. ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``."""
     known, options = _recipe(recipe, module, view, point, options)
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
     options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
-    return vector_env(known.simulation, known.points, num_envs=num_envs, view=view, **options)
+    return vector_env(known.simulation, known.points, view=view, **options)
 
 
-def _recipe(
-    name: str, module: str, view: str, point: str | None, options: dict[str, Any]
-) -> tuple[_Recipe, dict[str, Any]]:
+def _recipe(name: str, module: str, view: str, point: str | None, options: Any) -> tuple[_Recipe, dict[str, Any]]:
     """Return a recipe, and its options for a view."""
     if name not in _RECIPES and module != "__main__":
         importlib.import_module(module)  # as in a process that has only the spec
@@ -155,7 +145,9 @@ def _recipe(
             f"no simulation is registered as {name!r} in this process; import the module that registers it, or"
             ' make the environment by "module:id"'
         )
-    merged = {**known.options, **({"flatten": known.flatten} if view == "joint" else {}), **options}
+    merged = {**known.options, **options}
+    if view != "joint" and "flatten" not in options:
+        merged.pop("flatten", None)
     if point is not None:
         rules = {other: RULE for other in known.active if other != point}
         merged["policies"] = rules | dict(merged.get("policies") or {})

@@ -33,14 +33,8 @@ _SMALL = 16  # up to this many elements, comparing Python floats is faster than 
 def action_check(space: spaces.Space[Any]) -> Check:
     """Make the function that checks actions against a space.
 
-    The function returns an action of a ``Discrete`` as a Python integer, and a scalar for a one-element ``Box``
-    unchanged. It returns all other actions as copies; those of a ``Box`` have the dtype of the ``Box``.
-
-    Args:
-        space: The action space, of any kind.
-
-    Returns:
-        A function that returns ``ILLEGAL`` for an action outside the space.
+    The function returns ``ILLEGAL`` for an action outside the space, a Python integer for an action of a ``Discrete``,
+    and a scalar for a one-element ``Box`` unchanged. All other actions are copied, for a ``Box`` in its dtype.
     """
     if isinstance(space, spaces.Discrete):
         return _discrete_check(space)
@@ -62,20 +56,16 @@ def _discrete_check(space: spaces.Discrete) -> Check:
 
     def check(action: Any) -> Any:
         if type(action) is not int:
-            scalar = action if isinstance(action, integers) else _scalar(action)
-            if not isinstance(scalar, integers):
+            if isinstance(action, np.ndarray) and action.shape == ():
+                action = action[()]
+            if not isinstance(action, integers):
                 return ILLEGAL
-            action = int(scalar)
+            action = int(action)
         if low <= action < high:
             return action
         return ILLEGAL
 
     return check
-
-
-def _scalar(action: Any) -> Any:
-    """The element of a zero-dimensional array; None for all other values."""
-    return action[()] if isinstance(action, np.ndarray) and action.shape == () else None
 
 
 def _box_check(space: spaces.Box) -> Check:
@@ -118,14 +108,7 @@ def _box_check(space: spaces.Box) -> Check:
 
 
 def clipping_check(space: spaces.Space[Any]) -> Check:
-    """Make the function that clips the parts of actions that belong to a ``Box``, and checks the result.
-
-    Args:
-        space: The action space, of any kind.
-
-    Returns:
-        A function that returns ``ILLEGAL`` for an action that is not in the space even after clipping.
-    """
+    """Make the function that clips the parts of actions that belong to a ``Box``, and checks the result."""
     check, clip = action_check(space), partial(_clipped, space)
 
     def check_clipped(action: Any) -> Any:
@@ -162,12 +145,8 @@ def _clipped(space: spaces.Space[Any], action: Any) -> Any:
 def mask_cast(space: spaces.Space[Any]) -> Callable[[Any], Any]:
     """Make the function that casts a mask of the legal actions of an action space.
 
-    Args:
-        space: A ``Discrete`` (mask of shape ``(n,)``) or ``MultiDiscrete`` (a tuple of masks).
-
-    Returns:
-        A function that returns the mask as new np.int8 arrays of 0 and 1. It raises ``MaskError`` for a mask that
-        has another shape or other values, or that allows no action.
+    The function returns a new np.int8 array of 0 and 1, of shape ``(n,)``, for a ``Discrete``, or a tuple of these for
+    a ``MultiDiscrete``. It raises ``MaskError`` for another shape, for other values, and if no action is legal.
     """
     if isinstance(space, spaces.MultiDiscrete):
         parts = [_mask_of(int(number), space) for number in space.nvec.ravel()]
@@ -221,12 +200,7 @@ def mask_allows(space: spaces.Space[Any], mask: Any, action: Any) -> bool:
 
 
 def only_choice(space: spaces.Space[Any], mask: Any) -> Any:
-    """The only legal action of a space; None if there are several.
-
-    Args:
-        space: The action space.
-        mask: A mask that ``mask_cast`` returned. None: all actions of the space are legal.
-    """
+    """The only action that a mask of ``mask_cast`` allows (None: all are legal); None if there are several."""
     if isinstance(space, spaces.MultiDiscrete):
         parts = open_mask(space) if mask is None else mask
         if any(np.count_nonzero(part) != 1 for part in parts):

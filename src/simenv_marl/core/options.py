@@ -12,18 +12,23 @@ from typing import Any, Literal, TypedDict, TypeVar
 import numpy as np
 from gymnasium import spaces
 
-from ..errors import (
-    OptionValueError,
-    UnknownOptionError,
-    did_you_mean,
-    short_repr,
-)
+from ..errors import OptionValueError, UnknownOptionError, did_you_mean, short_repr
 from ..simulation import RULE
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+_ARGUMENTS = """Args:
+    simulation: A simulation (which every environment copies), its class, a zero-argument factory, or a ``Variant``.
+    points: The active decision points: a dotted name, a decision function, a list of these, or a dict from dotted name
+        or function to its definition. With a dict, the model needs no decorators. None: the simulation's attribute
+        ``points``, else all decorated points, which must then belong to one package."""
+_RAISES = """Raises:
+    SimEnvError: Something cannot work. The subclass tells what."""
+
 
 class _CommonOptions(TypedDict, total=False):
+    """Options for editors and type checkers. ``Options`` explains each."""
+
     driver: Literal["greenlet", "thread"]
     possible_agents: Iterable[str] | Mapping[Any, Iterable[str]] | None
     undeclared: Literal["error", "rule"]
@@ -38,7 +43,7 @@ class _CommonOptions(TypedDict, total=False):
 
 
 class EpisodeOptions(_CommonOptions, total=False):
-    """The options of functions that run whole episodes, for editors and type checkers. ``Options`` explains each."""
+    """The options of functions that run whole episodes."""
 
     max_steps: int | None
 
@@ -100,74 +105,61 @@ class Options:
     render_mode: str | None = None
 
     def __post_init__(self) -> None:
-        if self.driver not in ("greenlet", "thread"):
-            raise OptionValueError(f'driver must be "greenlet" or "thread", not {short_repr(self.driver)}')
-        if isinstance(self.possible_agents, str):
-            raise OptionValueError(
-                f"possible_agents must be a list of names, not the one name {short_repr(self.possible_agents)}"
-            )
-        if self.undeclared not in ("error", "rule"):
-            raise OptionValueError(f'undeclared must be "error" or "rule", not {short_repr(self.undeclared)}')
-        if self.agent is not None and not (isinstance(self.agent, str) and self.agent):
-            raise OptionValueError(f"agent must be the name of an agent or None, not {short_repr(self.agent)}")
-        for name in ("clip_actions", "global_rng", "skip_forced"):
-            if not isinstance(getattr(self, name), bool):
-                raise OptionValueError(f"{name} must be True or False, not {short_repr(getattr(self, name))}")
-        state_space = self.state_space
-        if not (state_space is None or isinstance(state_space, spaces.Space) or state_space == "observations"):
-            raise OptionValueError(
-                f'state_space must be a gymnasium space or "observations", not {short_repr(state_space)}'
-            )
-        steps = self.max_steps
-        if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
-            raise OptionValueError(f"max_steps must be a positive integer or None, not {short_repr(steps)}")
-        if self.policies is not None and not isinstance(self.policies, Mapping):
-            raise OptionValueError(
-                f"policies must be a dict from agents or points to callables, not {short_repr(self.policies)}"
-            )
-        if self.possible_agents is not None:  # it may be an iterator, and is read by every environment
-            object.__setattr__(self, "possible_agents", _listed(self.possible_agents))
-        for key, policy in (self.policies or {}).items():
+        agents, agent, space, steps = self.possible_agents, self.agent, self.state_space, self.max_steps
+        is_space = space is None or isinstance(space, spaces.Space) or space == "observations"
+        is_count = isinstance(steps, (int, np.integer)) and not isinstance(steps, bool) and steps >= 1
+        policies, plugins = {} if self.policies is None else self.policies, self.plugins
+        is_list = isinstance(plugins, Iterable) and not isinstance(plugins, (str, Mapping))
+        for name, is_allowed, expected in (
+            ("driver", self.driver in ("greenlet", "thread"), '"greenlet" or "thread"'),
+            ("possible_agents", not isinstance(agents, str), "a list of names"),
+            ("undeclared", self.undeclared in ("error", "rule"), '"error" or "rule"'),
+            ("agent", agent is None or (isinstance(agent, str) and agent), "the name of an agent or None"),
+            ("clip_actions", isinstance(self.clip_actions, bool), "True or False"),
+            ("global_rng", isinstance(self.global_rng, bool), "True or False"),
+            ("skip_forced", isinstance(self.skip_forced, bool), "True or False"),
+            ("state_space", is_space, 'a gymnasium space or "observations"'),
+            ("max_steps", steps is None or is_count, "a positive integer or None"),
+            ("policies", isinstance(policies, Mapping), "a dict from agents or points to callables"),
+            ("plugins", is_list, "a list of (handler, target, position)"),
+        ):
+            if not is_allowed:
+                raise OptionValueError(f"{name} must be {expected}, not {short_repr(getattr(self, name))}")
+        for key, policy in policies.items():
             if policy is not RULE and not callable(policy):
                 raise OptionValueError(
                     f"the policy of {short_repr(key)} must be a callable or RULE, not {short_repr(policy)}"
                 )
-
-        if isinstance(self.plugins, (str, Mapping)) or not isinstance(self.plugins, Iterable):
-            raise OptionValueError(
-                f"plugins must be a list of (handler, target, position), not {short_repr(self.plugins)}"
-            )
-        object.__setattr__(self, "plugins", tuple(self.plugins))  # an iterator is to serve more than once
+        # They may be iterators, and every environment reads them.
+        object.__setattr__(self, "possible_agents", None if agents is None else _listed(agents))
+        object.__setattr__(self, "plugins", tuple(plugins))
 
     def amended(self, options: Mapping[str, Any]) -> Options:
-        """The same options, but for those that are given.
-
-        Raises:
-            UnknownOptionError: There is no such option.
-            OptionValueError: An option cannot have its value.
-        """
+        """The same options, but for those that are given; raise an error for an unknown name or a wrong value."""
         known = [field.name for field in fields(self)]
         for name in options:
             if name not in known:
-                listed = ", ".join(known)
-                raise UnknownOptionError(
-                    f"there is no option {name!r}{did_you_mean(name, known)} (the options are {listed})"
-                )
+                hint = did_you_mean(name, known)
+                raise UnknownOptionError(f"there is no option {name!r}{hint} (the options are {', '.join(known)})")
         return replace(self, **options)
 
 
-def explain_options(function: Function) -> Function:
-    """Decorate a function whose docstring has a line ``{options}``: put the explanations of ``Options`` there."""
+def explain_arguments(function: Function) -> Function:
+    """Decorate a function that makes environments: complete its docstring.
+
+    ``{arguments}`` becomes the arguments that all these functions have, and ``{options}`` the explanations of
+    ``Options`` and the errors.
+    """
     if function.__doc__ and Options.__doc__:  # neither is there under ``python -OO``
         _, _, attributes = cleandoc(Options.__doc__).partition("Attributes:\n")
         listed = re.sub(r"^    (\w+):", r"- ``\1``:", attributes, flags=re.MULTILINE).replace("\n        ", "\n  ")
-        function.__doc__ = re.sub(
-            r"^( +)\{options\}$", lambda line: indent(listed, line[1]), function.__doc__, flags=re.MULTILINE
-        )
+        options = f"**options: Any of these:\n\n{indent(listed, ' ' * 8)}\n\n{_RAISES}"
+        function.__doc__ = cleandoc(function.__doc__).replace("{arguments}", _ARGUMENTS).replace("{options}", options)
     return function
 
 
 def _listed(names: Any) -> Any:
+    """Return names as lists, in a dict if they are in one."""
     if isinstance(names, Mapping):
         return {key: _listed(value) for key, value in names.items()}
     try:

@@ -15,6 +15,7 @@ from .plan import Plan
 from .points import Points
 
 DEPENDENCIES = ("greenlet", "gymnasium", "numpy", "pettingzoo", "simenv-marl")
+_distributions = cache(importlib.metadata.packages_distributions)
 
 
 def provenance(
@@ -32,8 +33,7 @@ def provenance(
         A dict of dicts, lists, strings, numbers, bools and None, ready for ``json.dump``:
 
         - ``simulation``: the dotted name of its class or factory;
-        - ``packages``: the versions of the packages of the simulation and its decision points, by name (None if a
-          package has no version);
+        - ``packages``: the versions (or None) of the packages of the simulation and its decision points, by name;
         - ``variant``, ``parameters``: the variant's name and parameters, if there is one;
         - ``points``: the agent of each active decision point, by dotted name (None: named at each call);
         - ``plugins``: the ``handler``, ``target`` and ``position`` of each;
@@ -52,7 +52,7 @@ def provenance(
 
 def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     """Return the provenance of an environment of a plan, as ``provenance`` does."""
-    name = source_name(plan.source)
+    name, variant = source_name(plan.source), plan.variant
     options = {
         option.name: as_json(getattr(plan.options, option.name))
         for option in fields(Options)
@@ -63,8 +63,8 @@ def describe(plan: Plan, seed: int | None) -> dict[str, Any]:
     return {
         "simulation": name,
         "packages": {package: _version(package) for package in packages},
-        "variant": None if plan.variant is None else plan.variant.name,
-        "parameters": {} if plan.variant is None else as_json(plan.variant.parameters),
+        "variant": None if variant is None else variant.name,
+        "parameters": {} if variant is None else as_json(variant.parameters),
         "points": points,
         "plugins": [
             {"handler": as_json(handler), "target": target, "position": position}
@@ -113,11 +113,6 @@ def _version(package: str) -> str | None:
         return _version_of_distribution(distribution)
     version = getattr(sys.modules.get(package), "__version__", None)
     return version if isinstance(version, str) else None
-
-
-@cache
-def _distributions() -> Mapping[str, list[str]]:
-    return importlib.metadata.packages_distributions()
 
 
 @cache

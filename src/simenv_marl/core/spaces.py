@@ -22,18 +22,9 @@ from ..simulation import Sentinel
 Cast = Callable[[Any], Any]
 """Takes an observation. Returns it cast to its space's dtype, with no memory shared."""
 
-# -- observations ---------------------------------------------------------------------------------
-
 
 def observation_cast(space: spaces.Space[Any]) -> Cast:
-    """Make the function that casts observations to a space.
-
-    Args:
-        space: The observation space, of any kind.
-
-    Returns:
-        A function that raises ``ObservationError`` for an observation that does not fit the space.
-    """
+    """Make the function that casts observations to a space, or raises ``ObservationError`` if they do not fit."""
     if isinstance(space, (spaces.Box, spaces.MultiBinary, spaces.MultiDiscrete)):
         return _array_cast(space)
     if isinstance(space, spaces.Discrete):
@@ -141,13 +132,9 @@ def _tuple_cast(space: spaces.Tuple[Any]) -> Cast:
 
 
 def finite_check(space: spaces.Space[Any]) -> Callable[[Any], None] | None:
-    """Make the function that checks that an observation is finite where its space is bounded.
+    """Make the function that raises ``ObservationError`` for NaN and infinities where a space is bounded.
 
-    Args:
-        space: The observation space.
-
-    Returns:
-        A function that raises ``ObservationError`` for NaN and for infinities; None if no bound of the space is finite.
+    It is None if no bound of the space is finite.
     """
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         parts: Any = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
@@ -204,11 +191,7 @@ def same(one: Any, other: Any) -> bool:
 def blank(space: spaces.Space[Any]) -> Any:
     """Make the blank observation of an agent that was not observed yet: zero, clipped into the space.
 
-    Args:
-        space: The observation space.
-
-    Returns:
-        An observation in the space. For spaces without a zero (text, graphs, ...) it is a fixed sample.
+    For spaces without a zero (text, graphs, ...) it is a fixed sample.
     """
     if isinstance(space, spaces.Box):
         return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high).astype(space.dtype)
@@ -227,9 +210,6 @@ def blank(space: spaces.Space[Any]) -> Any:
     sampled = copy.deepcopy(space)
     sampled.seed(0)
     return sampled.sample()
-
-
-# -- freshness ------------------------------------------------------------------------------------
 
 
 def _calibrate() -> int:

@@ -7,12 +7,10 @@ from pettingzoo import AECEnv
 
 from ..core.agent import Agent
 from ..core.episode import Episode
-from ..core.plan import Plan
 from ..core.spaces import duplicate
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
 from .agents import AgentsView
-from .base import View
 
 
 class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
@@ -32,22 +30,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             keys exist from the reset on. Until an agent was observed, its mask has all actions legal.
     """
 
-    def __init__(self, plan: Plan) -> None:
-        """Make the environment of a plan.
-
-        Raises:
-            SimEnvError: Something in the plan cannot work.
-        """
-        super().__init__(plan)
-        self._clear()
-
-    @staticmethod
-    def metadata_of(plan: Plan) -> dict[str, Any]:
-        """Return the metadata of a plan's environments; the order of agents is not an order of rounds."""
-        return View.metadata_of(plan) | {"is_parallelizable": False}
-
-    # -- episodes ---------------------------------------------------------------------------------
-
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Reset the simulation and run it to its first decision.
 
@@ -61,7 +43,13 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             BaseException: Any exception of the model, a mapping or a policy.
         """
         with self._session.exclusive():
-            self._record(self._start(seed, options))
+            episode = self._start(seed, options)
+            with self._session.context():
+                for agent in episode.agents.values():
+                    if not (agent.present or episode.over):
+                        agent.clear_observation()
+                    self._join(agent)
+            self._record(episode)
             if self._shows:
                 self.render()
 
@@ -93,11 +81,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             if episode.over:  # an error has ended it
                 self._clear()
             raise
-        # The selected agent is the only one that the latest step has rewarded, as a rule.
         selected = self.agent_selection
         self.rewards[selected] = self._cumulative_rewards[selected] = 0.0
         if self._rewarded:
-            self._take_back_rewards()
+            self._clear_rewards()
         agent = episode.pending
         if agent is None or episode.just_ended:
             self._record(episode)
@@ -119,17 +106,16 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             ResetNeededError: There is no episode, or all agents have taken their final step.
         """
         agent, observation = self._deciding, None
-        if agent is None:
-            if not self._leaving:
-                raise self._session.refusal()
-            name = self.agent_selection
-            if observe:
-                observation = self.observe(name)
-        else:
+        if agent is not None:
             name = agent.name
             if observe:
                 observation = agent.observation
                 observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
+        elif self._leaving:
+            name = self.agent_selection
+            observation = self.observe(name) if observe else None
+        else:
+            raise self._session.refusal()
         return (
             observation,
             self._cumulative_rewards[name],
@@ -139,10 +125,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         )
 
     def observe(self, agent: str) -> Any:
-        """Return the latest observation of an agent, as a new copy.
-
-        Args:
-            agent: The name of an agent of this episode.
+        """Return the latest observation of an agent of this episode, as a new copy.
 
         Raises:
             UnknownAgentError: There is no such agent.
@@ -152,91 +135,75 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     # -- PettingZoo's books -----------------------------------------------------------------------
 
-    def _resume_from_replay(self) -> None:
-        episode = self._running()
-        episode.just_ended = []  # they are in the books already
-        self._select_leaving(episode)
-
     def _clear(self) -> None:
-        super()._clear()
         self.agents = []
         self._places: dict[str, int] = {}  # of the agents, in the list of agents
         self._deciding: Agent | None = None  # the agent that is selected for its decision
         self._leaving: list[str] = []  # agents that have ended, and whose None step is to come, the next one last
-        self._rewarded: list[str] = []  # agents that the latest step has rewarded
+        self._rewarded: list[str] = []  # agents besides the selected one that the latest step has rewarded
         self.rewards: dict[str, float] = {}
         self._cumulative_rewards: dict[str, float] = {}
         self.terminations: dict[str, bool] = {}
         self.truncations: dict[str, bool] = {}
         self.infos: dict[str, dict[str, Any]] = {}
 
-    def _join(self, name: str) -> None:
+    def _join(self, agent: Agent) -> None:
+        """Enter an agent in the books."""
+        name = agent.name
         self._places[name] = len(self.agents)
         self.agents.append(name)
         self.rewards[name] = self._cumulative_rewards[name] = 0.0
         self.terminations[name] = self.truncations[name] = False
-        self.infos[name] = {}
+        self.infos[name] = agent.info
 
     def _select(self, agent: Agent) -> None:
         """Record a decision that has arisen."""
         self._deciding = agent
         name = self.agent_selection = agent.name
         if name not in self.rewards:
-            self._join(name)
+            self._join(agent)
         # It has had no other reward since its last step.
         self.rewards[name] = self._cumulative_rewards[name] = agent.reward
         self.infos[name] = agent.info
 
-    def _record_reward(self, agent: Agent) -> None:
-        """Record the reward and the info of an agent that is not selected for its decision."""
-        name, reward = agent.name, agent.reward
-        self.rewards[name] = reward
-        self._cumulative_rewards[name] += reward
-        self._rewarded.append(name)
-        self.infos[name] = agent.info
-
     def _record(self, episode: Episode) -> None:
-        """Record the births and ends of a reset or a step."""
-        if not self.agents:
-            for name, agent in episode.agents.items():
-                self._join(name)
-                self.infos[name] = agent.info
+        """Record the ends and the pending decision of a reset or a step."""
         for agent in episode.just_ended:
-            if agent.name not in self.rewards:
-                self._join(agent.name)
-            self._record_reward(agent)
-            self._dismiss(agent.name, terminated=True, truncated=False)
+            self._dismiss(agent, terminated=True, truncated=False)
         if episode.over:
-            terminated, truncated = episode.terminated, episode.truncated
             # Those that have never decided come last.
             for agent in sorted(episode.agents.values(), key=lambda agent: not agent.decided):
-                if agent.name not in self.rewards:
-                    self._join(agent.name)
-                self._record_reward(agent)
-                self._dismiss(agent.name, terminated=terminated, truncated=truncated)
+                self._dismiss(agent, terminated=episode.terminated, truncated=episode.truncated)
         self._leaving.reverse()
         if episode.pending is not None:
             self._select(episode.pending)
             self._rewarded.append(episode.pending.name)
-        self._select_leaving(episode)
         episode.just_ended = []
+        self._select_next()
 
-    def _select_leaving(self, episode: Episode) -> None:
+    def _dismiss(self, agent: Agent, *, terminated: bool, truncated: bool) -> None:
+        """Record the last reward and the end of an agent, whose ``None`` step comes next."""
+        name = agent.name
+        if name not in self.rewards:
+            self._join(agent)
+        self.rewards[name] = agent.reward
+        self._cumulative_rewards[name] += agent.reward
+        self.infos[name] = agent.info
+        self.terminations[name], self.truncations[name] = terminated, truncated
+        self._rewarded.append(name)
+        self._leaving.append(name)
+
+    def _select_next(self) -> None:
         """Select the next agent that takes its final step, or else the one that decides."""
         if self._leaving:
             self.agent_selection, self._deciding = self._leaving[-1], None
-        else:
-            self._deciding = episode.pending
-            if self._deciding is not None:
-                self.agent_selection = self._deciding.name
+            return
+        self._deciding = self._running().pending
+        if self._deciding is not None:
+            self.agent_selection = self._deciding.name
 
-    def _dismiss(self, name: str, *, terminated: bool, truncated: bool) -> None:
-        """Record the end of an agent, whose ``None`` step comes next."""
-        self.terminations[name], self.truncations[name] = terminated, truncated
-        self._leaving.append(name)
-
-    def _take_back_rewards(self) -> None:
-        """Reset the rewards of the previous step, except for the selected agent."""
+    def _clear_rewards(self) -> None:
+        """Reset the rewards of the previous step."""
         for name in self._rewarded:
             self.rewards[name] = 0.0
         self._rewarded = []
@@ -248,7 +215,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not"
                 f" {short_repr(action)}"
             )
-        self._take_back_rewards()
+        self._clear_rewards()
         name = self._leaving.pop()
         for book in (self.rewards, self._cumulative_rewards, self.terminations, self.truncations, self.infos):
             del book[name]
@@ -256,4 +223,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         place, mover = self._places.pop(name), self.agents.pop()
         if mover != name:
             self.agents[place], self._places[mover] = mover, place
-        self._select_leaving(self._running())
+        self._select_next()
+
+    def _resume_from_replay(self) -> None:
+        self._running().just_ended = []  # they are in the books already
+        self._select_next()

@@ -26,45 +26,35 @@ class AgentsView(View):
     agents: list[str]
 
     def __init__(self, plan: Plan) -> None:
-        """Make the view of a plan.
-
-        Raises:
-            SimEnvError: The plan does not work in this view.
-        """
+        """Make the view of a plan: see ``View``."""
         super().__init__(plan)
         if plan.possible_agents is not None:
             self.possible_agents = plan.possible_agents
-        self._observation_spaces: dict[str, spaces.Space[Any]] = {}
-        self._action_spaces: dict[str, spaces.Space[Any]] = {}
-
-    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Episode:
-        """End the current episode, begin another, and seed the agents' spaces."""
-        episode = super()._start(seed, options)
-        if not self._plan.complete:  # the agents of the last episode may never appear again
-            self._observation_spaces, self._action_spaces = {}, {}
-        elif seed is not None:
-            for agent in self._action_spaces:
-                self._seed_spaces(agent, int(seed))
-        return episode
+        self._spaces: dict[str, tuple[spaces.Space[Any], spaces.Space[Any]]] = {}
 
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Make sure that a plan allows this view.
-
-        Raises:
-            ViewError: The plan does not allow it.
-        """
+        """Check that a plan allows this view: see ``View``."""
         super().check(plan)
         if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
             raise ViewError(
                 'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='
             )
 
-    def _seen_spaces(self) -> list[spaces.Space[Any]]:
-        return [self.observation_space(agent) for agent in self.possible_agents]
+    @classmethod
+    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
+        """Return the metadata of a plan's environments. The order of agents is an order of rounds only in rounds."""
+        return super().metadata_of(plan) | {"is_parallelizable": cls.in_rounds}
 
-    def _seen(self, episode: Episode) -> tuple[Any, ...]:
-        return tuple(self._observation(episode, agent) for agent in self.possible_agents)
+    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Episode:
+        """End the current episode, begin another, and seed the agents' spaces."""
+        episode = super()._start(seed, options)
+        if not self._plan.complete:  # the agents of the last episode may never appear again
+            self._spaces = {}
+        elif seed is not None:
+            for agent in self._spaces:
+                self._seed_spaces(agent)
+        return episode
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The observation space of an agent. It is always the same object, and no other environment shares it.
@@ -72,8 +62,7 @@ class AgentsView(View):
         Raises:
             UnknownAgentError: There is no such agent.
         """
-        space = self._observation_spaces.get(agent)
-        return space if space is not None else self._make_spaces(agent)[0]
+        return (self._spaces.get(agent) or self._make_spaces(agent))[0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """The action space of an agent. It is always the same object, and no other environment shares it.
@@ -81,8 +70,7 @@ class AgentsView(View):
         Raises:
             UnknownAgentError: There is no such agent.
         """
-        space = self._action_spaces.get(agent)
-        return space if space is not None else self._make_spaces(agent)[1]
+        return (self._spaces.get(agent) or self._make_spaces(agent))[1]
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
@@ -95,37 +83,34 @@ class AgentsView(View):
 
     @property
     def action_spaces(self) -> dict[str, spaces.Space[Any]]:
-        """The action spaces of all possible agents, by name, for learners that read all at once.
-
-        Raises:
-            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
-        """
+        """The action spaces of all possible agents, as ``observation_spaces`` has the observation spaces."""
         return {agent: self.action_space(agent) for agent in self.possible_agents}
-
-    def _point(self, agent: str) -> Point:
-        point = self._plan.roster.get(agent)
-        if point is None:
-            episode = self._session.episode
-            found = None if episode is None else episode.agent(agent)
-            if found is None:
-                raise UnknownAgentError(
-                    f"there is no agent {short_repr(agent)}; the agents now are {self.agents[:10]}"
-                    f"{did_you_mean(agent, self.agents)}"
-                )
-            point = found.point
-        return point
 
     def _make_spaces(self, agent: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         definition = self._point(agent).definition
-        made = copy.deepcopy((definition.observation_space, definition.action_space))
-        self._observation_spaces[agent], self._action_spaces[agent] = made
+        made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
         if self._session.seed is not None:
-            self._seed_spaces(agent, self._session.seed)
+            self._seed_spaces(agent)
         return made
 
-    def _seed_spaces(self, agent: str, seed: int) -> None:
-        for space in (self._observation_spaces[agent], self._action_spaces[agent]):
+    def _seed_spaces(self, agent: str) -> None:
+        seed: Any = self._session.seed
+        for space in self._spaces[agent]:
             seed_space(space, seed, agent)
+
+    def _point(self, agent: str) -> Point:
+        """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
+        point = self._plan.roster.get(agent)
+        if point is not None:
+            return point
+        episode = self._session.episode
+        found = None if episode is None else episode.agent(agent)
+        if found is None:
+            raise UnknownAgentError(
+                f"there is no agent {short_repr(agent)}; the agents now are {self.agents[:10]}"
+                f"{did_you_mean(agent, self.agents)}"
+            )
+        return found.point
 
     def _observation(self, episode: Episode, agent: str) -> Any:
         """A copy of the latest observation of an agent."""
@@ -133,3 +118,9 @@ class AgentsView(View):
         if found is None or found.observation is None:
             return self._point(agent).blank()
         return duplicate(found.observation)
+
+    def _all_observation_spaces(self) -> list[spaces.Space[Any]]:
+        return list(self.observation_spaces.values())
+
+    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
+        return tuple(self._observation(episode, agent) for agent in self.possible_agents)

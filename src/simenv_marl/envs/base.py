@@ -1,10 +1,11 @@
-"""The base class of all views: the session, the spaces, rendering and the state."""
+"""The base class of all views: the session, rendering, the state, copies, and what branches need."""
 
 from __future__ import annotations
 
 import copy
 import weakref
 from collections.abc import Callable
+from functools import cached_property
 from sys import modules
 from typing import Any, ClassVar
 
@@ -18,6 +19,9 @@ from ..core.session import Session, checked_seed
 from ..core.spaces import observation_cast
 from ..errors import UnknownOptionError, ViewError
 from ..hooks.plugins import Entry
+
+_OWN = frozenset(("_deciding", "_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))
+"""The attributes that no copy takes over."""
 
 
 class View:
@@ -34,16 +38,10 @@ class View:
     render_mode: str | None
     takes: ClassVar[tuple[str, ...]] = ()
     in_rounds: ClassVar[bool] = False
-    _together: tuple[spaces.Tuple[Any], spaces.Space[Any]] | None = None
-
     _finalizer: Any = None
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the view of a plan.
-
-        Args:
-            plan: The plan.
-            session: The simulation to use, which its owner closes. None: a new one.
+        """Make the view of a plan, of a session that its owner closes, or else of a new session.
 
         Raises:
             SimEnvError: Something in the plan cannot work.
@@ -57,43 +55,20 @@ class View:
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
         self._shows = self.render_mode == "human"  # render after every reset and step
+        self._clear()
 
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Check that a plan allows this view.
-
-        Raises:
-            UnknownOptionError: An option is given that only another view takes.
-            ViewError: The plan does not allow the view.
-        """
+        """Check that a plan allows this view, or raise ``UnknownOptionError`` or ``ViewError``."""
         for option, view in (("flatten", "joint"), ("agent", "single")):
             if getattr(plan.options, option) and option not in cls.takes:
                 raise UnknownOptionError(f"{option} is an option of the {view} view only")
 
-    @staticmethod
-    def metadata_of(plan: Plan) -> dict[str, Any]:
+    @classmethod
+    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
         model = plan.model
         return {"name": f"{plan.name.lower()}_v0", "render_modes": model.render_modes, "render_fps": model.render_fps}
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        """The generator that was seeded with the last given seed, and from which other seeds are drawn."""
-        return self._session.np_random
-
-    @np_random.setter
-    def np_random(self, generator: np.random.Generator) -> None:
-        self._session.np_random = generator
-
-    @property
-    def np_random_seed(self) -> int:
-        """The seed of the generator; -1 if the generator was set."""
-        seed = self._session.np_random_seed
-        if seed is None:
-            _ = self._session.np_random  # draws a seed
-            seed = self._session.np_random_seed
-        assert seed is not None
-        return seed
 
     @property
     def simulation(self) -> Any:
@@ -107,18 +82,30 @@ class View:
         return [] if plugins is None else plugins.entries
 
     def provenance(self) -> dict[str, Any]:
-        """Return the provenance of this environment, with the seed of its latest episode, ready for ``json.dump``.
-
-        Returns:
-            The dict that ``simenv_marl.experiments.provenance`` describes.
-        """
+        """Return what ``simenv_marl.experiments.provenance`` describes, with the seed of the latest episode."""
         return describe(self._plan, self._session.seed)
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator that was seeded with the last given seed, and from which other seeds are drawn."""
+        return self._session.np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self._session.np_random = generator
+
+    @property
+    def np_random_seed(self) -> int:
+        """The seed of the generator; -1 if the generator was set."""
+        if self._session.np_random_seed is None:
+            _ = self._session.np_random  # draws a seed
+        return self._session.np_random_seed  # type: ignore[return-value]
 
     @property
     def state_space(self) -> spaces.Space[Any] | None:
         """The space of ``state()``, if the environment was made with one."""
         space = self._plan.options.state_space
-        return self._seen_together()[1] if isinstance(space, str) else space
+        return self._observed_together[1] if isinstance(space, str) else space
 
     def state(self) -> Any:
         """Return the state of the simulation, for centralised critics, from the simulation's own ``state()``.
@@ -132,8 +119,8 @@ class View:
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
         if isinstance(self._plan.options.state_space, str):
-            parts, space = self._seen_together()
-            return np.asarray(spaces.flatten(parts, self._seen(self._running()))).astype(space.dtype)
+            parts, space = self._observed_together
+            return np.asarray(spaces.flatten(parts, self._all_observations(self._running()))).astype(space.dtype)
         tell = getattr(self.simulation, "state", None)
         if not callable(tell):
             raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
@@ -141,25 +128,20 @@ class View:
             value = tell()
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 
-    def _seen_together(self) -> tuple[spaces.Tuple[Any], spaces.Space[Any]]:
-        """Return the spaces of all observations, and the space of their concatenation.
+    @cached_property
+    def _observed_together(self) -> tuple[spaces.Tuple[Any], spaces.Space[Any]]:
+        """The spaces of all observations, and the space of their concatenation."""
+        parts = spaces.Tuple(self._all_observation_spaces())
+        together = spaces.flatten_space(parts)
+        if not isinstance(together, spaces.Box):
+            raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
+        return parts, together
 
-        Raises:
-            ViewError: They cannot be flattened.
-        """
-        if self._together is None:
-            parts = spaces.Tuple(self._seen_spaces())
-            together = spaces.flatten_space(parts)
-            if not isinstance(together, spaces.Box):
-                raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
-            self._together = parts, together
-        return self._together
-
-    def _seen_spaces(self) -> list[spaces.Space[Any]]:
+    def _all_observation_spaces(self) -> list[spaces.Space[Any]]:
         """Return the spaces of all observations."""
         raise NotImplementedError
 
-    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
         """Return all observations."""
         raise NotImplementedError
 
@@ -200,33 +182,52 @@ class View:
             if episode is None or episode.over:
                 self._clear()
 
-    def __deepcopy__(self, memory: dict[int, Any]) -> Any:
-        """Make an environment like this one, with a simulation of its own. It needs a reset."""
-        made = memory[id(self)] = _made_again(type(self), self._made_of)
-        _take_over(made, copy.deepcopy(self._state(), memory))
-        return made
+    def _clear(self) -> None:
+        """Forget the records of the episode."""
+
+    def _running(self) -> Episode:
+        """The running episode, or the one that has just ended; raise ``ResetNeededError`` if there is none."""
+        episode = self._session.episode
+        if episode is None:
+            raise self._session.refusal()
+        return episode
 
     def __copy__(self) -> Any:
         return copy.deepcopy(self)
 
+    def __deepcopy__(self, memory: dict[int, Any]) -> Any:
+        """Make an environment like this one, with a simulation of its own. It needs a reset."""
+        made = memory[id(self)] = _make_again(type(self), self._made_of)
+        made.__setstate__(copy.deepcopy(self._state(), memory))
+        return made
+
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickle the recipe of an environment like this one, with a simulation of its own. It needs a reset."""
-        made: Any = type(self)
-        found: Any = modules.get(made.__module__)
-        for name in made.__qualname__.split("."):
+        view: Any = type(self)
+        found: Any = modules.get(view.__module__)
+        for name in view.__qualname__.split("."):
             found = getattr(found, name, None)
-        if found is not made:  # a class that generate_env made and that its name does not lead to
-            made = next(base for base in made.__mro__ if base.__module__.startswith(__package__))
-        return _made_again, (made, self._made_of), self._state(), None, None, _take_over
+        if found is not view:  # a class that generate_env made and that its name does not lead to
+            view = _class_of_package(view)
+        return _make_again, (view, self._made_of), self._state()
 
-    def __setstate__(self, kept: dict[str, Any]) -> None:
-        self._session.restore(kept.pop("session"))
-        vars(self).update(kept)
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._restore(state)
+        self._clear()
 
     def _state(self) -> dict[str, Any]:
         """Return what a copy takes over."""
-        kept = {name: value for name, value in vars(self).items() if name not in _OWN}
-        return kept | {"session": self._session.snapshot()}
+        own = {name: value for name, value in vars(self).items() if name not in _OWN}
+        return own | {"session": self._session.snapshot()}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        """Take over the state of another environment, with the records of its episode."""
+        self._session.restore(state.pop("session"))
+        vars(self).update(state)
+
+    # -- branches and planners --------------------------------------------------------------------
+
+    episode = property(_running)
 
     @property
     def driver(self) -> str:
@@ -234,12 +235,7 @@ class View:
         return self._plan.options.driver
 
     def check_pending(self) -> None:
-        """Check that a decision is pending.
-
-        Raises:
-            ResetNeededError: No decision is pending.
-            ReentrancyError: The simulation is running.
-        """
+        """Check that a decision is pending, or raise ``ResetNeededError`` or ``ReentrancyError``."""
         if self._running().pending is None:
             raise self._session.refusal()
 
@@ -252,69 +248,35 @@ class View:
         self._session.check_reseed()
 
     def reseed(self, seed: int) -> None:
-        """Reseed the simulation, for ``branch``: see ``Session.reseed``."""
+        """Reseed the simulation: see ``Session.reseed``."""
         self._session.reseed(seed)
 
-    def _running(self) -> Episode:
-        """Return the running episode, or the one that has just ended.
-
-        Raises:
-            ResetNeededError: There is none.
-        """
-        episode = self._session.episode
-        if episode is None:
-            raise self._session.refusal()
-        return episode
-
     def replayed(self) -> Any:
-        """Make an environment in exactly the same state in mid-episode, for ``branch``.
-
-        Raises:
-            BranchError: The state cannot be reached.
-            ResetNeededError: There is no running episode.
-        """
-        made = _made_again(type(self), self._made_of)
-        made.__setstate__(copy.deepcopy(self._state()))
+        """Make an environment in exactly the same state in mid-episode, or raise as ``Session.replay``."""
+        made = _make_again(type(self), self._made_of)
+        made._restore(copy.deepcopy(self._state()))
         made._session.replay(self._session)
         made._resume_from_replay()
         return made
 
-    @property
-    def episode(self) -> Episode:
-        """Return the running episode, or the one that has just ended, for planners.
+    def _resume_from_replay(self) -> None:
+        """Take over the session's episode in mid-episode."""
 
-        Raises:
-            ResetNeededError: There is none.
-        """
-        return self._running()
+    def begin_branch(self) -> None:
+        """Prepare the environment of a branch."""
 
     def stop_showing(self) -> None:
         """Stop rendering, in a branch."""
         self._shows = False
 
-    def begin_branch(self) -> None:
-        """Prepare the environment of a branch."""
 
-    def _resume_from_replay(self) -> None:
-        """Take over the session's episode in mid-episode."""
-
-    def _clear(self) -> None:
-        """Forget the records of the episode."""
+def _class_of_package(view: type[View]) -> Any:
+    """Return the class of this package from which a generated class is derived."""
+    return next(base for base in view.__mro__ if base.__module__.startswith(__package__))
 
 
-def _made_again(view: type[View], plan: Plan) -> View:
+def _make_again(view: type[View], plan: Plan) -> View:
     """Make an environment of a class from its plan alone."""
     made = view.__new__(view)
-    base: Any = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-    base.__init__(made, plan)
+    _class_of_package(view).__init__(made, plan)
     return made
-
-
-def _take_over(view: View, state: dict[str, Any]) -> None:
-    """Have a copy take over the state of another view, except for the records of its episode."""
-    view.__setstate__(state)
-    view._clear()
-
-
-_OWN = frozenset(("_deciding", "_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))
-"""The attributes that no copy takes over."""

@@ -26,31 +26,24 @@ class Joint:
     """
 
     def __init__(self, roster: Mapping[str, Point], *, flatten: bool) -> None:
-        """Combine the spaces.
-
-        Raises:
-            ViewError: The spaces cannot be flattened.
-        """
+        """Combine the spaces, or raise ``ViewError`` if they cannot be flattened."""
         self.roster, self._flatten = dict(roster), flatten
         observations = {name: deepcopy(point.definition.observation_space) for name, point in roster.items()}
         actions = {name: deepcopy(point.definition.action_space) for name, point in roster.items()}
-        self.observation_space: spaces.Space[Any]
-        self.action_space: spaces.Space[Any]
+        self.observation_space: spaces.Space[Any] = spaces.Dict(observations)
+        self.action_space: spaces.Space[Any] = spaces.Dict(actions)
         if flatten:
-            self.observation_space, self.action_space = _concatenate(observations), _concatenate_actions(actions)
-            self._places = _places(actions)
-        else:
-            self.observation_space, self.action_space = spaces.Dict(observations), spaces.Dict(actions)
+            self.observation_space = _concatenate(list(observations.values()))
+            self.action_space = _concatenate_actions(list(actions.values()))
+            self._places: dict[str, int | slice] = {}  # of each agent's action in the flattened one
+            begin = 0
+            for name, space in actions.items():
+                length = space.shape[0] if space.shape else 1
+                self._places[name] = slice(begin, begin + length) if space.shape else begin
+                begin += length
 
     def actions(self, episode: Episode, action: Any) -> dict[str, Any]:
-        """Split a joint action.
-
-        Returns:
-            The actions of the live agents.
-
-        Raises:
-            InvalidActionError: It is not a joint action, or lacks an agent.
-        """
+        """Return the actions of the live agents, or raise ``InvalidActionError`` if one is missing."""
         actions: Mapping[str, Any]
         if action is RULE:
             actions = dict.fromkeys(self.roster, RULE)
@@ -71,11 +64,7 @@ class Joint:
         return {name: actions[name] for name in self.roster if name in episode.agents}
 
     def check(self, episode: Episode, action: Any) -> None:
-        """Check the joint action of a vector environment, as far as possible before the simulation moves.
-
-        Raises:
-            InvalidActionError: It is not legal, or contains ``RULE``.
-        """
+        """Check the joint action of a vector environment, as far as possible before the simulation moves."""
         actions = self.actions(episode, action)
         if any(part is RULE for part in actions.values()):
             raise InvalidActionError("RULE is not an action in vector environments; use joint_env, or policies=")
@@ -112,11 +101,9 @@ class Joint:
         if masks:
             info["action_mask"] = masks
         if episode.clock is not None:
-            before, episode.last_time = episode.last_time, float(episode.clock())
-            info["time"], info["elapsed"] = (
-                episode.last_time,
-                episode.last_time - (episode.last_time if before is None else before),
-            )
+            before, now = episode.last_time, float(episode.clock())
+            episode.last_time = info["time"] = now
+            info["elapsed"] = 0.0 if before is None else now - before
         return info
 
     def masks(self, episode: Episode) -> list[Any]:
@@ -143,56 +130,28 @@ class SimulationJointEnv(OneAgentView):
     _agent = "joint"
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan.
-
-        Args:
-            plan: The plan.
-            session: The simulation to use. None: a new one.
-
-        Raises:
-            ViewError: Not all agents are known beforehand, or their spaces cannot be flattened.
-            SimEnvError: Something else in the plan cannot work.
-        """
+        """Make the environment of a plan: see ``View``. If not all agents are declared, this takes a reset."""
         super().__init__(plan, session)
         if not plan.complete:
-            if not hasattr(self._session.simulation, "expected_calls"):
-                self._session.close()
-                points = ", ".join(point.point.name for point in plan.active if point.agent is None)
-                raise ViewError(
-                    f"all agents must be known when the environment is made, and a callable names those of {points};"
-                    " declare them with possible_agents=, let the simulation announce them (expected_calls), or name"
-                    " the one agent of a single view with agent="
-                )
-            with_seed = self._session.start(0, None, in_rounds=True)
-            roster = {name: agent.point for name, agent in with_seed.agents.items()}
-            self._session.close()
-            self._session.np_random_seed = None
-            self._plan = self._made_of = self._session.plan = plan.declared(roster)
+            self._plan = self._made_of = self._session.plan = self._declared(plan)
         self.joint = Joint(self._plan.roster, flatten=plan.options.flatten)
 
-    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        return deepcopy((self.joint.observation_space, self.joint.action_space))
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the simulation and run it to its first decision.
-
-        Args:
-            seed: The seed for the environment's generator, its spaces, and the simulation's ``reset``. None: the
-                simulation gets a seed from the environment's generator.
-            options: Options for the simulation's ``reset``, if it takes them.
-
-        Returns:
-            The observation and the info.
-
-        Raises:
-            NoDecisionError: The simulation ended without a decision.
-            BaseException: Any exception of the model, a mapping or a policy.
-        """
-        with self._session.exclusive():
-            episode = self._start(seed, options)
-            if self._shows:
-                self.render()
-            return self.joint.observe(episode), self.joint.inform(episode)
+    def _declared(self, plan: Plan) -> Plan:
+        """Return the same plan with the agents that the simulation announces after a reset."""
+        session = self._session
+        if not hasattr(session.simulation, "expected_calls"):
+            session.close()
+            points = ", ".join(point.point.name for point in plan.active if point.agent is None)
+            raise ViewError(
+                f"all agents must be known when the environment is made, and a callable names those of {points};"
+                " declare them with possible_agents=, let the simulation announce them (expected_calls), or name"
+                " the one agent of a single view with agent="
+            )
+        agents = session.start(0, None, in_rounds=True).agents
+        roster = {name: agent.point for name, agent in agents.items()}
+        session.close()
+        session.np_random_seed = None
+        return plan.declared(roster)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a round with an action for each agent.
@@ -209,8 +168,7 @@ class SimulationJointEnv(OneAgentView):
 
         Raises:
             InvalidActionError: The action is not legal, or lacks an agent. The environment does not change.
-            ResetNeededError: There is no running episode.
-            BaseException: Any exception of the model, a mapping or a policy.
+            BaseException: Any other error of ``SimulationAECEnv.step``.
         """
         session = self._session
         if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
@@ -223,51 +181,38 @@ class SimulationJointEnv(OneAgentView):
         info = joint.inform(episode)
         return joint.observe(episode), joint.reward(episode), episode.terminated, episode.truncated, info
 
-    def _seen(self, episode: Episode) -> tuple[Any, ...]:
+    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        return deepcopy((self.joint.observation_space, self.joint.action_space))
+
+    def _first_results(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
+        return self.joint.observe(episode), self.joint.inform(episode)
+
+    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
         return (self.joint.observe(episode),)
 
-    def _legal(self, episode: Episode) -> list[Any]:
+    def _masks(self, episode: Episode) -> list[Any]:
         return self.joint.masks(episode)
 
 
-def _length(space: spaces.Space[Any]) -> int:
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise ViewError(f"flatten=True needs one-dimensional Box spaces, not {space}")
-    return space.shape[0]
+def _concatenate(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
+    """Return the space of concatenated vectors."""
+    for space in parts:
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            raise ViewError(f"flatten=True needs one-dimensional Box spaces, not {space}")
+    return spaces.flatten_space(spaces.Tuple(parts))
 
 
-def _concatenate_actions(parts: Mapping[str, spaces.Space[Any]]) -> spaces.Space[Any]:
+def _concatenate_actions(parts: list[Any]) -> spaces.Space[Any]:
     """Return the space of concatenated actions, which must be all continuous or all discrete."""
-    listed: list[Any] = list(parts.values())
-    if not all(_counts(space) for space in listed):
-        if any(_counts(space) for space in listed):
-            kinds = ", ".join(map(str, listed))
-            raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {kinds}")
+    discrete = [
+        isinstance(space, spaces.Discrete) or (isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1)
+        for space in parts
+    ]
+    if not any(discrete):
         return _concatenate(parts)
-    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in listed]
-    starts = [np.atleast_1d(space.start) for space in listed]
+    if not all(discrete):
+        kinds = ", ".join(map(str, parts))
+        raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {kinds}")
+    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in parts]
+    starts = [np.atleast_1d(space.start) for space in parts]
     return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))
-
-
-def _counts(space: spaces.Space[Any]) -> bool:
-    return isinstance(space, spaces.Discrete) or (isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1)
-
-
-def _places(parts: Mapping[str, spaces.Space[Any]]) -> dict[str, int | slice]:
-    """Return the place of each agent's action in the flattened one."""
-    places: dict[str, int | slice] = {}
-    begin = 0
-    for agent, space in parts.items():
-        length = space.shape[0] if space.shape else 1
-        places[agent] = slice(begin, begin + length) if space.shape else begin
-        begin += length
-    return places
-
-
-def _concatenate(parts: Mapping[str, spaces.Space[Any]]) -> spaces.Box:
-    for space in parts.values():
-        _length(space)
-    boxes: list[Any] = list(parts.values())
-    dtype: Any = np.result_type(*(box.dtype for box in boxes))
-    low, high = (np.concatenate([getattr(box, side) for box in boxes]).astype(dtype) for side in ("low", "high"))
-    return spaces.Box(low, high, dtype=dtype)

@@ -5,7 +5,7 @@ from typing import Any, Final, Unpack
 
 from gymnasium.vector import AutoresetMode
 
-from ..core.options import ViewOptions, explain_options
+from ..core.options import ViewOptions, explain_arguments
 from ..core.plan import Plan
 from ..core.points import Points
 from ..errors import OptionValueError, did_you_mean, short_repr
@@ -15,56 +15,40 @@ from .parallel import SimulationParallelEnv
 from .single import SimulationEnv, single_view
 from .vector import SimulationVectorEnv
 
-VIEWS: Final = ("aec", "parallel", "single", "joint")
+_CLASSES: Final[dict[str, Any]] = {
+    "aec": SimulationAECEnv,
+    "parallel": SimulationParallelEnv,
+    "single": SimulationEnv,
+    "joint": SimulationJointEnv,
+}
+VIEWS: Final = tuple(_CLASSES)
 
 
 def view_class(plan: Plan, view: str | None) -> Any:
-    """Return the class of a view of a plan.
-
-    Args:
-        plan: The plan.
-        view: One of ``VIEWS``. None: single if one point with one agent is active, else AEC.
-
-    Raises:
-        OptionValueError: There is no such view.
-        ViewError: The plan does not allow it.
-    """
+    """Return the class of a view. None: single if one point with one agent is active, else AEC."""
     if view is None:
         view = "aec" if plan.one_agent is None else "single"
-    if view == "single":
-        return single_view(plan)
-    found: dict[Any, Any] = {"aec": SimulationAECEnv, "parallel": SimulationParallelEnv, "joint": SimulationJointEnv}
-    if not isinstance(view, str) or view not in found:
+    if view not in VIEWS:
         raise OptionValueError(
             f"view must be None or one of {', '.join(map(repr, VIEWS))}, not"
             f" {short_repr(view)}{did_you_mean(view, VIEWS)}"
         )
-    found[view].check(plan)
-    return found[view]
+    _CLASSES[view].check(plan)
+    return single_view(plan) if view == "single" else _CLASSES[view]
 
 
-@explain_options
+@explain_arguments
 def generate_env(
     simulation: Any, points: Points = None, *, view: str | None = None, **options: Unpack[ViewOptions]
 ) -> Any:
     """Make an environment class for a simulation (paper, section 3.3).
 
-    Args:
-        simulation: A simulation (which every environment copies), its class, a zero-argument factory, or a ``Variant``.
-        points: The active decision points: a dotted name, a decision function, a list of these, or a dict from dotted
-            name or function to its definition. With a dict, the model needs no decorators. None: the simulation's
-            attribute ``points``, else all decorated points, which must then belong to one package.
+    The constructor of the class takes options as keyword arguments, which override those given here.
+
+    {arguments}
         view: "aec", "parallel", "single" or "joint". None: single if one point with one agent is active, or if
             ``agent=`` names one agent; else AEC.
-        **options: Any of these:
-
-            {options}
-
-    Returns:
-        A class. Its constructor takes options as keyword arguments, which override those given here.
-
-    Raises:
-        SimEnvError: Something cannot work. The subclass tells what.
+        {options}
     """
     plan = Plan.draw_up(simulation, points, options)
     base = view_class(plan, view)
@@ -73,93 +57,62 @@ def generate_env(
         current = Plan.draw_up(simulation, points, options) if plan.stale else plan
         base.__init__(self, current.amended(changes))
 
-    return type(
-        f"{plan.name}Env",
-        (base,),
-        {
-            "__init__": initialise,
-            "__doc__": f"A view of {plan.name}: {', '.join(b.point.name for b in plan.active)}.",
-            "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
-            "metadata": base.metadata_of(plan),
-        },
-    )
+    attributes = {
+        "__init__": initialise,
+        "__doc__": f"A view of {plan.name}: {', '.join(point.point.name for point in plan.active)}.",
+        "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
+        "metadata": base.metadata_of(plan),
+    }
+    return type(f"{plan.name}Env", (base,), attributes)
 
 
-@explain_options
+@explain_arguments
 def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationAECEnv:
     """Make a PettingZoo AEC environment whose agents decide at the decision points.
 
-    Args:
-        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
-        points: The active decision points, as ``generate_env`` takes them.
-        **options: Any of these:
-
-            {options}
-
-    Raises:
-        SimEnvError: Something cannot work. The subclass tells what.
+    {arguments}
+        {options}
     """
     return SimulationAECEnv(Plan.draw_up(simulation, points, options))
 
 
-@explain_options
+@explain_arguments
 def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationParallelEnv:
     """Make a PettingZoo parallel environment whose agents decide at the decision points.
 
-    Args:
-        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
-        points: The active decision points, as ``generate_env`` takes them.
-        **options: Any of these:
-
-            {options}
-
-    Raises:
-        SimEnvError: Something cannot work. The subclass tells what.
+    {arguments}
+        {options}
     """
     return SimulationParallelEnv(Plan.draw_up(simulation, points, options))
 
 
-@explain_options
+@explain_arguments
 def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationEnv:
-    """Make a Gymnasium environment for the one active agent.
+    """Make a Gymnasium environment for the one active agent. If there are several, ``agent=`` names it.
 
     If its decision point has a goal, the environment is goal-based: its observations are dicts of ``observation``,
     ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
 
-    Args:
-        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
-        points: The active decision points, as ``generate_env`` takes them.
-        **options: Any of these:
-
-            {options}
-
-    Raises:
-        ViewError: There is not exactly one active agent.
-        SimEnvError: Something else cannot work. The subclass tells what.
+    {arguments}
+        {options}
     """
     plan = Plan.draw_up(simulation, points, options)
     return single_view(plan)(plan)
 
 
-@explain_options
+@explain_arguments
 def joint_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationJointEnv:
     """Make a Gymnasium environment with one agent that takes all decisions.
 
-    Args:
-        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
-        points: The active decision points, as ``generate_env`` takes them.
-        **options: Any of these:
+    All agents must be known beforehand. With ``flatten=True``, their spaces must be ones that can be concatenated.
 
-            {options}
-
-    Raises:
-        ViewError: Not all agents are known beforehand, or the spaces cannot be flattened.
-        SimEnvError: Something else cannot work. The subclass tells what.
+    {arguments}
+        {options}
     """
     return SimulationJointEnv(Plan.draw_up(simulation, points, options))
 
 
-@explain_options
+@explain_arguments
 def vector_env(
     simulation: Any,
     points: Points = None,
@@ -176,9 +129,7 @@ def vector_env(
 
     Each step returns what ``gymnasium.vector.SyncVectorEnv`` would return for as many single (or joint) views.
 
-    Args:
-        simulation: A simulation (which is copied), its class, a zero-argument factory, or a ``Variant``.
-        points: The active decision points, as ``generate_env`` takes them.
+    {arguments}
         num_envs: The number of simulations.
         workers: The number of worker processes. 0: all simulations are suspended in this process.
         view: "single" or "joint". None: single if one point with one agent is active, else joint.
@@ -188,12 +139,7 @@ def vector_env(
             ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
         context: The start method of workers: "spawn" (the default), "forkserver", "fork", or a context of
             ``multiprocessing``.
-        **options: Any of these:
-
-            {options}
-
-    Raises:
-        SimEnvError: Something cannot work. The subclass tells what.
+        {options}
     """
     return SimulationVectorEnv(
         simulation,

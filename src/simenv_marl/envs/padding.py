@@ -9,7 +9,6 @@ from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
 from ..core.agent import Agent
-from ..core.episode import Episode
 from ..errors import ViewError, short_repr
 from .agents import AgentsView
 from .parallel import Results
@@ -44,10 +43,8 @@ def _is_present(agent: Agent | None) -> bool:
 def _info(agent: Agent | None, info: dict[str, Any]) -> dict[str, Any]:
     """The info of an agent, with the entry ``"present"``. An absent agent has all actions legal."""
     if agent is not None and not _is_present(agent):
-        reward = agent.reward
         agent.clear_observation()
-        agent.reward = reward
-        info = {**agent.info, **{key: info[key] for key in ("deciding", "acted") if key in info}}
+        info = agent.info | {key: info[key] for key in ("deciding", "acted") if key in info}
     return {**info, "present": _is_present(agent)}
 
 
@@ -59,49 +56,38 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment; return the observations and infos of all possible agents."""
         observations, infos = super().reset(seed=seed, options=options)
-        observations, _, _, _, infos = self._padded((observations, {}, {}, {}, infos))
+        observations, *_, infos = self._padded((observations, {}, {}, {}, infos))
         return observations, infos
 
     def step(self, actions: Any) -> Results:
         """Play a round; return the results of all possible agents."""
+        view = cast("AgentsView", self.unwrapped)
         if isinstance(actions, Mapping) and self.agents:
-            agents = self._episode.agents
-            roster = {*self.possible_agents}
-            actions = {
-                name: action for name, action in actions.items() if name not in roster or _is_present(agents.get(name))
-            }
-        if not self.agents and not actions:
-            return cast("Results", super().step(actions))
+            absent = {name for name in view.possible_agents if not _is_present(view.episode.agents.get(name))}
+            actions = {name: action for name, action in actions.items() if name not in absent}
         try:
             results = cast("Results", super().step(actions))
-        except BaseException:
-            if self._episode_is_over():
+        finally:
+            if not view.agents:  # an error may have ended the episode
                 self.agents = []
-            raise
-        return self._padded(results)
-
-    @property
-    def _episode(self) -> Episode:
-        return cast("AgentsView", self.unwrapped).episode
-
-    def _episode_is_over(self) -> bool:
-        return not cast("AgentsView", self.unwrapped).agents
+        return self._padded(results) if results[0] else results  # they are empty after the end of the episode
 
     def _padded(self, results: Results) -> Results:
         """Add the agents that are not present to the results of a round, and let all agents end together."""
-        episode, view = self._episode, cast("AgentsView", self.unwrapped)
+        view = cast("AgentsView", self.unwrapped)
+        episode, roster = view.episode, view.possible_agents
         observations, rewards, _, _, infos = results
-        padded: Results = {}, {}, {}, {}, {}
-        for name in view.possible_agents:
-            agent = episode.agent(name)
-            info = infos.get(name, {"deciding": False, "acted": False})
-            is_present = _is_present(agent)
-            padded[0][name] = observations[name] if is_present else view._point(name).blank()
-            padded[1][name] = rewards.get(name, 0.0)
-            padded[2][name], padded[3][name] = episode.terminated, episode.truncated
-            padded[4][name] = _info(agent, info)
-        self.agents = [] if episode.over else list(view.possible_agents)
-        return padded
+        found = {name: episode.agent(name) for name in roster}
+        absent = {name: view._point(name).blank() for name, agent in found.items() if not _is_present(agent)}
+        idle = {"deciding": False, "acted": False}
+        self.agents = [] if episode.over else list(roster)
+        return (
+            {name: absent[name] if name in absent else observations[name] for name in roster},
+            {name: rewards.get(name, 0.0) for name in roster},
+            dict.fromkeys(roster, episode.terminated),
+            dict.fromkeys(roster, episode.truncated),
+            {name: _info(agent, infos.get(name, idle)) for name, agent in found.items()},
+        )
 
 
 class PaddedAECEnv(BaseWrapper[str, Any, Any]):
@@ -126,10 +112,9 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
             return
         try:
             super().step(action)
-        except BaseException:
+        finally:
             if not cast("AgentsView", self.unwrapped).agents:  # an error has ended the episode
                 self.agents = []
-            raise
         self._cumulative_rewards[selected] = 0.0
         self._update()
 
@@ -143,15 +128,14 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
 
     def _update(self) -> None:
         """Read the rewards, infos and ends of a reset or a step."""
-        view, env = cast("AgentsView", self.unwrapped), self.env
-        episode, rewards = view.episode, env.rewards
-        infos = {name: env.infos.get(name, {}) for name in view.possible_agents}
-        self.rewards = {name: rewards.get(name, 0.0) for name in view.possible_agents}
+        env, roster, episode = self.env, self.possible_agents, cast("AgentsView", self.unwrapped).episode
+        infos = {name: env.infos.get(name, {}) for name in roster}
+        self.rewards = {name: env.rewards.get(name, 0.0) for name in roster}
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
         for name, reward in self.rewards.items():
             self._cumulative_rewards[name] += reward
         self.infos = {name: _info(episode.agent(name), info) for name, info in infos.items()}
-        self.terminations = dict.fromkeys(view.possible_agents, episode.terminated)
-        self.truncations = dict.fromkeys(view.possible_agents, episode.truncated)
+        self.terminations = dict.fromkeys(roster, episode.terminated)
+        self.truncations = dict.fromkeys(roster, episode.truncated)
         self.agent_selection = self.agents[0] if episode.over else env.agent_selection

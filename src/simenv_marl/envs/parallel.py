@@ -6,11 +6,9 @@ from typing import Any
 from pettingzoo import ParallelEnv
 
 from ..core.episode import Episode
-from ..core.plan import Plan
 from ..core.spaces import duplicate
 from ..simulation import Sentinel
 from .agents import AgentsView
-from .base import View
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
 """The results of a step: observations, rewards, terminations, truncations and infos, by agent."""
@@ -30,43 +28,22 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
 
     in_rounds = True
 
-    def __init__(self, plan: Plan) -> None:
-        """Make the environment of a plan.
-
-        Raises:
-            SimEnvError: Something in the plan cannot work.
-        """
-        super().__init__(plan)
-        self.agents = []
-
-    @staticmethod
-    def metadata_of(plan: Plan) -> dict[str, Any]:
-        """Return the metadata of a plan's environments."""
-        return View.metadata_of(plan) | {"is_parallelizable": True}
-
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
         """Reset the simulation and run it to its first decision.
 
-        Args:
-            seed: The seed for the environment's generator, the agents' spaces, and the simulation's ``reset``. None:
-                the simulation gets a seed from the environment's generator.
-            options: Options for the simulation's ``reset``, if it takes them.
+        The arguments and errors are those of ``SimulationAECEnv.reset``.
 
         Returns:
             The observations and the infos, by agent.
-
-        Raises:
-            NoDecisionError: The simulation ended without a decision.
-            BaseException: Any exception of the model, a mapping or a policy.
         """
         with self._session.exclusive():
             episode = self._start(seed, options)
             self.agents = [*episode.agents, *(agent.name for agent in episode.just_ended)]
             if self._shows:
                 self.render()
-            observations, _, _, _, infos = self._results(episode)
+            observations, *_, infos = self._results(episode)
             return observations, infos
 
     def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
@@ -84,9 +61,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
 
         Raises:
             UnknownAgentError: An action is for an agent that does not live. The environment does not change.
-            InvalidActionError: An action is not legal. The environment does not change.
-            ResetNeededError: There is no running episode.
-            BaseException: Any exception of the model, a mapping or a policy.
+            BaseException: Any error of ``SimulationAECEnv.step``.
         """
         session = self._session
         if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
@@ -135,5 +110,4 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         return results
 
     def _clear(self) -> None:
-        super()._clear()
         self.agents = []

@@ -14,7 +14,6 @@ from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import asks_for_simulation
 from ..core.session import Session
-from ..decision import Definition
 from ..errors import ViewError
 from .one_agent import OneAgentView
 
@@ -30,33 +29,15 @@ class SimulationEnv(OneAgentView):
     _own: Any = None  # its agent during an episode
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan.
-
-        Args:
-            plan: The plan.
-            session: The simulation to use. None: a new one.
-
-        Raises:
-            ViewError: There is not exactly one active agent, or its name is unknown until it decides.
-            SimEnvError: Something else in the plan cannot work.
-        """
+        """Make the environment of a plan: see ``View``."""
         super().__init__(plan, session)
         self._agent = str(plan.one_agent)
         if self._session.episode is not None:
             self._own = self._session.episode.agent(self._agent)
 
-    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        definition = self._plan.active[0].definition
-        return copy.deepcopy((definition.observation_space, definition.action_space))
-
     @classmethod
     def check(cls, plan: Plan) -> None:
-        """Check that a plan allows this view.
-
-        Raises:
-            UnknownOptionError: An option is given that only another view takes.
-            ViewError: The plan does not allow the view.
-        """
+        """Check that a plan allows this view: see ``View``."""
         super().check(plan)
         if plan.one_agent is None:
             points = ", ".join(point.point.name for point in plan.active)
@@ -66,41 +47,14 @@ class SimulationEnv(OneAgentView):
                 " others with policies=, or use aec_env"
             )
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the simulation and run it to its first decision.
-
-        Args:
-            seed: The seed for the environment's generator, its spaces, and the simulation's ``reset``. None: the
-                simulation gets a seed from the environment's generator.
-            options: Options for the simulation's ``reset``, if it takes them.
-
-        Returns:
-            The observation and the info.
-
-        Raises:
-            NoDecisionError: The simulation ended without a decision.
-            BaseException: Any exception of the model, a mapping or a policy.
-        """
-        with self._session.exclusive():
-            self._own = own = self._start(seed, options).agent(self._agent)
-            assert own is not None
-            if self._shows:
-                self.render()
-            return own.observation, own.info
-
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Answer the pending decision and run to the next one.
-
-        Args:
-            action: An action in the action space, or ``RULE``.
+        """Answer the pending decision with an action, or ``RULE``, and run to the next one.
 
         Returns:
             Observation, reward (a Python float), terminated, truncated, info.
 
         Raises:
-            InvalidActionError: The action is not legal. The environment does not change.
-            ResetNeededError: There is no running episode.
-            BaseException: Any exception of the model, a mapping or a policy.
+            BaseException: Any error of ``SimulationAECEnv.step``.
         """
         session = self._session
         if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
@@ -117,34 +71,34 @@ class SimulationEnv(OneAgentView):
             return own.observation, own.reward, True, False, own.info
         return own.observation, own.reward, episode.terminated, episode.truncated, own.info
 
-    def _legal(self, episode: Episode) -> list[Any]:
+    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
+        definition = self._plan.active[0].definition
+        return copy.deepcopy((definition.observation_space, definition.action_space))
+
+    def _first_results(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
+        self._own = own = episode.agent(self._agent)
+        assert own is not None
+        return own.observation, own.info
+
+    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
+        return (self._own.observation,)
+
+    def _masks(self, episode: Episode) -> list[Any]:
         mask = self._own.mask
         return [open_mask(self.action_space) if mask is None else mask]
-
-    def _seen(self, episode: Episode) -> tuple[Any, ...]:
-        return (self._own.observation,)
 
     def _resume_from_replay(self) -> None:
         self._own = self._running().agents[self._agent]
 
     def _clear(self) -> None:
-        super()._clear()
         self._own = None
 
 
 class SimulationGoalEnv(SimulationEnv):
-    """A goal-based single view.
-
-    Made if the decision point has a ``goal_space``. Its observation space is a ``Dict`` of ``observation``,
-    ``achieved_goal`` and ``desired_goal``.
-    """
+    """The single view of a point with a goal: a ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``."""
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan.
-
-        Raises:
-            SimEnvError: Something in the plan cannot work.
-        """
+        """Make the environment of a plan: see ``View``."""
         self.check(plan)
         self._definition = plan.active[0].definition
         super().__init__(with_goals(plan), session)
@@ -169,32 +123,26 @@ class SimulationGoalEnv(SimulationEnv):
 
 def with_goals(plan: Plan) -> Plan:
     """Return the same plan with goals in the observations of its one decision point."""
-    return plan.redefined(plan.active[0].point, _with_goals(plan.active[0].definition))
-
-
-def _with_goals(definition: Definition) -> Definition:
-    goal_space, observe = definition.goal_space, definition.observation_space_mapping
-    achieved, desired = definition.achieved_goal_mapping, definition.desired_goal_mapping
-    assert goal_space is not None
-    assert achieved is not None
-    assert desired is not None
-
-    parts = {"observation": observe, "achieved_goal": achieved, "desired_goal": desired}
+    definition = plan.active[0].definition
+    parts: dict[str, Any] = {
+        "observation": definition.observation_space_mapping,
+        "achieved_goal": definition.achieved_goal_mapping,
+        "desired_goal": definition.desired_goal_mapping,
+    }
+    asking = {key for key, part in parts.items() if asks_for_simulation(part)}
 
     def observe_with_goals(*args: Any, **kwargs: Any) -> dict[str, Any]:
         return {key: part(*args, **kwargs) for key, part in parts.items()}
-
-    asking = {key for key, part in parts.items() if asks_for_simulation(part)}
 
     def observe_with_simulation(*args: Any, _simulation: Any, **kwargs: Any) -> dict[str, Any]:
         given = {"_simulation": _simulation}
         return {key: part(*args, **kwargs, **given if key in asking else {}) for key, part in parts.items()}
 
-    space = spaces.Dict(
-        {"observation": definition.observation_space, "achieved_goal": goal_space, "desired_goal": goal_space}
-    )
+    goal: Any = definition.goal_space
+    space = spaces.Dict({"observation": definition.observation_space, "achieved_goal": goal, "desired_goal": goal})
     mapping = observe_with_simulation if asking else observe_with_goals
-    return replace(definition, observation_space=space, observation_space_mapping=mapping)
+    changed = replace(definition, observation_space=space, observation_space_mapping=mapping)
+    return plan.redefined(plan.active[0].point, changed)
 
 
 def single_view(plan: Plan) -> type[SimulationEnv]:

@@ -24,6 +24,7 @@ from ray.rllib.utils.pre_checks.env import check_multiagent_environments
 from ray.tune.registry import register_env
 
 from simenv_marl import aec_env, parallel_env, simulate
+from simenv_marl.envs import pad_agents
 
 from . import commands
 from .page import DOCS, blocks
@@ -39,7 +40,7 @@ HIVES = {"parallel": (ParallelPettingZooEnv, parallel_env), "aec": (PettingZooEn
 def hive(view, definition=DEFINITION):
     """Bees that are born and die, in RLlib's wrapper."""
     wrapper, make = HIVES[view]
-    return wrapper(make(HiveSim, points(definition), possible_agents=BEES, padded=True))
+    return wrapper(pad_agents(make(HiveSim, points(definition), possible_agents=BEES)))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -13,6 +13,7 @@ from skrl.utils import set_seed
 from torch import nn
 
 from simenv_marl import generate_env, parallel_env, single_env, vector_env
+from simenv_marl.envs import pad_agents
 
 from . import page
 from .returns import parallel_return
@@ -103,8 +104,8 @@ def test_two_agents_that_need_each_other(kind, sees, state_space):
 def test_agents_that_are_born_and_die():
     """All of them are there all the time, as it wants them."""
     set_seed(0)
-    options = {"possible_agents": FORAGERS, "padded": True, "state_space": "observations"}
-    env = wrap_env(parallel_env(HerdSim, **options))
+    options = {"possible_agents": FORAGERS, "state_space": "observations"}
+    env = wrap_env(pad_agents(parallel_env(HerdSim, **options)))
     learner = learners(IPPO, env, "observations")
     act, evaluation = greedy(learner), parallel_env(HerdSim, possible_agents=FORAGERS)
     before = parallel_return(evaluation, act)

@@ -10,6 +10,7 @@ from pettingzoo.test import api_test, seed_test
 from stable_baselines3 import PPO
 
 from simenv_marl import TRUNCATED, aec_env, parallel_env
+from simenv_marl.envs import pad_agents
 from tests.worlds.counters import alike
 from tests.worlds.dials import ACTIONS, SEEN, Dial, DialEnv, dial_env, points, turned_by
 
@@ -242,10 +243,9 @@ def test_environments_that_were_reset_before_they_are_copied(processes):
     assert alike(ours, theirs)
 
 
-@pytest.mark.parametrize("options", [{"padded": True}, {}])
-def test_environments_in_which_agents_are_born_and_die(options):
-    env = parallel_env(HerdSim, possible_agents=FORAGERS, **options)
-    envs = vectors_of(env if options else suit["black_death_v3"](env), 0)
+@pytest.mark.parametrize("wrapper", [pad_agents, suit["black_death_v3"]])
+def test_environments_in_which_agents_are_born_and_die(wrapper):
+    envs = vectors_of(wrapper(parallel_env(HerdSim, possible_agents=FORAGERS)), 0)
     observations, _ = envs.reset(seed=1)
     ends = 0
     for _ in range(40):

@@ -14,6 +14,7 @@ from tianshou.trainer import OffPolicyTrainerParams
 from tianshou.utils.net.common import Net
 
 from simenv_marl import aec_env, make_step, single_env
+from simenv_marl.envs import pad_agents
 
 from . import page
 from .returns import aec_return
@@ -107,7 +108,8 @@ def test_agents_that_are_born_and_die():
     """Without padding an episode ends for it when the first of them dies."""
     days = {}
     for padded in (False, True):
-        env = PettingZooEnv(aec_env(HerdSim, possible_agents=FORAGERS, padded=padded))
+        env = aec_env(HerdSim, possible_agents=FORAGERS)
+        env = PettingZooEnv(pad_agents(env) if padded else env)
         days[padded] = []
         for seed in range(5):
             env.reset(seed=seed)
@@ -123,7 +125,7 @@ def test_agents_that_are_born_and_die():
 
 def test_training_of_agents_that_are_born_and_die():
     def make():
-        return PettingZooEnv(aec_env(HerdSim, possible_agents=FORAGERS, padded=True))
+        return PettingZooEnv(pad_agents(aec_env(HerdSim, possible_agents=FORAGERS)))
 
     np.random.seed(0)
     algorithms = [learner(spaces.Discrete(2), 2) for _ in FORAGERS]

@@ -9,6 +9,7 @@ from hive import BEES, DEFINITION, MASKED, Hive, HiveSim, points
 from torchrl.envs import ExplorationType, GymWrapper, PettingZooWrapper, check_env_specs, set_exploration_type
 
 from simenv_marl import RULE, aec_env, parallel_env, simulate
+from simenv_marl.envs import pad_agents
 
 from .page import blocks
 
@@ -51,7 +52,7 @@ def test_one_agent():
 @pytest.mark.parametrize("definition", [DEFINITION, MASKED], ids=["free", "masked"])
 def test_births_and_deaths(view, definition, grouped, done_on_any):
     env = PettingZooWrapper(
-        view(HiveSim, points(definition), possible_agents=BEES, padded=True),
+        pad_agents(view(HiveSim, points(definition), possible_agents=BEES)),
         use_mask=True,
         group_map=grouped,
         done_on_any=done_on_any,
@@ -72,7 +73,7 @@ def test_births_and_deaths(view, definition, grouped, done_on_any):
 @EVERY_VIEW
 def test_no_reward_is_lost(view):
     """All that bees bring home is in the rewards of a rollout: also what they brought on the day on which they died."""
-    base = view(HiveSim, points(), possible_agents=BEES, padded=True)
+    base = pad_agents(view(HiveSim, points(), possible_agents=BEES))
     env = PettingZooWrapper(base, use_mask=True, group_map={"bees": BEES})
     brought = []
     fly = Hive.update_day
@@ -98,8 +99,8 @@ def test_no_reward_is_lost(view):
 
 @EVERY_VIEW
 def test_its_state(view):
-    options = {"possible_agents": BEES, "padded": True, "state_space": spaces.Box(0, 1, (4,), np.float32)}
-    env = PettingZooWrapper(view(HiveSim, points(), **options), use_mask=True, return_state=True)
+    options = {"possible_agents": BEES, "state_space": spaces.Box(0, 1, (4,), np.float32)}
+    env = PettingZooWrapper(pad_agents(view(HiveSim, points(), **options)), use_mask=True, return_state=True)
     check_env_specs(env)
     assert env.rollout(5)["state"].shape == (5, 4)
 

@@ -18,6 +18,7 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
+from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
     EpisodeOverError,
@@ -285,7 +286,8 @@ def test_agents_that_die_on_the_way(view, method):
 
 @pytest.mark.parametrize("view", ["aec", "parallel"])
 def test_agents_that_die_and_stay_for_the_learner(view):
-    env = made(view, Mortal, padded=True)
+    env = pad_agents(made(view, Mortal))
+    env.reset(seed=5)
     told = action_values(env, futures=8, base=lambda observation: 2)
     assert told.returns == pytest.approx(expected(env, "left", number=8, model=Mortal, bases={"left": lambda seen: 2}))
 

@@ -25,6 +25,7 @@ from simenv_marl import (
     vector_env,
 )
 from simenv_marl.data import Mixture, collect_episodes, compare_with_rule, record_dataset
+from simenv_marl.envs import pad_agents
 from simenv_marl.errors import (
     BranchError,
     CopyError,
@@ -552,7 +553,6 @@ def test_seeds_tell_planners_apart():
     [
         {"skip_forced": True},
         {"max_steps": 4},
-        {"padded": True},
         {"global_rng": True},
         {"plugins": [(lambda duel: None, LEFT, "before"), (lambda duel: None, RIGHT, "after")]},
     ],
@@ -560,11 +560,20 @@ def test_seeds_tell_planners_apart():
 )
 @pytest.mark.parametrize("make", [aec_env, parallel_env])
 def test_options_of_the_environment(make, options):
+    check_both_methods(make, options)
+
+
+@pytest.mark.parametrize("make", [aec_env, parallel_env])
+def test_padded_environments(make):
+    check_both_methods(make, {}, wrapper=pad_agents)
+
+
+def check_both_methods(make, options, wrapper=lambda env: env):
     """By either method a planner finds the same, and what it does is what comes of it."""
     given, found = points(action_mask_mapping=lambda duel: [1, duel.turn % 2, duel.turn % 2]), []
     for method in ("fork", "replay"):
         noted = Noted(RolloutPolicy(futures=2, horizon=2, method=method))
-        env = make(Duel, given, policies={"left": noted}, **options)
+        env = wrapper(make(Duel, given, policies={"left": noted}, **options))
         env.reset(seed=5)
         for _ in range(3):
             env.step(1 if make is aec_env else {"right": 1})

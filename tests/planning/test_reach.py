@@ -25,6 +25,7 @@ from simenv_marl import (
     single_env,
 )
 from simenv_marl.data import collect_episodes
+from simenv_marl.envs import pad_agents
 from simenv_marl.errors import BranchError, OptionValueError
 from simenv_marl.planning import RolloutPolicy, action_values
 from tests.processes import gone
@@ -122,9 +123,9 @@ def test_what_an_action_is_worth_reaches_to_the_next_decision(view):
     assert turn.means.tolist() == [100, 101, 102]
 
 
-@pytest.mark.parametrize("options", [{}, {"padded": True, "possible_agents": ["first", "second"]}])
-def test_the_first_of_padded_rounds(options):
-    env = begun(parallel_env(Pair, POINTS, **options))
+@pytest.mark.parametrize("wrapper", [lambda env: env, pad_agents])
+def test_the_first_of_padded_rounds(wrapper):
+    env = begun(wrapper(parallel_env(Pair, POINTS, possible_agents=["first", "second"])))
     assert action_values(env, futures=1, horizon=1).means.tolist() == [1, 2, 3]
     assert RolloutPolicy(futures=1, horizon=1).choose(env).best == 2
 

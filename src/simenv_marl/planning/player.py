@@ -258,7 +258,7 @@ class ParallelPlayer(Player):
         observations, rewards, terminations, truncations, infos = self._step_env(actions | others, self.agent)
         self._seen = {name: (observations[name], infos.get(name, {})) for name in observations}
         over = terminations.get(self.agent, True) or truncations.get(self.agent, True)
-        self.over = bool(over or self.record.ended)  # with padded=True, ended agents stay
+        self.over = bool(over or self.record.ended)  # pad_agents keeps ended agents
         return float(rewards.get(self.agent, 0.0))
 
 

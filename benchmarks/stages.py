@@ -23,9 +23,9 @@ def measure(rounds: int, number: int) -> Section:
     episode = env.unwrapped._session.episode
     bare, resume, values = bare_greenlet().switch, episode.driver.resume, np.zeros(4, np.float32)
 
-    def arise() -> None:
+    def handle() -> None:
         event, args, kwargs = resume(1)
-        event.arise(episode, args, kwargs)
+        event.handle(episode, args, kwargs)
 
     def array_after_switch() -> None:
         bare()
@@ -39,7 +39,7 @@ def measure(rounds: int, number: int) -> Section:
         "an empty call": lambda: None,
         "a bare switch there and back": bare,
         "driver.resume: the model goes on and decides again": lambda: resume(1),
-        "and event.arise: reward, info and observation": arise,
+        "and event.handle: reward, info and observation": handle,
         "Episode.step: the action checked and mapped, too": lambda: episode.step(1),
         "env.step": lambda: env.step(1),
         "env.step and env.last": last,

@@ -165,7 +165,9 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     """
     recording = Trace()
     with LOCK:
-        hooks = [target for target in list(Target.all) if isinstance(target, Hook) and (target.for_good or target.slot)]
+        hooks = [
+            target for target in list(Target.all) if isinstance(target, Hook) and (target.permanent or target.slot)
+        ]
         found = [find_target(target) for target in targets] if targets else [current_target(hook) for hook in hooks]
         functions = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
         installation = Installation([Attachment((function, recording) for function in functions)])

@@ -12,7 +12,7 @@ from greenlet import GreenletExit, getcurrent, greenlet
 
 from ..errors import WrongThreadError
 from ..hooks.hook import Hook
-from ..hooks.stacks import STACKS, Taker
+from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import RULE
 from .driver import FINISHED, NO_EVENTS, Driver, Event, SimulationExit, reporting_rule
 from .loops import ASYNCIO, Loops, silence_unwound_tasks
@@ -132,7 +132,7 @@ class GreenletDriver(Driver):
                 self.idle = True
                 self._leave(*event)
 
-    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Taker:
+    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
         deliver, driver, loops = event.deliver, self, self._loops
         rule = reporting_rule(hook, event, lambda report: self._decider(hook, report, away))
 

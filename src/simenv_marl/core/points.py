@@ -61,7 +61,7 @@ def portable(key: Any, name: str | None = None) -> Any:
 
 
 class Member:
-    """The stand-in by which a function of a class in the main module is pickled: the class and the function's name.
+    """The form in which a function of a class in the main module is pickled: the class and the function's name.
 
     The rule of a decision function cannot be pickled by name, because the name leads to the decision function.
     """
@@ -169,7 +169,7 @@ def locate(key: Any, own: Mapping[DecisionPoint, Definition] = MappingProxyType(
         if decorated is None:
             raise
         return decorated  # decorated inside a function
-    if decorated is not None and (hook.point is None or not hook.for_good):
+    if decorated is not None and (hook.point is None or not hook.permanent):
         return decorated  # not yet assigned to its name
     return point_for(hook)
 
@@ -204,7 +204,7 @@ def aliases(point: DecisionPoint) -> list[DecisionPoint]:
 
 def _decorated_owners(point: DecisionPoint) -> set[Any]:
     """Return the classes and modules that have a decision function of the point under the function's own name."""
-    name, wrappers = point.rule.__name__, point.hook.stand_ins
+    name, wrappers = point.rule.__name__, point.hook.wrappers
     owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
     found = ((owner, unbind(vars(owner).get(name))) for owner in owners)
     return {owner for owner, function in found if isinstance(function, FunctionType) and function in wrappers}

@@ -242,7 +242,7 @@ def _reduced(thing: Any) -> tuple[Any, ...] | None:
     if there is not None and unwrapped(there) is thing:
         return _rule_at, (thing.__module__, thing.__qualname__)
     hook = hook_of(thing)
-    return None if hook is None else (_restore_stand_in, (_token(thing), hook, made_with(thing)))
+    return None if hook is None else (_restore_wrapper, (_token(thing), hook, made_with(thing)))
 
 
 def _found_at(module: str, path: str, *, bound: bool = False) -> Any:
@@ -287,5 +287,5 @@ def _restored(token: str, make: Callable[[], Any]) -> Any:
     return thing
 
 
-def _restore_stand_in(token: str, hook: Hook, definition: Definition | None) -> Any:
-    return _restored(token, lambda: hook.stand_in(definition))
+def _restore_wrapper(token: str, hook: Hook, definition: Definition | None) -> Any:
+    return _restored(token, lambda: hook.make_wrapper(definition))

@@ -151,7 +151,7 @@ def expose(thing: Any) -> Any:
     if callable(thing):
         hook = Hook(thing, f"{getattr(thing, '__module__', None) or '?'}.{name_of(thing)}")
         hook.exposed = True
-        return hook.stand_in()
+        return hook.make_wrapper()
     raise PatchError(f"{short_repr(thing)} cannot be exposed to plugins: it is neither a function nor an iterable")
 
 
@@ -160,7 +160,7 @@ def _expose_function(thing: Any) -> Any:
     wrapper = _permanent_wrapper(function)
     hook = hook_of(wrapper) or permanent_hook(thing)[0]
     if wrapper is None:
-        wrapper = hook.stand_in()
+        wrapper = hook.make_wrapper()
     hook.exposed = True
     if isinstance(thing, (staticmethod, classmethod)) and thing.__func__ is wrapper:
         return thing
@@ -171,7 +171,7 @@ def _permanent_wrapper(function: FunctionType) -> Any:
     """Return the wrapper of a function that is decorated or exposed already; None if there is none."""
     hook = hook_of(function)
     if hook is not None:
-        return function if hook.for_good else None
+        return function if hook.permanent else None
     try:
         owner, attribute = resolve(f"{function.__module__}.{function.__qualname__}", TARGET)
     except (UnknownTargetError, PatchError, ImportError):

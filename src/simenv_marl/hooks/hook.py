@@ -1,8 +1,8 @@
 """Hooks: one for each function of a model that is decided or extended, with functions that stand in front of it.
 
-A *stand-in* looks and behaves like the function, has its signature, and costs almost nothing while the hook has no
-*takers*. A call finds its taker by the greenlet it runs in. For an episode, a driver enters the stack of its
-simulation, with the environment's decision inside and the handlers around it; at the end it removes the entry.
+A *wrapper* looks and behaves like the function, has its signature, and costs almost nothing while the hook has no
+*interceptors*. A call finds its interceptor by the greenlet it runs in. For an episode, a driver enters its
+simulation's stack, with the environment's decision inside and the handlers around it; at the end it removes the entry.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
 from .handlers import CALLS, ITEMS
-from .stacks import EVALUATING, STACKS, Taker, spawner_of, stack_of
+from .stacks import EVALUATING, STACKS, Interceptor, spawner_of, stack_of
 from .targets import AROUND, Target
 
 _ABSENT: Final = object()
@@ -27,29 +27,29 @@ _ABSENT: Final = object()
 _TAKEN: Final = ("ABSENT", "NOTHING", "bind", "rule")
 """Names that the code below uses."""
 
-_FILE: Final = "<stand-in for "
+_FILE: Final = "<wrapper of "
 
-_ASK: Final = "(TAKERS.get(getcurrent()) or elsewhere)({}, {})".format
+_ASK: Final = "(INTERCEPTORS.get(getcurrent()) or elsewhere)({}, {})".format
 
-_RULE = "not TAKERS or not OTHERS and getcurrent().parent is None"
-"""Whether the rule decides at once: the hook has no takers, or its takers are all on stacks of simulations, and the
+_RULE = "not INTERCEPTORS or not OTHERS and getcurrent().parent is None"
+"""Whether the rule decides at once: the hook has no interceptors, or they are all on stacks of simulations, and the
 call comes from the root of a thread."""
 
 _SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
 
 _CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
 
-# This determines the cost of a call without takers. A method without arguments besides ``self`` costs two plain calls.
+# This determines the cost of a call without interceptors. A method with no argument but ``self`` costs two plain calls.
 # If arguments can be passed by keyword it costs three, because mappings and handlers must get them as they were
 # passed.
 _WITHOUT_ARGUMENTS = """
-{define} stand_in({names}):
+{define} wrapper({names}):
     if {at_once}:
         return {rule}
     return {ask}
 """
 _WITH_ARGUMENTS = """
-{define} stand_in({positional}, /, **kwargs):
+{define} wrapper({positional}, /, **kwargs):
     if kwargs or {last} is ABSENT:
         args = {passed}
         if {at_once}:
@@ -62,7 +62,7 @@ _WITH_ARGUMENTS = """
     return {ask_all}
 """
 _VARIADIC = """
-{define} stand_in(*args, **kwargs):
+{define} wrapper(*args, **kwargs):
     if {at_once}:
         return {rule_as_passed}
     bind(*args, **kwargs)
@@ -103,7 +103,7 @@ def generate(
     alone: bool,
     namespace: Mapping[str, Any],
 ) -> FunctionType:
-    """Generate the stand-in of a function.
+    """Generate the wrapper of a function.
 
     Args:
         rule: The function.
@@ -161,7 +161,7 @@ def generate(
         **namespace,
     }
     exec(compile(template.format(**values), f"{_FILE}{name}>", "exec"), scope)
-    function: FunctionType = scope["stand_in"]
+    function: FunctionType = scope["wrapper"]
     function.__code__ = function.__code__.replace(co_name=getattr(rule, "__name__", "call"))  # the name in tracebacks
     update_wrapper(function, rule)
     return function
@@ -176,8 +176,8 @@ def _is_required(parameter: inspect.Parameter) -> bool:
     return positional and parameter.default is parameter.empty
 
 
-def stands_in(function: Any) -> bool:
-    """Return whether a function is a stand-in."""
+def is_wrapper(function: Any) -> bool:
+    """Return whether a function is a wrapper."""
     # Checked by its code, not by an attribute: other decorators copy a function's attributes.
     return isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE)
 
@@ -188,8 +188,8 @@ MADE_OF: Final[WeakKeyDictionary[Any, WeakSet[Hook]]] = WeakKeyDictionary()
 """The hooks in front of each function, one per decoration."""
 
 
-class _Takers(dict[Any, Taker]):
-    """The takers of one hook. A stand-in that is pickled by value finds those of the process where it is unpickled."""
+class _Interceptors(dict[Any, Interceptor]):
+    """The interceptors of one hook. A wrapper that is pickled by value finds those of the process it arrives in."""
 
     __slots__ = ("hook", "others")
 
@@ -198,22 +198,22 @@ class _Takers(dict[Any, Taker]):
         self.hook = hook
         self.others = _Others(hook)
 
-    def __setitem__(self, key: Any, taker: Taker) -> None:
-        super().__setitem__(key, taker)
+    def __setitem__(self, key: Any, interceptor: Interceptor) -> None:
+        super().__setitem__(key, interceptor)
         if not isinstance(key, greenlet) or key.parent is None:
             self.others.add(key)
 
     def remove(self, key: Any) -> None:
-        """Remove the taker of a key, if there is one."""
+        """Remove the interceptor of a key, if there is one."""
         self.pop(key, None)
         self.others.discard(key)
 
     def __reduce__(self) -> Any:
-        return getattr, (self.hook, "takers")
+        return getattr, (self.hook, "interceptors")
 
 
 class _Others(set[Any]):
-    """The keys of takers that are no greenlet's stack (a thread's root, plugins, None), and drivers with threads."""
+    """The keys that are no stack of a greenlet (a thread's root, plugins, None), and drivers with threads."""
 
     __slots__ = ("_hook",)
 
@@ -226,15 +226,15 @@ class _Others(set[Any]):
 
 
 def _others_of(hook: Hook) -> _Others:
-    return hook.takers.others
+    return hook.interceptors.others
 
 
 class Elsewhere:
-    """What a stand-in calls if its hook has no taker for the call.
+    """What a wrapper calls if its hook has no interceptor for the call.
 
     Attributes:
         hook: The hook.
-        made_with: The object that the stand-in was made with, for the layer above. It is kept here because a stand-in
+        made_with: The object that the wrapper was made with, for the layer above. It is kept here because a wrapper
             that is pickled by value takes along only what its code names.
     """
 
@@ -250,15 +250,15 @@ class Elsewhere:
             WrongThreadError: It is a decision, and the simulation cannot wait for its answer here.
         """
         hook = self.hook
-        taker = hook.taker_at(getcurrent())
-        if taker is not None:
-            return taker(args, kwargs)
+        interceptor = hook.interceptor_at(getcurrent())
+        if interceptor is not None:
+            return interceptor(args, kwargs)
         rule = hook.rule
         return rule(*args, **kwargs) if kwargs else rule(*args)
 
 
 class Hook(Target):
-    """A function of a model that is decided or extended, with the takers of its calls.
+    """A function of a model that is decided or extended, with the interceptors of its calls.
 
     Attributes:
         function: The function.
@@ -266,11 +266,11 @@ class Hook(Target):
         kind: What a call returns: "function" (a value), "generator" or "coroutine".
         bound: Whether its first argument is the object it is called on, which is never passed by keyword.
         alone: Whether every call has one argument, the object it is called on.
-        takers: The takers of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
+        interceptors: Those of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
             other calls while an environment with these plugins, or without plugins, is evaluated.
-        stand_ins: The functions that stand in front of the function.
-        place: The place of a stand-in while the hook is installed; None if none is to be set.
-        for_good: Whether a stand-in was set permanently, as a decorated or exposed function.
+        wrappers: The functions that stand in front of the function.
+        place: The place of a wrapper while the hook is installed; None if none is to be set.
+        permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
         point: The object that the layer above makes of the hook.
     """
 
@@ -282,7 +282,7 @@ class Hook(Target):
             name: Its dotted name.
             bound: Whether, in a class, its first argument is the object it is called on.
             like: The function that determines what calls return, if ``function`` only forwards to it.
-            place: The place for a temporary stand-in.
+            place: The place for a temporary wrapper.
 
         Raises:
             PatchError: It is an async generator function.
@@ -298,12 +298,12 @@ class Hook(Target):
             self._own = None  # the signature is unknown
         self.bound = bound and is_method(function, name)
         self.alone = self._own is not None and is_alone(self._own, bound=self.bound)
-        self.takers = _Takers(self)
-        self.stand_ins: WeakSet[FunctionType] = WeakSet()
+        self.interceptors = _Interceptors(self)
+        self.wrappers: WeakSet[FunctionType] = WeakSet()
         self.place = place
-        self.for_good = place is None
+        self.permanent = place is None
         self.point: Any = None
-        self._set: FunctionType | None = None  # the temporary stand-in
+        self._set: FunctionType | None = None  # the temporary wrapper
         iterates = self.kind == "generator"
         super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is not a generator function", signature)
         with suppress(TypeError):  # not all objects can be referenced weakly
@@ -313,8 +313,8 @@ class Hook(Target):
         made_of = (self.function, self.name, self.bound, self.kind, self.exposed)
         return _restored, made_of, self.point, None, None, _came_along
 
-    def stand_in(self, made_with: Any = None) -> FunctionType:
-        """Make a permanent stand-in of the hook's function.
+    def make_wrapper(self, made_with: Any = None) -> FunctionType:
+        """Make a permanent wrapper of the hook's function.
 
         Args:
             made_with: The object that the function ``made_with`` returns for it.
@@ -326,24 +326,24 @@ class Hook(Target):
             kind=self.kind,
             alone=self.alone,
             namespace={
-                "TAKERS": self.takers,
-                "OTHERS": self.takers.others,
+                "INTERCEPTORS": self.interceptors,
+                "OTHERS": self.interceptors.others,
                 "elsewhere": Elsewhere(self, made_with).__call__,
                 "getcurrent": getcurrent,
             },
         )
-        self.stand_ins.add(made)
+        self.wrappers.add(made)
         return made
 
     # -- where it is set --------------------------------------------------------------------------
 
     @property
     def stale(self) -> bool:
-        """Whether something else has replaced it while no stand-in was set in its place."""
+        """Whether something else has replaced it while no wrapper was set in its place."""
         return self.place is not None and not self._users and not self.place.is_free(self)
 
     def install(self, user: object) -> None:
-        """Set a stand-in in its place until every user has called ``uninstall``.
+        """Set a wrapper in its place until every user has called ``uninstall``.
 
         Raises:
             PatchError: The place cannot be patched, or something else was set there meanwhile.
@@ -353,7 +353,7 @@ class Hook(Target):
 
     def _apply(self) -> None:
         if self._set is None:
-            self._set = self.stand_in()
+            self._set = self.make_wrapper()
         self.place.put(self, self._set)
 
     def _revert(self) -> None:
@@ -362,8 +362,8 @@ class Hook(Target):
 
     # -- who takes part ---------------------------------------------------------------------------
 
-    def enter(self, stack: greenlet, decide: Taker | None, plugins: Any) -> None:
-        """Enter a taker for calls on the stack of a simulation.
+    def enter(self, stack: greenlet, decide: Interceptor | None, plugins: Any) -> None:
+        """Enter an interceptor for calls on the stack of a simulation.
 
         Args:
             stack: The stack.
@@ -371,18 +371,18 @@ class Hook(Target):
             plugins: The plugins of the simulation's environment.
         """
         if decide is not None:
-            self.takers[stack] = self.around(decide, plugins)
+            self.interceptors[stack] = self.around(decide, plugins)
         elif plugins in self.slot and plugins is not None:
-            self.takers[stack] = self.around(self.run_rule, plugins)
+            self.interceptors[stack] = self.around(self.run_rule, plugins)
         else:
-            self.takers.remove(stack)
+            self.interceptors.remove(stack)
 
     def leave(self, stack: greenlet) -> None:
-        """Remove the taker of a stack."""
-        self.takers.remove(stack)
+        """Remove the interceptor of a stack."""
+        self.interceptors.remove(stack)
 
-    def around(self, inner: Taker, plugins: Any) -> Taker:
-        """Return a taker that runs the handlers of plugins, or of the whole process, around ``inner``."""
+    def around(self, inner: Interceptor, plugins: Any) -> Interceptor:
+        """Return an interceptor that runs the handlers of plugins, or of the whole process, around ``inner``."""
         found = self.slot.get(plugins) or self.slot.get(None)
         return inner if found is None else partial(AROUND[self.kind], found, self.slot, inner)
 
@@ -398,53 +398,53 @@ class Hook(Target):
         self.rule = self.function if rule is None else rule
         self._changed()
 
-    def taker_at(self, here: greenlet) -> Taker | None:
-        """Return the taker of a call in a greenlet; None if only the rule runs."""
+    def interceptor_at(self, here: greenlet) -> Interceptor | None:
+        """Return the interceptor of a call in a greenlet; None if only the rule runs."""
         driver = stack_of(here) if STACKS else None
         if hasattr(here, "spawning_greenlet"):
             spawner = spawner_of(here)
             if spawner is not None and not spawner.own_thread and spawner.decides(self):
-                taker: Taker = spawner.refuse(self, _SPAWNED)
-                return taker
+                interceptor: Interceptor = spawner.refuse(self, _SPAWNED)
+                return interceptor
         if driver is None:
             evaluation = EVALUATING.get(here)
             plugins = None if evaluation is None else evaluation.plugins
         else:
             plugins = driver.plugins
-            decide = driver.taker(self)
+            decide = driver.interceptor(self)
             if decide is not None:
                 return self.around(decide, plugins)
-        return self.takers.get(plugins) or self.takers.get(None)
+        return self.interceptors.get(plugins) or self.interceptors.get(None)
 
     def _changed(self) -> None:
-        takers, slot = self.takers, self.slot
+        interceptors, slot = self.interceptors, self.slot
         for plugins in list(slot) if self.rule is self.function else [None, *slot]:  # garbage collection may change it
-            takers[plugins] = self.around(self.run_rule, plugins)
-        for key, taker in list(takers.items()):
+            interceptors[plugins] = self.around(self.run_rule, plugins)
+        for key, interceptor in list(interceptors.items()):
             if not isinstance(key, greenlet):
                 if key not in slot and (key is not None or self.rule is self.function):
-                    takers.remove(key)
+                    interceptors.remove(key)
                 continue
-            inner = taker.args[2] if isinstance(taker, partial) else taker
+            inner = interceptor.args[2] if isinstance(interceptor, partial) else interceptor
             plugins = getattr(STACKS.get(key), "plugins", None)
             self.enter(key, None if inner == self.run_rule else inner, plugins)
 
 
 def hook_of(function: Any) -> Hook | None:
-    """Return the hook of a stand-in; None for any other function."""
-    if stands_in(function):
+    """Return the hook of a wrapper; None for any other function."""
+    if is_wrapper(function):
         hook: Hook = function.__globals__["elsewhere"].__self__.hook
         return hook
     return None
 
 
 def made_with(function: FunctionType) -> Any:
-    """Return the object that a stand-in was made with."""
+    """Return the object that a wrapper was made with."""
     return function.__globals__["elsewhere"].__self__.made_with
 
 
-def beneath(function: Any) -> Any:
-    """Return the function behind a stand-in; any other function itself."""
+def unwrap(function: Any) -> Any:
+    """Return the function behind a wrapper; any other function itself."""
     hook = hook_of(function)
     return function if hook is None else hook.function
 

@@ -17,7 +17,7 @@ from typing import Any, Final, Protocol
 
 from greenlet import getcurrent, greenlet
 
-Taker = Callable[[tuple[Any, ...], dict[str, Any]], Any]
+Interceptor = Callable[[tuple[Any, ...], dict[str, Any]], Any]
 """A function that intercepts a call. It gets the positional and keyword arguments, and returns the call's result."""
 
 LOCK: Final = RLock()

@@ -81,7 +81,7 @@ def point_named(name: str) -> Point:
         pass
 
     deciding, removing = _hook(decide, name), _hook(remove, f"{name} (removed)")
-    functions = Point(deciding.stand_in(), removing.stand_in())
+    functions = Point(deciding.make_wrapper(), removing.make_wrapper())
     point_for(deciding).removed_by[functions.remove] = None
     return functions
 

@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 from .decision import decision_points
 from .errors import HandlerError, name_of, short_repr
-from .hooks.finding import current_target, expose, exposed_functions, find_target
-from .hooks.handlers import ChangedArgs, ChangedResult
+from .hooks.finding import expose, exposed_functions, find_target
+from .hooks.handlers import Call, ChangedArgs, ChangedResult, Trace
 from .hooks.hook import Hook
 from .hooks.patches import Installation
 from .hooks.plugins import Attachment, Entry, make_handler
 from .hooks.stacks import LOCK
-from .hooks.targets import Call, Target, Trace
+from .hooks.targets import Target
 
 __all__ = [
     "Call",
@@ -48,7 +48,7 @@ def attached_handlers(env: Any = None) -> list[Entry]:
     if env is not None:
         entries: list[Entry] = env.unwrapped.plugins
         return entries
-    targets = sorted(Target.all, key=lambda target: target.name)
+    targets = sorted(Target.all.values(), key=lambda target: target.name)
     return [(handler.function, target.name, handler.position) for target in targets for handler in target.handlers]
 
 
@@ -165,12 +165,10 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     """
     recording = Trace()
     with LOCK:
-        hooks = [
-            target for target in list(Target.all) if isinstance(target, Hook) and (target.permanent or target.slot)
-        ]
-        found = [find_target(target) for target in targets] if targets else [current_target(hook) for hook in hooks]
-        functions = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
-        installation = Installation([Attachment((function, recording) for function in functions)])
+        found = [find_target(target) for target in targets] if targets else list(Target.all.values())
+        hooks = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
+        traced = [hook for hook in hooks if targets or hook.permanent or hook.slot]
+        installation = Installation([Attachment((hook, recording) for hook in traced)])
     try:
         yield recording.calls
     finally:

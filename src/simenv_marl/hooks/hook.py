@@ -1,4 +1,4 @@
-"""Hooks: one for each function of a model that is decided or extended, with functions that stand in front of it.
+"""Hooks: one for each function of a model that is decided or extended, with wrappers in front of it.
 
 A *wrapper* looks and behaves like the function, has its signature, and costs almost nothing while the hook has no
 *interceptors*. A call finds its interceptor by the greenlet it runs in. For an episode, a driver enters its
@@ -8,7 +8,6 @@ simulation's stack, with the environment's decision inside and the handlers arou
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial, update_wrapper
 from types import FunctionType
@@ -20,166 +19,101 @@ from greenlet import getcurrent, greenlet
 from ..errors import PatchError
 from .handlers import CALLS, ITEMS
 from .stacks import EVALUATING, STACKS, Interceptor, spawner_of, stack_of
-from .targets import AROUND, Target
+from .targets import Target
+
+_SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
+
+# -- wrappers -------------------------------------------------------------------------------------
 
 _ABSENT: Final = object()
-
-_TAKEN: Final = ("ABSENT", "NOTHING", "bind", "rule")
-"""Names that the code below uses."""
+"""The default of arguments that a call may leave out, because interceptors must get them as they were passed."""
 
 _FILE: Final = "<wrapper of "
 
-_ASK: Final = "(INTERCEPTORS.get(getcurrent()) or elsewhere)({}, {})".format
+_MADE_WITH: Final = "__simenv_marl__"
+"""The attribute of a wrapper with its hook and the object that it was made with."""
 
 _RULE = "not INTERCEPTORS or not OTHERS and getcurrent().parent is None"
 """Whether the rule decides at once: the hook has no interceptors, or they are all on stacks of simulations, and the
 call comes from the root of a thread."""
 
-_SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
+_INTERCEPT = "(INTERCEPTORS.get(getcurrent()) or intercept)"
 
-_CALL = {"function": "{}", "generator": "(yield from {})", "coroutine": "(await {})"}
+_RETURN = {"function": "return {}", "generator": "return (yield from {})", "coroutine": "return (await {})"}
 
-# This determines the cost of a call without interceptors. A method with no argument but ``self`` costs two plain calls.
-# If arguments can be passed by keyword it costs three, because mappings and handlers must get them as they were
-# passed.
-_WITHOUT_ARGUMENTS = """
-{define} wrapper({names}):
-    if {at_once}:
-        return {rule}
-    return {ask}
-"""
-_WITH_ARGUMENTS = """
-{define} wrapper({positional}, /, **kwargs):
-    if kwargs or {last} is ABSENT:
+# This determines the cost of a call without interceptors: two plain calls if ``incomplete`` is "False", else three.
+_TEMPLATE = """
+def wrapper({parameters}):
+    if {incomplete}:
         args = {passed}
-        if {at_once}:
-            return {rule_as_passed}
-        if kwargs or len(args) < {required}:
-            bind(*args, **kwargs)
-        return {ask}
-    if {at_once} or {wrong}:
-        return {rule}
-    return {ask_all}
-"""
-_VARIADIC = """
-{define} wrapper(*args, **kwargs):
-    if {at_once}:
-        return {rule_as_passed}
-    bind(*args, **kwargs)
-    return {ask}
+        if {rule} or ({doubtful}) and not fits(*args, **kwargs):
+            {rule_as_passed}
+        {intercept_as_passed}
+    if {rule}:
+        {rule_at_once}
+    {intercept}
 """
 
 
-def kind_of(function: Any, name: str) -> str:
-    """Return what a call of a function returns: "function" (its value), "generator" or "coroutine".
-
-    Raises:
-        PatchError: It is an async generator function.
-    """
-    if inspect.isasyncgenfunction(function):
-        raise PatchError(f"{name} is an async generator function, which cannot return a decision or call handlers")
-    if inspect.isgeneratorfunction(function):
-        return "generator"
-    return "coroutine" if inspect.iscoroutinefunction(function) else "function"
-
-
-def is_method(function: Any, name: str) -> bool:
-    """Return whether a function of that dotted name was defined in a class."""
-    return "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
-
-
-def is_alone(signature: inspect.Signature, *, bound: bool) -> bool:
-    """Return whether every call has one argument: the object it is called on, never passed by keyword."""
-    parameters = list(signature.parameters.values())
-    return bound and len(parameters) == 1 and _is_required(parameters[0])
-
-
-def generate(
-    rule: Any,
-    signature: inspect.Signature | None,
-    *,
-    name: str,
-    kind: str,
-    alone: bool,
-    namespace: Mapping[str, Any],
-) -> FunctionType:
-    """Generate the wrapper of a function.
-
-    Args:
-        rule: The function.
-        signature: Its signature; None if it is unknown.
-        name: Its dotted name.
-        kind: What a call returns, as ``kind_of`` returns it.
-        alone: The result of ``is_alone``.
-        namespace: The values of the names in ``_ASK``.
-    """
-    parameters = signature.parameters.values() if signature is not None else ()
+def _source(hook: Hook, scope: dict[str, Any]) -> str:
+    """Return the source code of a hook's wrappers; ``scope`` has the names that it uses."""
+    signature = hook.own_signature
+    parameters = [] if signature is None else list(signature.parameters.values())
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
-    # Keep the parameter's name: if a staticmethod looks like a method, it may be passed by keyword.
-    alone = alone and positional[0].name not in {*namespace, *_TAKEN}
-    if alone:
-        names = [positional[0].name]
-    call = _CALL[kind].format
-    values = {
-        "define": "async def" if kind == "coroutine" else "def",
-        "names": ", ".join(names),
-        "rule": call(f"rule({', '.join(names)})"),
-        "rule_as_passed": call("rule(*args, **kwargs)"),
-        "ask": call(_ASK("args", "kwargs")),
-        "at_once": _RULE,
-    }
-    if signature is None:
-        template = _VARIADIC
-    elif alone or not parameters:
-        template = _WITHOUT_ARGUMENTS
-        values["ask"] = call(_ASK(f"({names[0]},)" if names else "()", "NOTHING"))
+    incomplete = doubtful = "True"
+    passed, accepted = "args", "*args, **kwargs"
+    if (hook.alone and parameters[0].name not in scope) or (signature is not None and not parameters):
+        incomplete = "False"
+        names = [p.name for p in positional]  # a staticmethod that looks like a method may be passed it by keyword
+        accepted = ", ".join(names)
     elif positional and not any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        template = _WITH_ARGUMENTS
         required = sum(p.default is p.empty for p in positional)
+        doubtful = f"kwargs or len(args) < {required}"
         if any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in parameters):
-            required = len(names) + 1  # a call without keywords is wrong
+            doubtful = "True"
+        else:
+            incomplete = f"kwargs or {names[-1]} is ABSENT"
+        accepted = ", ".join(f"{name}=ABSENT" for name in names) + ", /, **kwargs"
         passed = "()"
-        for number, absent in enumerate(names):
-            passed = f"({', '.join(names[: number + 1])},) if {absent} is not ABSENT else {passed}"
-        values |= {
-            "positional": ", ".join(f"{absent}=ABSENT" for absent in names),
-            "passed": passed,
-            "last": names[-1],
-            "required": str(required),
-            "wrong": str(required > len(names)),  # the rule raises Python's own error
-            "ask_all": call(_ASK(f"({', '.join(names)},)", "kwargs")),
-        }
-    else:
-        template = _VARIADIC
-    scope: dict[str, Any] = {
-        "ABSENT": _ABSENT,
-        "NOTHING": {},  # shared by all calls, since it is only unpacked
-        "bind": signature.bind if signature is not None else _anything,
-        "rule": rule,
-        "__name__": __name__,
-        **namespace,
-    }
-    exec(compile(template.format(**values), f"{_FILE}{name}>", "exec"), scope)
-    function: FunctionType = scope["wrapper"]
-    function.__code__ = function.__code__.replace(co_name=getattr(rule, "__name__", "call"))  # the name in tracebacks
-    update_wrapper(function, rule)
-    return function
-
-
-def _anything(*args: Any, **kwargs: Any) -> None:
-    """Accept any arguments, if the signature is unknown."""
-
-
-def _is_required(parameter: inspect.Parameter) -> bool:
-    positional = parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-    return positional and parameter.default is parameter.empty
+        for number, name in enumerate(names):
+            passed = f"({', '.join(names[: number + 1])},) if {name} is not ABSENT else {passed}"
+    given = ", ".join(names)
+    answer = _RETURN[hook.kind].format
+    source = _TEMPLATE.format(
+        parameters=accepted,
+        incomplete=incomplete,
+        passed=passed,
+        doubtful=doubtful,
+        rule=_RULE,
+        rule_as_passed=answer("rule(*args, **kwargs)"),
+        intercept_as_passed=answer(f"{_INTERCEPT}(args, kwargs)"),
+        rule_at_once=answer(f"rule({given})"),
+        intercept=answer(f"{_INTERCEPT}(({given + ',' if given else ''}), {{}})"),
+    )
+    return f"async {source.lstrip()}" if hook.kind == "coroutine" else source
 
 
 def is_wrapper(function: Any) -> bool:
     """Return whether a function is a wrapper."""
     # Checked by its code, not by an attribute: other decorators copy a function's attributes.
     return isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE)
+
+
+def hook_of(function: Any) -> Hook | None:
+    """Return the hook of a wrapper; None for any other function."""
+    return vars(function)[_MADE_WITH][0] if is_wrapper(function) else None
+
+
+def made_with(wrapper: FunctionType) -> Any:
+    """Return the object that a wrapper was made with."""
+    return vars(wrapper)[_MADE_WITH][1]
+
+
+def unwrap(function: Any) -> Any:
+    """Return the function behind a wrapper; any other function itself."""
+    hook = hook_of(function)
+    return function if hook is None else hook.function
 
 
 # -- hooks ----------------------------------------------------------------------------------------
@@ -195,8 +129,7 @@ class _Interceptors(dict[Any, Interceptor]):
 
     def __init__(self, hook: Hook) -> None:
         super().__init__()
-        self.hook = hook
-        self.others = _Others(hook)
+        self.hook, self.others = hook, _Others(self)
 
     def __setitem__(self, key: Any, interceptor: Interceptor) -> None:
         super().__setitem__(key, interceptor)
@@ -215,46 +148,14 @@ class _Interceptors(dict[Any, Interceptor]):
 class _Others(set[Any]):
     """The keys that are no stack of a greenlet (a thread's root, plugins, None), and drivers with threads."""
 
-    __slots__ = ("_hook",)
+    __slots__ = ("_interceptors",)
 
-    def __init__(self, hook: Hook) -> None:
+    def __init__(self, interceptors: _Interceptors) -> None:
         super().__init__()
-        self._hook = hook
+        self._interceptors = interceptors
 
     def __reduce__(self) -> Any:
-        return _others_of, (self._hook,)
-
-
-def _others_of(hook: Hook) -> _Others:
-    return hook.interceptors.others
-
-
-class Elsewhere:
-    """What a wrapper calls if its hook has no interceptor for the call.
-
-    Attributes:
-        hook: The hook.
-        made_with: The object that the wrapper was made with, for the layer above. It is kept here because a wrapper
-            that is pickled by value takes along only what its code names.
-    """
-
-    __slots__ = ("hook", "made_with")
-
-    def __init__(self, hook: Hook, made_with: Any) -> None:
-        self.hook, self.made_with = hook, made_with
-
-    def __call__(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Run a call.
-
-        Raises:
-            WrongThreadError: It is a decision, and the simulation cannot wait for its answer here.
-        """
-        hook = self.hook
-        interceptor = hook.interceptor_at(getcurrent())
-        if interceptor is not None:
-            return interceptor(args, kwargs)
-        rule = hook.rule
-        return rule(*args, **kwargs) if kwargs else rule(*args)
+        return getattr, (self._interceptors, "others")
 
 
 class Hook(Target):
@@ -264,11 +165,12 @@ class Hook(Target):
         function: The function.
         rule: The innermost part of a call: the function, or its temporary replacement.
         kind: What a call returns: "function" (a value), "generator" or "coroutine".
+        own_signature: The signature of the function itself, not of what it wraps; None if it is unknown.
         bound: Whether its first argument is the object it is called on, which is never passed by keyword.
         alone: Whether every call has one argument, the object it is called on.
         interceptors: Those of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
             other calls while an environment with these plugins, or without plugins, is evaluated.
-        wrappers: The functions that stand in front of the function.
+        wrappers: The wrappers of the function.
         place: The place of a wrapper while the hook is installed; None if none is to be set.
         permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
         point: The object that the layer above makes of the hook.
@@ -287,25 +189,29 @@ class Hook(Target):
         Raises:
             PatchError: It is an async generator function.
         """
+        like = function if like is None else like
+        if inspect.isasyncgenfunction(like):
+            raise PatchError(f"{name} is an async generator function, which cannot return a decision or call handlers")
+        awaited = "coroutine" if inspect.iscoroutinefunction(like) else "function"
+        self.kind = "generator" if inspect.isgeneratorfunction(like) else awaited
         self.function = self.rule = function
-        self.kind = kind_of(function if like is None else like, name)
-        self._own: inspect.Signature | None = None
-        signature: inspect.Signature | None = None
-        try:
-            self._own = inspect.signature(function, follow_wrapped=False)
+        self.own_signature = signature = None
+        with suppress(TypeError, ValueError):  # the signature is unknown
             signature = inspect.signature(function)
-        except (TypeError, ValueError):
-            self._own = None  # the signature is unknown
-        self.bound = bound and is_method(function, name)
-        self.alone = self._own is not None and is_alone(self._own, bound=self.bound)
+            self.own_signature = inspect.signature(function, follow_wrapped=False)
+        self.bound = bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
+        parameters = [] if self.own_signature is None else list(self.own_signature.parameters.values())
+        first = [
+            p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
+        ]
+        self.alone = self.bound and len(first) == len(parameters) == 1
         self.interceptors = _Interceptors(self)
         self.wrappers: WeakSet[FunctionType] = WeakSet()
-        self.place = place
-        self.permanent = place is None
+        self.place, self.permanent = place, place is None
         self.point: Any = None
-        self._set: FunctionType | None = None  # the temporary wrapper
-        iterates = self.kind == "generator"
-        super().__init__(name, CALLS + ITEMS if iterates else CALLS, "is not a generator function", signature)
+        self._temporary: FunctionType | None = None  # the wrapper for the place
+        positions = CALLS + ITEMS if self.kind == "generator" else CALLS
+        super().__init__(name, positions, "is not a generator function", signature)
         with suppress(TypeError):  # not all objects can be referenced weakly
             MADE_OF.setdefault(function, WeakSet()).add(self)
 
@@ -314,31 +220,46 @@ class Hook(Target):
         return _restored, made_of, self.point, None, None, _came_along
 
     def make_wrapper(self, made_with: Any = None) -> FunctionType:
-        """Make a permanent wrapper of the hook's function.
+        """Make a wrapper of the hook's function.
 
         Args:
             made_with: The object that the function ``made_with`` returns for it.
         """
-        made = generate(
-            self.function,
-            self._own,
-            name=self.name,
-            kind=self.kind,
-            alone=self.alone,
-            namespace={
-                "INTERCEPTORS": self.interceptors,
-                "OTHERS": self.interceptors.others,
-                "elsewhere": Elsewhere(self, made_with).__call__,
-                "getcurrent": getcurrent,
-            },
-        )
+        scope: dict[str, Any] = {
+            "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors,
+            "OTHERS": self.interceptors.others, "fits": self._fits, "getcurrent": getcurrent,
+            "intercept": self._intercept, "rule": self.function,
+        }  # fmt: skip
+        exec(compile(_source(self, scope), f"{_FILE}{self.name}>", "exec"), scope)
+        made: FunctionType = scope["wrapper"]
+        name = getattr(self.function, "__name__", "call")
+        made.__code__ = made.__code__.replace(co_name=name)  # the name in tracebacks
+        update_wrapper(made, self.function)
+        vars(made)[_MADE_WITH] = self, made_with
         self.wrappers.add(made)
         return made
+
+    def _fits(self, *args: Any, **kwargs: Any) -> bool:
+        """Return whether the function takes these arguments. If not, it is called, and raises Python's own error."""
+        try:
+            if self.own_signature is not None:
+                self.own_signature.bind(*args, **kwargs)
+        except TypeError:
+            return False
+        return True
+
+    def _intercept(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Run a call for which the stack itself has no interceptor.
+
+        Raises:
+            WrongThreadError: It is a decision, and the simulation cannot wait for its answer here.
+        """
+        return (self.interceptor_at(getcurrent()) or self.run_rule)(args, kwargs)
 
     # -- where it is set --------------------------------------------------------------------------
 
     @property
-    def stale(self) -> bool:
+    def stale(self) -> bool:  # type: ignore[override]
         """Whether something else has replaced it while no wrapper was set in its place."""
         return self.place is not None and not self._users and not self.place.is_free(self)
 
@@ -352,13 +273,13 @@ class Hook(Target):
             super().install(user)
 
     def _apply(self) -> None:
-        if self._set is None:
-            self._set = self.make_wrapper()
-        self.place.put(self, self._set)
+        if self._temporary is None:
+            self._temporary = self.make_wrapper()
+        self.place.put(self, self._temporary)
 
     def _revert(self) -> None:
-        if self.place is not None and self._set is not None:
-            self.place.put_back(self._set)
+        if self.place is not None and self._temporary is not None:
+            self.place.put_back(self._temporary)
 
     # -- who takes part ---------------------------------------------------------------------------
 
@@ -384,7 +305,9 @@ class Hook(Target):
     def around(self, inner: Interceptor, plugins: Any) -> Interceptor:
         """Return an interceptor that runs the handlers of plugins, or of the whole process, around ``inner``."""
         found = self.slot.get(plugins) or self.slot.get(None)
-        return inner if found is None else partial(AROUND[self.kind], found, self.slot, inner)
+        if found is None:
+            return inner
+        return partial(found.call if self.kind == "function" else found.wait, inner)
 
     def run_rule(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Run the rule."""
@@ -401,11 +324,10 @@ class Hook(Target):
     def interceptor_at(self, here: greenlet) -> Interceptor | None:
         """Return the interceptor of a call in a greenlet; None if only the rule runs."""
         driver = stack_of(here) if STACKS else None
-        if hasattr(here, "spawning_greenlet"):
-            spawner = spawner_of(here)
-            if spawner is not None and not spawner.own_thread and spawner.decides(self):
-                interceptor: Interceptor = spawner.refuse(self, _SPAWNED)
-                return interceptor
+        spawner = spawner_of(here)
+        if spawner is not None and not spawner.own_thread and spawner.decides(self):
+            refuse: Interceptor = spawner.refuse(self, _SPAWNED)
+            return refuse
         if driver is None:
             evaluation = EVALUATING.get(here)
             plugins = None if evaluation is None else evaluation.plugins
@@ -425,28 +347,9 @@ class Hook(Target):
                 if key not in slot and (key is not None or self.rule is self.function):
                     interceptors.remove(key)
                 continue
-            inner = interceptor.args[2] if isinstance(interceptor, partial) else interceptor
+            inner = interceptor.args[0] if isinstance(interceptor, partial) else interceptor
             plugins = getattr(STACKS.get(key), "plugins", None)
             self.enter(key, None if inner == self.run_rule else inner, plugins)
-
-
-def hook_of(function: Any) -> Hook | None:
-    """Return the hook of a wrapper; None for any other function."""
-    if is_wrapper(function):
-        hook: Hook = function.__globals__["elsewhere"].__self__.hook
-        return hook
-    return None
-
-
-def made_with(function: FunctionType) -> Any:
-    """Return the object that a wrapper was made with."""
-    return function.__globals__["elsewhere"].__self__.made_with
-
-
-def unwrap(function: Any) -> Any:
-    """Return the function behind a wrapper; any other function itself."""
-    hook = hook_of(function)
-    return function if hook is None else hook.function
 
 
 def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -> Hook:

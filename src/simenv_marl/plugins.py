@@ -14,8 +14,7 @@ from .errors import HandlerError, name_of, short_repr
 from .hooks.finding import expose, exposed_functions, find_target
 from .hooks.handlers import Call, ChangedArgs, ChangedResult, Trace
 from .hooks.hook import Hook
-from .hooks.patches import Installation
-from .hooks.plugins import Attachment, Entry, make_handler
+from .hooks.plugins import Entry, attached, make_handler
 from .hooks.stacks import LOCK
 from .hooks.targets import Target
 
@@ -97,8 +96,8 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        attached = make_handler((handler, target, position))
-        attached.target.add(attached)
+        made = make_handler((handler, target, position))
+        made.target.add(made)
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
@@ -117,13 +116,13 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
     with LOCK:
         found = find_target(target)
         present = found.handlers
-        chosen = [a for a in present if a.position == position and (handler is None or a.function == handler)]
+        chosen = [h for h in present if h.position == position and (handler is None or h.function == handler)]
         if not chosen:
             what = "no handler is" if handler is None else f"{name_of(handler)} is not"
-            at = ", ".join(sorted({a.position for a in present})) or "nowhere"
+            at = ", ".join(sorted({h.position for h in present})) or "nowhere"
             raise HandlerError(f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}")
-        for attached in chosen if handler is None else chosen[-1:]:
-            found.remove(attached)
+        for removed in chosen if handler is None else chosen[-1:]:
+            found.remove(removed)
 
 
 @contextmanager
@@ -137,12 +136,9 @@ def handlers(*entries: Entry) -> Iterator[None]:
         SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
-        attached = [make_handler(entry) for entry in entries]
-        installation = Installation([Attachment((handler.target, handler) for handler in attached)])
-    try:
+        made = [make_handler(entry) for entry in entries]
+    with attached([(handler.target, handler) for handler in made]):
         yield
-    finally:
-        installation.uninstall()
 
 
 # -- seeing what happens --------------------------------------------------------------------------
@@ -167,9 +163,5 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     with LOCK:
         found = [find_target(target) for target in targets] if targets else list(Target.all.values())
         hooks = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
-        traced = [hook for hook in hooks if targets or hook.permanent or hook.slot]
-        installation = Installation([Attachment((hook, recording) for hook in traced)])
-    try:
+    with attached([(hook, recording) for hook in hooks if targets or hook.permanent or hook.slot]):
         yield recording.calls
-    finally:
-        installation.uninstall()

@@ -8,7 +8,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from simenv_marl.core import processes
-from simenv_marl.core.points import aliases, find_point, find_points, locate, own_points, portable
+from simenv_marl.core.points import find_point, find_points, locate, own_points, portable
 from simenv_marl.core.processes import pack, unpack
 from simenv_marl.decision import point_of, registered, unwrapped
 from simenv_marl.errors import UnknownPointError
@@ -111,7 +111,6 @@ def test_two_definitions_of_one_function_are_one_point():
     assert find_point(first).point.definition is two  # what the bare name means
     other = define()(function)
     assert point_of(other)[0] is not point_of(first)[0]
-    assert point_of(first)[0] in aliases(point_of(other)[0])
 
 
 def test_a_point_goes_with_its_model():

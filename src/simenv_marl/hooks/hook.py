@@ -57,7 +57,7 @@ def wrapper({parameters}):
 
 def _source(hook: Hook, scope: dict[str, Any]) -> str:
     """Return the source code of a hook's wrappers; ``scope`` has the names that it uses."""
-    signature = hook.own_signature
+    signature = hook.signature
     parameters = [] if signature is None else list(signature.parameters.values())
     positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     names = [f"_{number}" for number in range(len(positional))]
@@ -165,7 +165,7 @@ class Hook(Target):
         function: The function.
         rule: The innermost part of a call: the function, or its temporary replacement.
         kind: What a call returns: "function" (a value), "generator" or "coroutine".
-        own_signature: The signature of the function itself, not of what it wraps; None if it is unknown.
+        signature: The signature of the function itself, not of what it wraps; None if it is unknown.
         bound: Whether its first argument is the object it is called on, which is never passed by keyword.
         alone: Whether every call has one argument, the object it is called on.
         interceptors: Those of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
@@ -195,12 +195,11 @@ class Hook(Target):
         awaited = "coroutine" if inspect.iscoroutinefunction(like) else "function"
         self.kind = "generator" if inspect.isgeneratorfunction(like) else awaited
         self.function = self.rule = function
-        self.own_signature = signature = None
+        signature = None
         with suppress(TypeError, ValueError):  # the signature is unknown
-            signature = inspect.signature(function)
-            self.own_signature = inspect.signature(function, follow_wrapped=False)
+            signature = inspect.signature(function, follow_wrapped=False)
         self.bound = bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
-        parameters = [] if self.own_signature is None else list(self.own_signature.parameters.values())
+        parameters = [] if signature is None else list(signature.parameters.values())
         first = [
             p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
         ]
@@ -242,8 +241,8 @@ class Hook(Target):
     def _fits(self, *args: Any, **kwargs: Any) -> bool:
         """Return whether the function takes these arguments. If not, it is called, and raises Python's own error."""
         try:
-            if self.own_signature is not None:
-                self.own_signature.bind(*args, **kwargs)
+            if self.signature is not None:
+                self.signature.bind(*args, **kwargs)
         except TypeError:
             return False
         return True

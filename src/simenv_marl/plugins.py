@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 from .decision import decision_points
 from .errors import HandlerError, name_of, short_repr
 from .hooks.finding import expose, exposed_functions, find_target
-from .hooks.handlers import Call, ChangedArgs, ChangedResult, Trace
+from .hooks.handlers import Call, ChangedArgs, ChangedResult, Handler, Trace
 from .hooks.hook import Hook
-from .hooks.plugins import Entry, attached, make_handler
+from .hooks.patches import Installation
+from .hooks.plugins import Attachment, Entry, make_handler
 from .hooks.stacks import LOCK
 from .hooks.targets import Target
 
@@ -137,8 +138,18 @@ def handlers(*entries: Entry) -> Iterator[None]:
     """
     with LOCK:
         made = [make_handler(entry) for entry in entries]
-    with attached([(handler.target, handler) for handler in made]):
+    with _attached([(handler.target, handler) for handler in made]):
         yield
+
+
+@contextmanager
+def _attached(entries: list[tuple[Target, Handler | Trace]]) -> Iterator[None]:
+    """Attach handlers or traces for the duration of a ``with`` block, or until an interrupted block is collected."""
+    installation = Installation([Attachment(entries)])
+    try:
+        yield
+    finally:
+        installation.uninstall()
 
 
 # -- seeing what happens --------------------------------------------------------------------------
@@ -163,5 +174,5 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     with LOCK:
         found = [find_target(target) for target in targets] if targets else list(Target.all.values())
         hooks = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
-    with attached([(hook, recording) for hook in hooks if targets or hook.permanent or hook.slot]):
+    with _attached([(hook, recording) for hook in hooks if targets or hook.permanent or hook.slot]):
         yield recording.calls

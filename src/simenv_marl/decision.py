@@ -19,7 +19,7 @@ from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, short_repr
-from .hooks.hook import Hook, beneath, hook_of, made_with
+from .hooks.hook import Hook, hook_of, made_with, unwrap
 from .hooks.places import permanent_hook
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
@@ -84,7 +84,7 @@ class Definition:
         """
         hook, binding = permanent_hook(function)
         point = point_for(hook)
-        wrapper = hook.stand_in(self)
+        wrapper = hook.make_wrapper(self)
         point.definition = self
         _REGISTRY[point.name] = point
         return wrapper if binding is None else binding(wrapper)
@@ -322,7 +322,7 @@ def point_of(function: Any) -> "tuple[DecisionPoint, Definition | None] | None":
 
 def unwrapped(function: Any) -> Any:
     """Return the function behind a decision function or an exposed function; any other function itself, unbound."""
-    return beneath(getattr(function, "__func__", function))
+    return unwrap(getattr(function, "__func__", function))
 
 
 def registered(name: str) -> "DecisionPoint | None":

@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 from .decision import decision_points
 from .errors import HandlerError, name_of, short_repr
-from .hooks.finding import current_target, expose, exposed_functions, find_target
-from .hooks.handlers import ChangedArgs, ChangedResult
+from .hooks.finding import expose, exposed_functions, find_target
+from .hooks.handlers import Call, ChangedArgs, ChangedResult, Handler, Trace
 from .hooks.hook import Hook
 from .hooks.patches import Installation
 from .hooks.plugins import Attachment, Entry, make_handler
 from .hooks.stacks import LOCK
-from .hooks.targets import Call, Target, Trace
+from .hooks.targets import Target
 
 __all__ = [
     "Call",
@@ -48,7 +48,7 @@ def attached_handlers(env: Any = None) -> list[Entry]:
     if env is not None:
         entries: list[Entry] = env.unwrapped.plugins
         return entries
-    targets = sorted(Target.all, key=lambda target: target.name)
+    targets = sorted(Target.all.values(), key=lambda target: target.name)
     return [(handler.function, target.name, handler.position) for target in targets for handler in target.handlers]
 
 
@@ -97,8 +97,8 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        attached = make_handler((handler, target, position))
-        attached.target.add(attached)
+        made = make_handler((handler, target, position))
+        made.target.add(made)
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
@@ -117,13 +117,13 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
     with LOCK:
         found = find_target(target)
         present = found.handlers
-        chosen = [a for a in present if a.position == position and (handler is None or a.function == handler)]
+        chosen = [h for h in present if h.position == position and (handler is None or h.function == handler)]
         if not chosen:
             what = "no handler is" if handler is None else f"{name_of(handler)} is not"
-            at = ", ".join(sorted({a.position for a in present})) or "nowhere"
+            at = ", ".join(sorted({h.position for h in present})) or "nowhere"
             raise HandlerError(f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}")
-        for attached in chosen if handler is None else chosen[-1:]:
-            found.remove(attached)
+        for removed in chosen if handler is None else chosen[-1:]:
+            found.remove(removed)
 
 
 @contextmanager
@@ -137,8 +137,15 @@ def handlers(*entries: Entry) -> Iterator[None]:
         SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
-        attached = [make_handler(entry) for entry in entries]
-        installation = Installation([Attachment((handler.target, handler) for handler in attached)])
+        made = [make_handler(entry) for entry in entries]
+    with _attached([(handler.target, handler) for handler in made]):
+        yield
+
+
+@contextmanager
+def _attached(entries: list[tuple[Target, Handler | Trace]]) -> Iterator[None]:
+    """Attach handlers or traces for the duration of a ``with`` block, or until an interrupted block is collected."""
+    installation = Installation([Attachment(entries)])
     try:
         yield
     finally:
@@ -165,11 +172,7 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     """
     recording = Trace()
     with LOCK:
-        hooks = [target for target in list(Target.all) if isinstance(target, Hook) and (target.for_good or target.slot)]
-        found = [find_target(target) for target in targets] if targets else [current_target(hook) for hook in hooks]
-        functions = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
-        installation = Installation([Attachment((function, recording) for function in functions)])
-    try:
+        found = [find_target(target) for target in targets] if targets else list(Target.all.values())
+        hooks = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
+    with _attached([(hook, recording) for hook in hooks if targets or hook.permanent or hook.slot]):
         yield recording.calls
-    finally:
-        installation.uninstall()

@@ -9,7 +9,7 @@ import pytest
 
 from simenv_marl.core import packing
 from simenv_marl.core.packing import pack, unpack
-from simenv_marl.core.points import aliases, find_point, find_points, locate, own_points, portable
+from simenv_marl.core.points import find_point, find_points, locate, own_points, portable
 from simenv_marl.decision import point_of, registered, unwrapped
 from simenv_marl.errors import UnknownPointError
 from simenv_marl.hooks.hook import hook_of
@@ -43,7 +43,7 @@ def test_a_decorated_function_is_found_under_its_name_and_as_itself():
     assert by_name.point is point_of(Base.decorated)[0] is registered(f"{HERE}.Base.decorated")
     assert by_name.definition.agent == "decorated_0"
     assert (by_name.key, by_name.own_definition) == (f"{HERE}.Base.decorated", None)
-    assert by_name.point.hook.for_good
+    assert by_name.point.hook.permanent
 
 
 def test_an_undecorated_function_is_one_point_however_it_is_named():
@@ -52,7 +52,7 @@ def test_an_undecorated_function_is_one_point_however_it_is_named():
     assert by_name.point is as_itself.point
     assert (by_name.own_definition, as_itself.own_definition) == (one, two)
     assert by_name.point.definition is None
-    assert not by_name.point.hook.for_good
+    assert not by_name.point.hook.permanent
     assert hook_of(vars(Base)["plain"]) is None  # nothing is set before it is held
 
 
@@ -111,7 +111,6 @@ def test_two_definitions_of_one_function_are_one_point():
     assert find_point(first).point.definition is two  # what the bare name means
     other = define()(function)
     assert point_of(other)[0] is not point_of(first)[0]
-    assert point_of(first)[0] in aliases(point_of(other)[0])
 
 
 def test_a_point_goes_with_its_model():

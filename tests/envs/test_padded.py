@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import random
 from collections import defaultdict
 
@@ -307,3 +308,23 @@ def test_what_a_round_tells_stands_in_the_order_of_the_roster():
         assert [list(part) for part in told] == [names] * len(told)
         told = env.step({"being_0": 1, "being_1": 1, "being_2": 1})
     assert [list(part) for part in told] == [names] * 5
+
+
+def test_the_state_of_observations_has_blanks_for_the_removed():
+    names = ["being_1", "being_2"]
+    options = {"possible_agents": names, "state_space": "observations"}
+    for view, step in (
+        (parallel_env, lambda env: env.step({"being_1": 3, "being_2": 4})),
+        (aec_env, lambda env: env.step(3)),
+    ):
+        env = pad_agents(view(script(generations), beings(), **options))
+        env.reset(seed=0)
+        assert env.state()[:2].tolist() == [1, 0]
+        env.step(action)
+        assert env.state()[:2].tolist() == [0, 0]
+
+
+def test_a_copy_in_mid_episode_has_no_agents_before_its_reset():
+    env = pad_agents(parallel_env(script(generations), beings(), possible_agents=["being_1", "being_2"]))
+    env.reset(seed=0)
+    assert copy.deepcopy(env).agents == []

@@ -1,4 +1,4 @@
-"""Stand-ins, and who takes part in their calls."""
+"""Wrappers, and who takes part in their calls."""
 
 import gc
 import inspect
@@ -9,9 +9,8 @@ import weakref
 import cloudpickle
 import pytest
 from greenlet import getcurrent, greenlet
-from simenv_marl.core.children import Children
 
-from simenv_marl.hooks.hook import MADE_OF, Hook, beneath, hook_of, made_with
+from simenv_marl.hooks.hook import MADE_OF, Hook, hook_of, made_with, unwrap
 from simenv_marl.hooks.stacks import EVALUATING, OUTSIDE, STACKS, outside_simulation, stack_of
 
 
@@ -33,17 +32,21 @@ class Model:
 
 
 class Stack:
-    """A simulation's stack that decides everything, or what it is told."""
+    """A simulation's stack that decides everything."""
+
+    own_thread = False
 
     def __init__(self, plugins=None):
-        self.plugins, self.asked, self.hidden = plugins, [], 0
-        self.children = Children(None)  # where other tests have left environments, threads are watched
+        self.plugins, self.asked, self.hidden = plugins, 0, 0
 
-    def taker(self, hook, here):
-        self.asked.append(here)
+    def decides(self, hook):
+        return True
+
+    def interceptor(self, hook):
+        self.asked += 1
         return lambda args, kwargs: ("elsewhere", args)
 
-    def refusal_of(self, hook, where):
+    def refuse(self, hook, where):
         return lambda args, kwargs: f"refused in {where}"
 
     def hide(self):
@@ -66,30 +69,30 @@ def in_a_greenlet(function):
     return greenlet(function).switch()
 
 
-# -- stand-ins --------------------------------------------------------------------------------------
+# -- wrappers --------------------------------------------------------------------------------------
 
 
-def test_a_stand_in_looks_like_its_function_and_runs_it():
-    made = Hook(rule, "somewhere.rule").stand_in()
+def test_a_wrapper_looks_like_its_function_and_runs_it():
+    made = Hook(rule, "somewhere.rule").make_wrapper()
     assert (made.__name__, made.__doc__, inspect.signature(made)) == ("rule", rule.__doc__, inspect.signature(rule))
     assert made(1) == made(first=1) == (1, 2, 3)
     assert made(1, third=4) == (1, 2, 4)
-    assert hook_of(made).function is beneath(made) is rule
-    assert (hook_of(rule), beneath(rule)) == (None, rule)
+    assert hook_of(made).function is unwrap(made) is rule
+    assert (hook_of(rule), unwrap(rule)) == (None, rule)
     with pytest.raises(TypeError):
         made()
 
 
 @pytest.mark.parametrize(("args", "kwargs"), [((1,), {}), ((1, 5), {}), ((1,), {"third": 7}), ((), {"first": 1})])
-def test_a_taker_gets_the_arguments_as_they_were_passed(args, kwargs):
+def test_an_interceptor_gets_the_arguments_as_they_were_passed(args, kwargs):
     hook = Hook(rule, "somewhere.rule")
-    hook.enter(getcurrent(), lambda *taken: taken, None)
-    made = hook.stand_in()
+    hook.enter(getcurrent(), lambda *given: given, None)
+    made = hook.make_wrapper()
     assert made(*args, **kwargs) == (args, kwargs)
     with pytest.raises(TypeError, match="missing"):
         made()
     hook.leave(getcurrent())
-    assert hook.takers == {}
+    assert hook.interceptors == {}
 
 
 @pytest.mark.parametrize(
@@ -109,28 +112,28 @@ def test_what_takes_nothing_but_what_it_is_called_on_is_told_apart(function, alo
     assert Hook(function, "somewhere.Model.function").alone is alone
 
 
-def test_every_kind_of_function_has_takers_of_its_kind():
+def test_every_kind_of_function_has_interceptors_of_its_kind():
     items, wait = Hook(Model.items, f"{__name__}.Model.items"), Hook(Model.wait, f"{__name__}.Model.wait")
     assert (items.kind, wait.kind) == ("generator", "coroutine")
 
     def generate(args, kwargs):
-        yield "taken"
+        yield "intercepted"
 
-    async def taken(args, kwargs):
-        return "taken"
+    async def wait_for(args, kwargs):
+        return "intercepted"
 
     items.enter(getcurrent(), generate, None)
-    wait.enter(getcurrent(), taken, None)
-    assert list(items.stand_in()(Model(), 2)) == ["taken"]
-    with pytest.raises(StopIteration, match="taken"):
-        wait.stand_in()(Model(), 1).send(None)
+    wait.enter(getcurrent(), wait_for, None)
+    assert list(items.make_wrapper()(Model(), 2)) == ["intercepted"]
+    with pytest.raises(StopIteration, match="intercepted"):
+        wait.make_wrapper()(Model(), 1).send(None)
 
 
-def test_takers_are_found_by_greenlet():
+def test_interceptors_are_found_by_greenlet():
     hook = Hook(Model.decide, f"{__name__}.Model.decide")
-    made = hook.stand_in()
-    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
-    assert made(Model()) == "taken"
+    made = hook.make_wrapper()
+    hook.enter(getcurrent(), lambda args, kwargs: "intercepted", None)
+    assert made(Model()) == "intercepted"
     assert in_a_greenlet(lambda: made(Model())) == "rule"  # no simulation's stack is among its parents
     said = []
     thread = threading.Thread(target=lambda: said.append(made(Model())))
@@ -141,18 +144,18 @@ def test_takers_are_found_by_greenlet():
 
 def test_a_greenlet_belongs_to_the_nearest_stack_among_its_parents(stack):
     hook = Hook(Model.decide, f"{__name__}.Model.decide")
-    made = hook.stand_in()
-    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
+    made = hook.make_wrapper()
+    hook.enter(getcurrent(), lambda args, kwargs: "intercepted", None)
     model = Model()
     assert in_a_greenlet(lambda: made(model)) == ("elsewhere", (model,))
     assert in_a_greenlet(lambda: in_a_greenlet(lambda: made(model))) == ("elsewhere", (model,))
-    assert len(stack.asked) == 2
+    assert stack.asked == 2
 
 
 def test_what_a_stack_has_spawned_on_a_hub_of_others_is_refused(stack):
     hook = Hook(Model.decide, f"{__name__}.Model.decide")
-    made = hook.stand_in()
-    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
+    made = hook.make_wrapper()
+    hook.enter(getcurrent(), lambda args, kwargs: "intercepted", None)
     here, said, going = getcurrent(), [], threading.Event()
 
     class Spawned(greenlet):
@@ -171,7 +174,7 @@ def test_what_a_stack_has_spawned_on_a_hub_of_others_is_refused(stack):
     assert "refused in a greenlet that the simulation has spawned" in said[0]
 
 
-def test_outside_a_simulation_its_takers_are_masked(stack):
+def test_outside_a_simulation_its_interceptors_are_masked(stack):
     here = getcurrent()
     with outside_simulation():
         assert stack.hidden == 1
@@ -202,27 +205,27 @@ def test_in_a_greenlet_of_the_model_only_that_is_masked(stack):
 
 def test_what_runs_in_the_functions_place_does_so_everywhere_but_in_what_has_begun():
     hook = Hook(Model.decide, f"{__name__}.Model.decide")
-    made = hook.stand_in()
+    made = hook.make_wrapper()
     hook.replace_rule(lambda model: "other")
     assert made(Model()) == in_a_greenlet(lambda: made(Model())) == "other"
     hook.replace_rule()
     assert made(Model()) == "rule"
-    assert hook.takers == {}
+    assert hook.interceptors == {}
 
 
-def test_what_a_stand_in_was_made_with_stays_with_it():
+def test_what_a_wrapper_was_made_with_stays_with_it():
     hook = Hook(rule, "somewhere.rule")
-    one, two = hook.stand_in("one"), hook.stand_in("two")
+    one, two = hook.make_wrapper("one"), hook.make_wrapper("two")
     assert (made_with(one), made_with(two)) == ("one", "two")
     assert hook_of(one) is hook_of(two) is hook
-    assert set(hook.stand_ins) == {one, two}
+    assert set(hook.wrappers) == {one, two}
 
 
-def test_a_hook_goes_with_its_stand_ins():
+def test_a_hook_goes_with_its_wrappers():
     def function():
         return 1
 
-    made = Hook(function, "somewhere.function").stand_in()
+    made = Hook(function, "somewhere.function").make_wrapper()
     reference = weakref.ref(hook_of(made))
     assert list(MADE_OF[function]) == [reference()]
     del made
@@ -231,16 +234,16 @@ def test_a_hook_goes_with_its_stand_ins():
     assert not MADE_OF[function]
 
 
-def test_a_stand_in_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
+def test_a_wrapper_that_is_pickled_by_value_asks_the_hook_where_it_arrives():
     scope = {"__name__": "__main__"}
     exec("def function(number): return number", scope)
-    made = Hook(scope["function"], "__main__.function").stand_in("made with")
+    made = Hook(scope["function"], "__main__.function").make_wrapper("made with")
     again = pickle.loads(cloudpickle.dumps(made))
     hook = hook_of(again)
     assert again(3) == 3
     assert made_with(again) == "made with"
-    hook.enter(getcurrent(), lambda args, kwargs: "taken", None)
-    assert again(3) == "taken"
+    hook.enter(getcurrent(), lambda args, kwargs: "intercepted", None)
+    assert again(3) == "intercepted"
     hook.leave(getcurrent())
 
 

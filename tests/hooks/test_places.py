@@ -277,17 +277,17 @@ def test_classes_of_undecorated_points_go_with_their_environments():
     assert [reference() for reference in references] == [None] * 20
 
 
-def test_exposed_classes_of_iterables_are_collected():
+def test_classes_whose_items_have_handlers_are_collected():
     references = []
     for _ in range(5):
 
         class Pool:
+            @expose_to_plugins
             def __iter__(self):
-                return iter([1, 2])
+                yield from [1, 2]
 
         references.append(weakref.ref(Pool))
-        expose_to_plugins(Pool)
-        with handlers((lambda pool, _result: ChangedResult(_result + 1), Pool, "after_next")):
+        with handlers((lambda pool, _result: ChangedResult(_result + 1), Pool.__iter__, "after_next")):
             assert list(Pool()) == [2, 3]
         assert list(Pool()) == [1, 2]
         del Pool

@@ -282,7 +282,7 @@ def test_a_plugins_error_surfaces_from_step_and_the_next_reset_works():
     env.step(1)
     env.close()
     assert nobody_is_asked()
-    assert hook_of(vars(House)["water"]).takers == EVALUATING == {}
+    assert hook_of(vars(House)["water"]).interceptors == EVALUATING == {}
 
 
 def fail_once():
@@ -309,7 +309,7 @@ def test_nothing_is_left_behind():
     assert stacks() <= before
     assert alive(House) == 0
     assert nobody_is_asked()
-    assert hook_of(vars(House)["water"]).takers == EVALUATING == {}
+    assert hook_of(vars(House)["water"]).interceptors == EVALUATING == {}
 
 
 def test_environments_in_threads_of_their_own_have_their_own_plugins():

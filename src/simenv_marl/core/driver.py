@@ -23,7 +23,7 @@ from greenlet import getcurrent, greenlet
 
 from ..errors import SimulationError, WrongThreadError, annotate
 from ..hooks.hook import Hook
-from ..hooks.stacks import STACKS, Taker
+from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import TRUNCATED, Sentinel
 from .resources import watch_resources
 
@@ -293,11 +293,11 @@ class Driver:
         """Whether the current job sends events for the calls of a hook."""
         return hook in self._events
 
-    def taker(self, hook: Hook) -> Taker | None:
+    def interceptor(self, hook: Hook) -> Interceptor | None:
         """The interceptor for calls of a hook in the simulation's own greenlets. None: the rule decides."""
         return self._interceptor(hook, away=True)
 
-    def _interceptor(self, hook: Hook, away: bool = False) -> Taker | None:
+    def _interceptor(self, hook: Hook, away: bool = False) -> Interceptor | None:
         event = self._events.get(hook)
         if event is None:
             return None
@@ -305,7 +305,7 @@ class Driver:
             return self.refuse(hook, self._process_refused)
         return self._decider(hook, event, away)
 
-    def _decider(self, hook: Hook, event: Any, away: bool) -> Taker:
+    def _decider(self, hook: Hook, event: Any, away: bool) -> Interceptor:
         """Make the function that sends an event for the calls of a hook, and carries out the replies.
 
         Args:
@@ -320,7 +320,7 @@ class Driver:
         if self.stack is not None:
             for hook in self._hooks():
                 hook.leave(self.stack)
-                hook.takers.others.discard(self)
+                hook.interceptors.others.discard(self)
 
     def show(self) -> None:
         """Enter all hooks, so that the driver takes part in calls on the stack."""
@@ -329,14 +329,14 @@ class Driver:
             for hook in self._hooks():
                 hook.enter(stack, self._interceptor(hook), self.plugins)
                 if self.has_started_threads:
-                    hook.takers.others.add(self)
+                    hook.interceptors.others.add(self)
 
     def _hooks(self) -> list[Hook]:
         return [*self._events, *(() if self.plugins is None else self.plugins.hooks)]
 
     # -- refusals ---------------------------------------------------------------------------------
 
-    def refuse(self, hook: Hook, where: str) -> Taker:
+    def refuse(self, hook: Hook, where: str) -> Interceptor:
         """Make the interceptor that refuses a decision in a place where the simulation cannot wait for it.
 
         The caller gets the error at once, and the user gets one at the simulation's next event.
@@ -371,7 +371,7 @@ class Driver:
 # -- the rule's decisions -------------------------------------------------------------------------
 
 
-def reporting_rule(hook: Hook, event: Any, send: Callable[[Any], Taker]) -> Callable[..., Any]:
+def reporting_rule(hook: Hook, event: Any, send: Callable[[Any], Interceptor]) -> Callable[..., Any]:
     """Return the rule of a hook, which sends the event's ``report`` with each decision.
 
     Args:

@@ -13,7 +13,7 @@ from greenlet import GreenletExit, getcurrent, greenlet
 
 from ..errors import WrongThreadError
 from ..hooks.hook import Hook
-from ..hooks.stacks import STACKS, Taker
+from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import RULE
 from .driver import FINISHED, NO_EVENTS, Driver, Event, SimulationExit, reporting_rule
 from .loops import ASYNCIO, Loops, silence_unwound_tasks
@@ -133,7 +133,7 @@ class GreenletDriver(Driver):
                 self.idle = True
                 self._leave(*event)
 
-    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Taker:
+    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
         deliver, driver, loops = event.deliver, self, self._loops
         rule: Any = hook.rule
         if event.report is not None:

@@ -184,6 +184,6 @@ def _make_wrapper(token: str, hook: Hook, definition: Definition | None) -> Any:
     """Make the decision function that has a token, unless this process has it."""
     function = _known.get(token)
     if function is None:
-        function = _known[token] = hook.stand_in(definition)
+        function = _known[token] = hook.make_wrapper(definition)
         _tokens[function] = token
     return function

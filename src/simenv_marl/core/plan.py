@@ -31,7 +31,6 @@ from .planner import DeferredPolicy, PlannerPolicy, bind_session
 from .point import EndAgent, Point, Removal, given_simulation
 from .points import (
     NamedPoint,
-    aliases,
     by_name,
     find_points,
     have_instances,
@@ -176,9 +175,6 @@ class Plan:
             else:
                 self.unmatched_names.discard(agent)
         events: dict[DecisionPoint, Any] = {point.point: point for point in self.points}
-        for point in self.points:
-            for other in aliases(point.point):
-                events.setdefault(other, point)
         self._find_removals(events, warns=first)
         if self.points and self.model.ends_agents:
             self._add_event(events, locate(END_AGENT), EndAgent())

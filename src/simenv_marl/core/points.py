@@ -15,11 +15,15 @@ from typing import Any, Final
 
 from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
 from ..errors import DefinitionError, PatchError, UnknownPointError, name_of, short_repr
-from ..hooks.hook import MADE_OF
 from ..hooks.places import Purpose, all_classes, find_hook, is_importable, raw_attribute, resolve, unbind
 
 Points = str | Callable[..., Any] | Iterable[str | Callable[..., Any]] | Mapping[Any, Definition | None] | None
 """The ways to name decision points: see ``generate_env``."""
+
+Own = Mapping[DecisionPoint, Definition]
+"""The definitions in a simulation's attribute ``points``."""
+
+_NONE: Final[Own] = MappingProxyType({})
 
 POINT: Final = Purpose("decision point", UnknownPointError, decision_points)
 
@@ -42,39 +46,40 @@ class NamedPoint:
         return None if self.definition is self.point.definition else self.definition
 
 
-def portable(key: Any, name: str | None = None) -> Any:
-    """Return a key that names a function in another process: its dotted name, if that surely leads to it there.
+# -- points by name or function -------------------------------------------------------------------
 
-    Anything but a function is returned as it is.
+
+def locate(key: Any, own: Own = _NONE) -> DecisionPoint:
+    """Return the point of a dotted name or function, whether it has a definition or not.
+
+    Raises:
+        UnknownPointError: The name leads to nothing.
+        PatchError: The name leads to something that cannot be patched.
     """
-    function = unwrapped(key)
-    if not isinstance(function, FunctionType):
-        return key
-    if hasattr(function, BY_NAME):
-        return getattr(function, BY_NAME)
-    name = name or f"{function.__module__}.{function.__qualname__}"
-    if is_importable(name):
-        return name
-    owner, _, attribute = name.removeprefix("__main__.").rpartition(".")
-    found = getattr(modules.get("__main__"), owner, None) if owner.isidentifier() else None
-    return Member(found, attribute) if isinstance(found, type) else function
+    if not isinstance(key, str):
+        return point_for(find_hook(key, POINT))
+    named = by_name(own).get(key)
+    if named is not None:
+        return named
+    decorated = registered(key)
+    try:
+        hook = find_hook(key, POINT)
+    except (UnknownPointError, PatchError):
+        if decorated is None:
+            raise
+        return decorated  # decorated inside a function
+    if decorated is not None and (hook.point is None or not hook.permanent):
+        return decorated  # not yet assigned to its name
+    return point_for(hook)
 
 
-class Member:
-    """The stand-in by which a function of a class in the main module is pickled: the class and the function's name.
-
-    The rule of a decision function cannot be pickled by name, because the name leads to the decision function.
-    """
-
-    def __init__(self, owner: type, name: str) -> None:
-        self._owner, self._name = owner, name
-
-    def __reduce__(self) -> Any:
-        return getattr, (self._owner, self._name)
+def by_name(own: Own) -> dict[str, DecisionPoint]:
+    """Return the simulation's own points that do not exist in a module, by name."""
+    return {point.name: point for point in own if hasattr(point.rule, BY_NAME)}
 
 
 def own_points(simulation: Any) -> dict[DecisionPoint, Definition]:
-    """The definitions in a simulation's attribute ``points``.
+    """Return the definitions in a simulation's attribute ``points``.
 
     Names that lead to nothing are left out. Code that looks such a name up raises an error for it.
     """
@@ -86,13 +91,25 @@ def own_points(simulation: Any) -> dict[DecisionPoint, Definition]:
     return own
 
 
+def owner_class(point: DecisionPoint) -> type | None:
+    """Return the class of which a point is a method; None if it is not a method, or if its name leads to nothing."""
+    try:
+        owner, _ = resolve(point.name, POINT)
+    except (UnknownPointError, PatchError):
+        return None
+    return owner if isinstance(owner, type) else None
+
+
+def have_instances(one: type, other: type) -> bool:
+    """Return whether any existing class is a subclass of both classes."""
+    return any(issubclass(owner, other) for owner in all_classes(one))
+
+
+# -- points with their definitions ----------------------------------------------------------------
+
+
 def find_points(
-    points: Any,
-    simulation: Any,
-    own: Mapping[DecisionPoint, Definition] | None = None,
-    *,
-    required: bool = True,
-    empty: bool = False,
+    points: Any, simulation: Any, own: Own | None = None, *, required: bool = True, empty: bool = False
 ) -> list[NamedPoint]:
     """Find all decision points that ``points=`` names, in the order in which they are named.
 
@@ -118,66 +135,34 @@ def find_points(
     if isinstance(points, str) or not hasattr(points, "__iter__"):
         points = [points]
     entries = points.items() if isinstance(points, Mapping) else [(key, None) for key in points]
-    found = [find_point(key, definition, own=own) for key, definition in entries]
+    found: dict[DecisionPoint, NamedPoint] = {}
+    for key, definition in entries:
+        named = find_point(key, definition, own=own)
+        if named.point in found:
+            raise UnknownPointError(f"the decision point {named.point.name} was named twice")
+        found[named.point] = named
     if not found and not empty:
         raise UnknownPointError("no decision point was named: points is empty")
-    for number, named in enumerate(found):
-        if any(named.point is other.point for other in found[:number]):
-            raise UnknownPointError(f"the decision point {named.point.name} was named twice")
-    return found
+    return list(found.values())
 
 
-def find_point(
-    key: Any, definition: Any = None, *, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})
-) -> NamedPoint:
+def find_point(key: Any, definition: Any = None, *, own: Own = _NONE) -> NamedPoint:
     """Find one decision point by a dotted name or function, and the definition to use for it, as ``find_points``."""
     if definition is not None and not isinstance(definition, Definition):
         raise DefinitionError(
             f"the definition of {name_of(key)} must come from make_step, not {short_repr(definition)}"
         )
     point = locate(key, own)
-    definition = definition or _decorated_with(key) or own.get(point) or point.definition or _inherited(point)
+    decorated = None if isinstance(key, str) else point_of(getattr(key, "__func__", key))
+    if decorated is not None:  # a name means the latest definition, a decision function its own
+        definition = definition or decorated[1]
+    definition = definition or own.get(point) or point.definition or _inherited(point)
     if definition is None:
         raise DefinitionError(
             f"{point.name} has no definition here: decorate it with make_step, or give its definition in points="
             f"{{{point.name!r}: make_step(...)}}"
         )
     return NamedPoint(point, definition)
-
-
-def by_name(own: Mapping[DecisionPoint, Definition]) -> dict[str, DecisionPoint]:
-    """The simulation's own points that have a name of their own and do not exist in a module."""
-    return {point.name: point for point in own if hasattr(point.rule, BY_NAME)}
-
-
-def locate(key: Any, own: Mapping[DecisionPoint, Definition] = MappingProxyType({})) -> DecisionPoint:
-    """Return the point of a dotted name or function, whether it has a definition or not.
-
-    Raises:
-        UnknownPointError: The name leads to nothing.
-        PatchError: The name leads to something that cannot be patched.
-    """
-    if not isinstance(key, str):
-        return point_for(find_hook(key, POINT))
-    named = by_name(own).get(key)
-    if named is not None:
-        return named
-    decorated = registered(key)
-    try:
-        hook = find_hook(key, POINT)
-    except (UnknownPointError, PatchError):
-        if decorated is None:
-            raise
-        return decorated  # decorated inside a function
-    if decorated is not None and (hook.point is None or not hook.for_good):
-        return decorated  # not yet assigned to its name
-    return point_for(hook)
-
-
-def _decorated_with(key: Any) -> Definition | None:
-    """Return the definition of a decision function. A name means the latest definition, so it has none here."""
-    known = None if isinstance(key, str) else point_of(getattr(key, "__func__", key))
-    return known and known[1]
 
 
 def _inherited(point: DecisionPoint) -> Definition | None:
@@ -187,41 +172,6 @@ def _inherited(point: DecisionPoint) -> Definition | None:
         return None
     known = point_of(unbind(raw_attribute(place.owner, place.attribute)))
     return known and (known[1] or known[0].definition)
-
-
-def aliases(point: DecisionPoint) -> list[DecisionPoint]:
-    """Return the other decision points that decide for the same function in the same class or module.
-
-    A function that is decorated twice is one decision point with two definitions, whichever decision function the model
-    calls. A method that two classes inherit, and that is decorated for each of them, is two decision points.
-    """
-    others = [hook.point for hook in MADE_OF[point.rule] if hook.point is not None and hook is not point.hook]
-    owners = _decorated_owners(point) if others else set()
-    if not owners:
-        return others
-    return [other for other in others if not owners.isdisjoint(_decorated_owners(other) or owners)]
-
-
-def _decorated_owners(point: DecisionPoint) -> set[Any]:
-    """Return the classes and modules that have a decision function of the point under the function's own name."""
-    name, wrappers = point.rule.__name__, point.hook.stand_ins
-    owners: list[Any] = [*all_classes(), *(module for module in list(modules.values()) if hasattr(module, "__dict__"))]
-    found = ((owner, unbind(vars(owner).get(name))) for owner in owners)
-    return {owner for owner, function in found if isinstance(function, FunctionType) and function in wrappers}
-
-
-def have_instances(one: type, other: type) -> bool:
-    """Whether any existing class is a subclass of both classes."""
-    return any(issubclass(owner, other) for owner in all_classes(one))
-
-
-def owner_class(point: DecisionPoint) -> type | None:
-    """The class of which a point is a method; None if it is not a method, or if its name leads to nothing."""
-    try:
-        owner, _ = resolve(point.name, POINT)
-    except (UnknownPointError, PatchError):
-        return None
-    return owner if isinstance(owner, type) else None
 
 
 def _all_registered() -> list[str]:
@@ -235,3 +185,38 @@ def _all_registered() -> list[str]:
             " meant with points=, or with an attribute points of the simulation"
         )
     return names
+
+
+# -- points in other processes --------------------------------------------------------------------
+
+
+def portable(key: Any, name: str | None = None) -> Any:
+    """Return a key that names a function in another process: its dotted name, if that surely leads to it there.
+
+    Anything but a function is returned as it is.
+    """
+    function = unwrapped(key)
+    if not isinstance(function, FunctionType):
+        return key
+    if hasattr(function, BY_NAME):
+        return getattr(function, BY_NAME)
+    name = name or f"{function.__module__}.{function.__qualname__}"
+    if is_importable(name):
+        return name
+    owner, _, attribute = name.removeprefix("__main__.").rpartition(".")
+    found = getattr(modules.get("__main__"), owner, None) if owner.isidentifier() else None
+    return Member(found, attribute) if isinstance(found, type) else function
+
+
+@dataclass(frozen=True)
+class Member:
+    """A function of a class in the main module; unpickled, it is the function itself.
+
+    The rule of a decision function cannot be pickled by name, because the name leads to the decision function.
+    """
+
+    owner: type
+    name: str
+
+    def __reduce__(self) -> Any:
+        return getattr, (self.owner, self.name)

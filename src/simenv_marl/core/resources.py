@@ -52,7 +52,7 @@ class StartedThread:
     def __init__(self, driver: Any) -> None:
         self.driver = driver
 
-    def taker(self, hook: Any) -> Any:
+    def interceptor(self, hook: Any) -> Any:
         """Return the interceptor that refuses a decision; None for other calls, and after the simulation's end."""
         if not self.driver.decides(hook):
             return None

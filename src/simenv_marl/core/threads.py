@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from ..errors import WrongThreadError, warn_user
 from ..hooks.hook import Hook
-from ..hooks.stacks import SIMULATION, Taker
+from ..hooks.stacks import SIMULATION, Interceptor
 from ..simulation import RULE, Sentinel
 from .driver import FAILED, FINISHED, NO_EVENTS, SECONDS_TO_UNWIND, Driver, Event, SimulationExit, reporting_rule
 from .loops import silence_unwound_tasks
@@ -192,7 +192,7 @@ class ThreadDriver(Driver):
         reply, self._reply = self._reply, _NOTHING
         return reply
 
-    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Taker:
+    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
         deliver = event.deliver
         rule: Any = hook.rule
         if event.report is not None:

@@ -44,6 +44,8 @@ def _info(agent: Agent | None, info: dict[str, Any]) -> dict[str, Any]:
     """The info of an agent, with the entry ``"present"``. An absent agent has all actions legal."""
     if agent is not None and not _is_present(agent):
         agent.clear_observation()
+        if agent.ended:
+            agent.observation = None  # so that ``state`` has blanks, too
         info = agent.info | {key: info[key] for key in ("deciding", "acted") if key in info}
     return {**info, "present": _is_present(agent)}
 
@@ -51,7 +53,12 @@ def _info(agent: Agent | None, info: dict[str, Any]) -> dict[str, Any]:
 class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
     """A parallel environment whose ``agents`` are all possible agents until the episode ends: see ``pad_agents``."""
 
-    agents: list[str]
+    @property
+    def agents(self) -> list[str]:
+        """All possible agents while there is an episode."""
+        view = cast("AgentsView", self.unwrapped)
+        episode = view._session.episode
+        return [] if episode is None or episode.over else list(view.possible_agents)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment; return the observations and infos of all possible agents."""
@@ -65,11 +72,7 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
         if isinstance(actions, Mapping) and self.agents:
             absent = {name for name in view.possible_agents if not _is_present(view.episode.agents.get(name))}
             actions = {name: action for name, action in actions.items() if name not in absent}
-        try:
-            results = cast("Results", super().step(actions))
-        finally:
-            if not view.agents:  # an error may have ended the episode
-                self.agents = []
+        results = cast("Results", super().step(actions))
         return self._padded(results) if results[0] else results  # they are empty after the end of the episode
 
     def _padded(self, results: Results) -> Results:
@@ -80,7 +83,6 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
         found = {name: episode.agent(name) for name in roster}
         absent = {name: view._point(name).blank() for name, agent in found.items() if not _is_present(agent)}
         idle = {"deciding": False, "acted": False}
-        self.agents = [] if episode.over else list(roster)
         return (
             {name: absent[name] if name in absent else observations[name] for name in roster},
             {name: rewards.get(name, 0.0) for name in roster},

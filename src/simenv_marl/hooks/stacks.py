@@ -17,7 +17,7 @@ from typing import Any, Final, Protocol
 
 from greenlet import getcurrent, greenlet
 
-Taker = Callable[[tuple[Any, ...], dict[str, Any]], Any]
+Interceptor = Callable[[tuple[Any, ...], dict[str, Any]], Any]
 """A function that intercepts a call. It gets the positional and keyword arguments, and returns the call's result."""
 
 LOCK: Final = RLock()
@@ -25,20 +25,15 @@ LOCK: Final = RLock()
 
 
 class Evaluation(Protocol):
-    """The environment or agent for which code is evaluated.
-
-    Attributes:
-        memory: The memory of differences; None if there is none.
-        plugins: The plugins that take part. None: only the handlers of the whole process.
-    """
+    """The environment or agent for which code is evaluated."""
 
     @property
     def memory(self) -> dict[Any, Any] | None:
-        """The memory of differences."""
+        """The memory of differences; None if there is none."""
 
     @property
     def plugins(self) -> Any:
-        """The plugins that take part."""
+        """The plugins that take part. None: only the handlers of the whole process."""
 
 
 SIMULATION: Final = "simulation"

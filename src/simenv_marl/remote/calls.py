@@ -67,7 +67,7 @@ def point_functions(name: str) -> PointFunctions:
     """Return the functions that represent decision points of that name, in all simulators."""
     decide_hook = _named_hook(lambda call: RULE, name)
     remove_hook = _named_hook(lambda call: None, f"{name} (removed)")
-    functions = PointFunctions(decide_hook.stand_in(), remove_hook.stand_in())
+    functions = PointFunctions(decide_hook.make_wrapper(), remove_hook.make_wrapper())
     point_for(decide_hook).removed_by[functions.remove] = None
     return functions
 

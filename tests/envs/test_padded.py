@@ -313,10 +313,7 @@ def test_what_a_round_tells_stands_in_the_order_of_the_roster():
 def test_the_state_of_observations_has_blanks_for_the_removed():
     names = ["being_1", "being_2"]
     options = {"possible_agents": names, "state_space": "observations"}
-    for view, step in (
-        (parallel_env, lambda env: env.step({"being_1": 3, "being_2": 4})),
-        (aec_env, lambda env: env.step(3)),
-    ):
+    for view, action in ((parallel_env, {"being_1": 3, "being_2": 4}), (aec_env, 3)):
         env = pad_agents(view(script(generations), beings(), **options))
         env.reset(seed=0)
         assert env.state()[:2].tolist() == [1, 0]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
-from contextlib import contextmanager
+from collections.abc import Hashable
 from contextvars import ContextVar
 from typing import Any, Final, Protocol
+from weakref import ref
 
 
 class Resource(Protocol):
@@ -22,44 +22,56 @@ class Resource(Protocol):
         """Wait for the end of the resource."""
 
 
-_POOL: Final[ContextVar[dict[Hashable, list[Resource]] | None]] = ContextVar("simenv_marl.reuse", default=None)
-"""The free resources, by the arguments that made them. None outside a block of ``reuse_resources``."""
-
-
-@contextmanager
-def reuse_resources() -> Iterator[None]:
+class reuse_resources:  # noqa: N801 - it is used like a function; not a generator: immutable errors cannot pass one
     """Reuse the resources of closed simulations for new ones, until the end of the block.
 
     Starting a process often takes longer than an episode. Within another such block this does nothing.
+
+    Attributes:
+        free: The free resources, by the arguments that made them.
     """
-    if _POOL.get() is not None:
-        yield
-        return
-    pool: dict[Hashable, list[Resource]] = {}
-    token = _POOL.set(pool)
-    try:
-        yield
-    finally:
-        _POOL.reset(token)
-        resources = [resource for alike in pool.values() for resource in alike]
+
+    def __init__(self) -> None:
+        self.free: dict[Hashable, list[Resource]] = {}
+        self._token: Any = None
+
+    def __enter__(self) -> None:
+        if _block() is None:
+            self._token = _BLOCK.set(ref(self))
+
+    def __exit__(self, *error: object) -> None:
+        if self._token is None:
+            return
+        _BLOCK.reset(self._token)
+        resources = [resource for alike in self.free.values() for resource in alike]
         for resource in resources:  # first for all of them, so that they end at the same time
             resource.close_input()
         for resource in resources:
             resource.close()
 
 
+_BLOCK: Final[ContextVar[Any]] = ContextVar("simenv_marl.reuse", default=lambda: None)
+"""A reference to the current block. Weak: after an interrupt before it was entered, a block is never left."""
+
+
+def _block() -> reuse_resources | None:
+    block: reuse_resources | None = _BLOCK.get()()
+    return block
+
+
 def release(key: Hashable, resource: Resource) -> bool:
     """Leave a resource to later simulations; return False if it is not usable, or if there is no block."""
-    pool = _POOL.get()
-    if pool is None or not resource.usable:
+    block = _block()
+    if block is None or not resource.usable:
         return False
-    pool.setdefault(key, []).append(resource)
+    block.free.setdefault(key, []).append(resource)
     return True
 
 
 def acquire(key: Hashable) -> Any:
     """Return a usable resource that was released under an equal key; None if there is none."""
-    alike = (_POOL.get() or {}).get(key, [])
+    block = _block()
+    alike = [] if block is None else block.free.get(key, [])
     while alike:
         resource = alike.pop()
         if resource.usable:

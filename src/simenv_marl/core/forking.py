@@ -116,6 +116,15 @@ def _open_files() -> list[_OpenFile]:
     return files
 
 
+def _inode(number: int) -> tuple[int, int] | None:
+    """Return what identifies the file behind a descriptor; None if the descriptor is closed."""
+    try:
+        status = os.fstat(number)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
 def _add(files: list[_OpenFile], number: int, inode: tuple[int, int]) -> None:
     """Add a descriptor to the opening that it is a duplicate of, or add a new opening."""
     flags, offset = fcntl.fcntl(number, fcntl.F_GETFL) & FLAGS, os.lseek(number, 0, os.SEEK_CUR)
@@ -137,8 +146,8 @@ def _share_offset(one: int, other: int) -> bool:
 
 def _reopen(files: list[_OpenFile]) -> None:
     """Open all files again: the same ones if they are only read, else copies that are deleted when they are closed."""
-    still_open = set(map(int, os.listdir(DESCRIPTORS)))  # a file that only a lost thread used may be closed
-    files = [file for file in files if still_open.issuperset(file.numbers)]
+    # A file may have been closed since it was noted: by the garbage collector, or in a thread that does not exist here.
+    files = [file for file in files if all(_inode(number) == file.inode for number in file.numbers)]
     for inode in {file.inode for file in files}:
         alike = [file for file in files if file.inode == inode]
         modes = {file.flags & os.O_ACCMODE for file in alike}

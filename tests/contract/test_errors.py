@@ -40,8 +40,8 @@ def test_there_is_one_root():
 
 def test_all_errors_are_public():
     for error in LEAVES:
-        assert getattr(simenv_marl, error.__name__) is error
-        assert error.__name__ in simenv_marl.__all__
+        assert getattr(simenv_marl.errors, error.__name__) is error
+        assert error.__name__ in simenv_marl.errors.__all__
         assert error.__doc__
 
 

@@ -145,7 +145,7 @@ def test_decisions_in_threads_of_the_model_are_refused_and_the_next_step_says_so
         env.step(1)
     assert env.simulation.log == [1, "refused"]
     assert "after decision 1, of 'choose_0'" in notes(caught.value)
-    assert "__call__" in culprits(caught.value.__cause__)  # which leads to the thread
+    assert "refuse" in culprits(caught.value.__cause__)  # which leads to the thread
     env.reset()
     env.close()
 

@@ -7,7 +7,9 @@ from contextlib import suppress
 from contextvars import copy_context
 from os import getpid
 from sys import modules
+from threading import local
 from typing import Any, Final
+from weakref import ref
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -19,18 +21,25 @@ from .driver import FINISHED, NO_EVENTS, Driver, Event, SimulationExit, reportin
 from .loops import ASYNCIO, Loops, silence_unwound_tasks
 
 
-def _root() -> greenlet:
-    """The root greenlet of the current thread. Unlike the thread's number, it is never reused for another thread."""
-    here = getcurrent()
-    while here.parent is not None:
-        here = here.parent
-    return here
+class _Home:
+    """The identity of a thread. Unlike the thread's number, it is never reused for another thread."""
+
+
+_homes = local()
+
+
+def _home() -> _Home:
+    try:
+        home: _Home = _homes.home
+    except AttributeError:
+        home = _homes.home = _Home()
+    return home
 
 
 class GreenletDriver(Driver):
     """A driver that runs a simulation in a greenlet of the thread that begins the first job."""
 
-    __slots__ = ("_asker", "_body", "_direct", "_leave", "_loops", "_process", "_root", "resume")
+    __slots__ = ("_asker", "_body", "_direct", "_home", "_leave", "_loops", "_process", "resume")
 
     def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
         """Prepare a greenlet, as ``Driver`` does.
@@ -42,7 +51,7 @@ class GreenletDriver(Driver):
         """
         super().__init__(plugins, opened)
         self._direct = direct
-        self._root, self._process = _root(), getpid()
+        self._home, self._process = ref(_home()), getpid()
         self._loops = Loops()
         self._body: Any = greenlet(self._serve)
         self._asker: greenlet | None = None  # the model's own greenlet that waits for an answer
@@ -87,12 +96,12 @@ class GreenletDriver(Driver):
     @property
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from the current thread."""
-        return self._root is _root()
+        return self._home() is _home()
 
     @property
     def lost(self) -> bool:
         """Whether the simulation's thread has ended, or does not exist in this forked process."""
-        return bool(self._root.dead) or (getpid() != self._process and not self.reachable)
+        return self._home() is None or (getpid() != self._process and not self.reachable)
 
     @property
     def usable(self) -> bool:

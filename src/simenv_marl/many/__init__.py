@@ -1,1 +1,1 @@
-"""Policies in the model, in one simulation or in many at once; trajectories for learning; plots."""
+"""Policies in the model, in one simulation or in many at once."""

@@ -124,11 +124,11 @@ class Child:
 
     def begin(self, start: bytes) -> dict[str, Any]:
         """Begin an episode with a line; return the first frame, as ``next_frame``."""
+        stopped = self.state == "stopped"
+        self.state, self.number, self.time = "running", 0, None  # first, since the process may have exited
         if self._rest or self._reading in dict(self._output.poll(0)):
             frame = self.receive()
             self.refuse(frame, f"has sent {short_repr(frame)} before the start of an episode")
-        stopped = self.state == "stopped"
-        self.state, self.number, self.time = "running", 0, None
         self.send(start)
         frame = self.next_frame()
         if stopped and "end" in frame:

@@ -145,7 +145,7 @@ class Point:
             name = name_agent(*args, **kwargs) if kwargs else name_agent(*args)
             if name is None:
                 return RULE
-        agent = episode.agents.get(name) if type(name) is str else None
+        agent = (episode.agents.get(name) or episode.others.get(name)) if type(name) is str else None
         if agent is None or agent.point is not self:
             agent = episode.agent_for(self, name)
         return agent.handle(episode, args, kwargs)

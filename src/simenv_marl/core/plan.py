@@ -296,11 +296,6 @@ class Plan:
         """Whether other code has replaced a function that the plan patches since the plan was made."""
         return any(patch.stale for patch in self.patches)
 
-    @property
-    def inspected(self) -> Any:
-        """The simulation that was made for inspection; None if there is none, or if an environment has claimed it."""
-        return self._prototypes[-1].simulation if self._prototypes else None
-
     def prototype(self) -> Prototype | None:
         """Take the simulation that was made for inspection, with its stack; None if there is none that fits."""
         if self.plugins or self.options.global_rng:  # the simulation was made without them

@@ -301,7 +301,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 class _exclusive:  # noqa: N801 - it is used like a function
-    """A block in which nobody else can use a vector environment."""
+    """A block during which every other call to a vector environment is refused."""
 
     def __init__(self, env: SimulationVectorEnv) -> None:
         self._env = env

@@ -1,4 +1,4 @@
-"""Changes of a model that are in force as long as somebody uses them."""
+"""Changes of a model that are in force while an environment or a block uses them."""
 
 from __future__ import annotations
 

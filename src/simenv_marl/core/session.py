@@ -24,8 +24,7 @@ from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, environment_context
 from .driver import Driver
 from .episode import LONGEST_TAPE, LOST, Episode
-from .plan import Plan
-from .prototype import DRIVERS
+from .plan import DRIVERS, Plan
 from .resources import open_resources
 from .rng import GlobalRandom, draws_check, is_seed
 from .run import refusal
@@ -335,7 +334,7 @@ class Session:
         if mode is None:
             warn_user(
                 "render() shows nothing without a render_mode; the simulation's render modes are"
-                f" {self.plan.model.render_modes}"
+                f" {self.plan.render_modes}"
             )
             return None
         with self.context():

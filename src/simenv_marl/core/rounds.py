@@ -12,7 +12,6 @@ from ..hooks.stacks import EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import ILLEGAL
 from .agent import Agent
-from .delegation import forced_action
 from .driver import WAIT
 from .spaces import duplicate
 
@@ -126,7 +125,7 @@ class Rounds:
             checked[name] = action
         return checked
 
-    def decide(self, episode: Episode, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def decide(self, agent: Agent, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Answer a decision with the agent's action of this round, or wait for the next round."""
         if agent.point.legal is not None:
             agent.mask, agent.choices = agent.point.legal(args, kwargs)
@@ -135,7 +134,7 @@ class Rounds:
         return self._use_action(episode, agent)
 
     def _use_action(self, episode: Episode, agent: Agent) -> Any:
-        action = forced_action(episode, agent) if episode.skips else None
+        action = agent.only_action() if episode.skips else None
         if action is None:
             action = self.actions.pop(agent.name, MISSING)
             mask = agent.mask
@@ -175,5 +174,3 @@ class Rounds:
             if agent.choices is not None and agent is not following:
                 agent.choices = None  # ``legal`` returns them again when the agent decides
         episode.pending = following
-        for agent in episode.agents.values() if episode.skips and not episode.begun else ():
-            agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards

@@ -138,10 +138,6 @@ class Agent:
         Returns:
             The reply to the simulation; ``WAIT`` if the policy is asked later, for many decisions at once, or if a
             replay has reached the other episode's decision.
-
-        Raises:
-            InvalidActionError: The policy's action is not legal.
-            BaseException: Any error of a mapping or the policy.
         """
         if self.ended:
             raise self.decides_after_end()

@@ -100,17 +100,10 @@ class Episode(Run):
         lock: ExclusiveLock | None = None,
         script: Iterable[Any] | None = None,
     ) -> None:
-        """Prepare an episode of a simulation that has been reset.
+        """Prepare an episode of a simulation that has been reset. The driver's next ``resume`` begins ``run``.
 
-        Args:
-            plan: The plan of the environment.
-            simulation: The simulation.
-            driver: The simulation's driver. Its next ``resume`` begins ``run``.
-            seed: The seed of the simulation's reset.
-            in_rounds: Whether all agents are updated when a step returns.
-            rng: The environment's own state of the global generators. None if it has none.
-            lock: The lock that lets one thread at a time use the environment. None if only one thread can use it.
-            script: The tape of another episode to replay. None: this is an ordinary episode.
+        An episode ``in_rounds`` updates all agents when a step returns. ``script`` is the tape of another episode to
+        replay; ordinary episodes have none. For the other arguments, see ``Run``.
         """
         super().__init__(plan, simulation, driver, seed, rng, lock)
         self.agents = {name: Agent(name, point, plan, self.clock) for name, point in plan.roster.items()}
@@ -141,14 +134,10 @@ class Episode(Run):
     # -- steps ------------------------------------------------------------------------------------
 
     def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
-        """Run the simulation to its first decision.
-
-        Args:
-            at_first_event: Called when the simulation has sent its first event.
+        """Run the simulation to its first decision; when it has sent its first event, call a function.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
-            BaseException: Any error of the model, a mapping or a policy.
         """
         with self.context():
             try:
@@ -194,7 +183,6 @@ class Episode(Run):
         Raises:
             InvalidActionError: The action is not legal. Nothing has moved.
             EpisodeOverError, ReentrancyError: No decision is pending.
-            BaseException: Any error of the model, a mapping or a policy.
         """
         agent = self.pending
         if agent is None:
@@ -220,18 +208,9 @@ class Episode(Run):
             raise
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
-        """Turn the checked action of an agent into the reply to the simulation.
+        """Turn the checked action of an agent, or ``RULE``, into the reply for the driver's ``resume``.
 
-        Args:
-            agent: The agent whose decision is answered.
-            action: The action, or ``RULE``.
-            turn: Whether the user answers the pending decision.
-
-        Returns:
-            The reply, for the driver's ``resume``.
-
-        Raises:
-            BaseException: Any error of a mapping. The decision stays pending.
+        If a mapping raises, the decision stays pending. ``turn``: The user answers the pending decision.
         """
         try:
             self.pending = None  # so that an action from inside a mapping is refused
@@ -263,8 +242,7 @@ class Episode(Run):
     def advance(self, reply: Any) -> None:
         """Resume the simulation with a reply, and run to the user's next decision, or to the end.
 
-        Raises:
-            BaseException: Any error of the model, a mapping or a policy. The caller must then call ``fail``.
+        If the model, a mapping or a policy raises, the caller must call ``fail``.
         """
         while True:
             resume = self.driver.resume  # a local variable: calling the attribute directly is slower

@@ -56,7 +56,6 @@ class Rounds:
             InvalidActionError: An action is not legal. Nothing has moved. An action that is legal now and illegal at
                 its turn counts as missing.
             EpisodeOverError, ReentrancyError: No decision is pending.
-            BaseException: Any error of the model, a mapping or a policy.
         """
         pending = episode.pending
         if pending is None:
@@ -93,14 +92,7 @@ class Rounds:
             )
 
     def check(self, episode: Episode, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Check the actions of a round, as far as this is possible before the simulation moves.
-
-        Returns:
-            The actions in the form that mappings take.
-
-        Raises:
-            UnknownAgentError, InvalidActionError, EpisodeOverError, ReentrancyError: See ``play``.
-        """
+        """Check the actions of a round before the simulation moves; return them in the form that mappings take."""
         pending, agents, checked = episode.pending, episode.agents, {}
         if pending is None:
             raise episode.refusal()
@@ -148,12 +140,7 @@ class Rounds:
         return episode.answer(agent, action, False)
 
     def update_all(self, episode: Episode, *, truncated: bool = False) -> None:
-        """Reward and observe all live agents when a step or a reset returns.
-
-        Args:
-            episode: The episode.
-            truncated: Whether the episode ends here.
-        """
+        """Reward and observe all live agents when a step or a reset returns. ``truncated``: The episode ends here."""
         following, episode.pending = episode.pending, None  # so that an action from inside a mapping is refused
         for agent, call in episode.announced().items():
             if agent is not following:

@@ -2,48 +2,33 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain, count, islice, product
 from typing import Any, Final
 
+import numpy as np
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
-from ..errors import AgentError, InvalidActionError, error_text
-from ..simulation import RULE, takes
-from .fingerprint import ABSENT, STATE, alike, describe_differences, general
-from .internals import fitting_views, make_environment, make_simulation
-from .report import Finding, PointStatistics, finding
-from .runs import Run, Runner, TimeUp, describe_with_place, place_of, seed_global_generators
-from .statistics import Statistics
-
-
-@dataclass(kw_only=True)
-class Subject(Runner):
-    """A simulation with its decision points and options, the parameters of the check, and what is known so far."""
-
-    seeds: tuple[int, ...]
-    episodes: int
-    end: float = math.inf  # of the time limit, as time.monotonic()
-    plain: dict[int, Run] = field(default_factory=dict)  # plain runs, by seed
-    playable: bool = False  # whether plain runs decide something and end
-    repeats: bool = True  # whether the same seed gives the same plain run
-    drawn: set[str] = field(default_factory=set)  # the global generators that it draws from
-
-    @property
-    def late(self) -> bool:
-        """Whether the time is up."""
-        return time.monotonic() >= self.end
-
-    @cached_property
-    def views(self) -> tuple[str, ...]:
-        """The views that its plan allows."""
-        return fitting_views(self.plan)
+from ..core.actions import MASK
+from ..errors import AgentError, InvalidActionError, error_text, short_repr
+from ..simulation import RULE, make_simulation, takes
+from .fingerprint import ABSENT, STATE, describe_differences, general
+from .report import Finding, PointStatistics, Range, finding
+from .runs import (
+    Run,
+    Subject,
+    TimeUp,
+    describe_with_place,
+    fitting_views,
+    make_environment,
+    place_of,
+    seed_global_generators,
+)
 
 
 @dataclass
@@ -112,7 +97,7 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
     if not any(run.entries for run in subject.plain.values()):
         report.add("no_decision", points=", ".join(bound.point.name for bound in subject.plan.active))
         return
-    subject.playable = True
+    subject.views = fitting_views(subject.plan)
     if any(run.cut for run in subject.plain.values()):
         report.add("cut_runs", most=subject.max_steps)
     first, *others = subject.plain.values()
@@ -189,16 +174,81 @@ def check_views(subject: Subject, report: Report) -> None:
 # -- episodes of random legal actions -------------------------------------------------------------
 
 
+@dataclass
+class PointRecord:
+    """What episodes have shown of one decision point."""
+
+    point: Any
+    decisions: int = 0
+    values: dict[str, tuple[int, Any, Any, Any]] = field(default_factory=dict)
+    """The number, minimum, sum and maximum of the rewards, and of each array in the observations."""
+    legal: Any = False  # for each action of a masked space, whether it was legal at least once
+    unfit: str = ""  # an observation outside of its space
+
+    def record(self, name: str, value: Any) -> None:
+        """Add a number, an array, or a dict or tuple of these."""
+        if isinstance(value, Mapping):
+            for key in value:
+                if key != MASK:
+                    self.record(f"{name}.{key}", value[key])
+        elif isinstance(value, tuple):
+            for number, part in enumerate(value):
+                self.record(f"{name}.{number}", part)
+        elif isinstance(value, (np.ndarray, np.generic, int, float)):
+            array = np.array(value, float)
+            number, low, total, high = self.values.get(name, (0, array, np.zeros_like(array), array))
+            if array.shape == low.shape:
+                self.values[name] = number + 1, np.minimum(low, array), total + array, np.maximum(high, array)
+
+    def ranges(self, name: str) -> tuple[Range, ...]:
+        """Return the ranges of all elements of arrays of the same name."""
+        number, low, total, high = self.values.get(name, (0, *[np.zeros(0)] * 3))
+        return tuple(
+            Range(f"{name}{list(place)}" if place else name, *(float(a[place]) for a in (low, total / number, high)))
+            for place in np.ndindex(low.shape)
+        )
+
+    def statistics(self) -> PointStatistics:
+        """Return the statistics."""
+        never = np.flatnonzero(~self.legal) if isinstance(self.legal, np.ndarray) else np.zeros(0, int)
+        return PointStatistics(
+            point=self.point.point.name,
+            agents=self.point.agent or "agents named by each call",
+            decisions=self.decisions,
+            observations=tuple(part for name in self.values if name != "reward" for part in self.ranges(name)),
+            rewards=next(iter(self.ranges("reward")), None),
+            never_legal=tuple((never + int(getattr(self.point.definition.action_space, "start", 0))).tolist()),
+        )
+
+
+def _collect(records: Mapping[Any, PointRecord], acted: set[str], env: Any, agent: str, step: Any) -> None:
+    """Record a step of an episode. Rewards count only for agents that have acted in it."""
+    bound = env._point(agent)
+    record = records[bound.point.name, bound.agent]
+    observation, reward, terminated, truncated, info = step
+    record.record("observation", observation)
+    space = env.observation_space(agent)
+    if not record.unfit and not space.contains(observation):
+        record.unfit = f"{agent} has observed {short_repr(observation)}; the space is {space}"
+    if agent in acted:
+        record.record("reward", reward)
+    acted.add(agent)
+    if not (terminated or truncated):
+        record.decisions += 1
+        if isinstance(info.get(MASK), np.ndarray):
+            record.legal = record.legal | info[MASK].astype(bool)
+
+
 def check_episodes(subject: Subject, report: Report) -> None:
     """Play episodes with random legal actions; collect statistics; compare episodes of the same seed."""
-    statistics = Statistics(subject.plan)
+    records = {(bound.point.name, bound.agent): PointRecord(bound) for bound in subject.plan.active}
     first, failures = None, 0
     with report.opened(subject, max_steps=subject.max_steps) as env:
         seeds = islice(chain(subject.seeds, count(max(subject.seeds) + 1)), subject.episodes)
         for number, seed in enumerate(seeds, 1):
             if subject.late or failures == 3:
                 break
-            run = subject.run_randomly(env, seed, collect=statistics.collector())
+            run = subject.run_randomly(env, seed, collect=partial(_collect, records, set()))
             if run.error is not None:
                 failures += 1
                 report.add_error(run, f"in episode {number} of random legal actions, seed {seed}")
@@ -207,16 +257,34 @@ def check_episodes(subject: Subject, report: Report) -> None:
                 continue
             first = run if number == 1 else first
             report.episodes[run.result if len(run.actions) < subject.max_steps else "cut"] += 1
-        report.statistics, findings = statistics.results({name for run in subject.plain.values() for name in run.calls})
+        report.statistics = tuple(record.statistics() for record in records.values())
         episodes = sum(report.episodes.values())
         if episodes:
-            report.findings += findings
+            called = {name for run in subject.plain.values() for name in run.calls}
+            for statistics, record in zip(report.statistics, records.values(), strict=True):
+                _judge(statistics, record, called, report)
             report.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
         if report.episodes["cut"] == episodes > 0:
             report.add("cut_runs", most=subject.max_steps)
         if first is not None and not failures and subject.repeats:
             _compare_episodes(subject, report, env, first)
         Run().play(subject.seconds, partial(env.reset, seed=subject.seeds[0]))  # to be closed in mid-episode
+
+
+def _judge(statistics: PointStatistics, record: PointRecord, called: set[str], report: Report) -> None:
+    """Add what the statistics of a decision point show; plain runs have called some points."""
+    point, rewards, never = statistics.point, statistics.rewards, statistics.never_legal
+    if not statistics.decisions:
+        if point not in called:
+            report.add("never_called", point=point)
+        return
+    if record.unfit:
+        report.add("outside", record.unfit, point=point)
+    if never:
+        report.add("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=point)
+    if rewards and rewards.minimum == rewards.maximum and record.values["reward"][0] > 1:
+        name = "same_rewards" if rewards.minimum else "zero_rewards"
+        report.add(name, f"{record.values['reward'][0]} rewards of {rewards.mean:.6g}", point=point)
 
 
 def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -> None:
@@ -236,7 +304,7 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -
                 report.add_unrepeatable(subject, evidence) if env is new and not beside else report.add(name, evidence)
                 return
         other = subject.run_randomly(used, seed, salt=1)
-        if len(other.entries) > 1 and not alike(first.actions, other.actions) and not first.difference(other):
+        if len(other.entries) > 1 and repr(first.actions) != repr(other.actions) and not first.difference(other):
             report.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
     report.checked.append("the same seed and actions in a new environment, in a used one, and beside another one")
 

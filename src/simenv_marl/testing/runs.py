@@ -9,27 +9,39 @@ from __future__ import annotations
 import ctypes
 import datetime
 import io
+import math
 import os
 import random
 import sys
 import threading
 import time
 import traceback
+import types
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
+from greenlet import getcurrent
 
+from ..core.actions import MASK
+from ..core.context import environment_context
+from ..core.driver import SimulationExit
+from ..core.plan import Plan
+from ..core.rng import GlobalRandom
+from ..decision import DecisionPoint
+from ..envs.make import VIEWS, view_class
 from ..errors import error_notes, error_text
-from ..simulation import RULE
-from .fingerprint import Difference, Fingerprint, alike, describe_differences, differences, fingerprint
-from .internals import MASK, Plan, SimulationExit, outside_simulation, set_up, watching_rules
+from ..hooks.patches import Installation
+from ..hooks.stacks import outside_simulation, stack_of
+from ..simulation import RULE, make_simulation, resetter
+from .fingerprint import Difference, Fingerprint, describe_differences, differences, fingerprint
 
-Result = TypeVar("Result")
+_WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appear in the episode")
+"""Texts in the warnings of environments that are findings."""
 
 
 class Cut(SimulationExit):
@@ -40,7 +52,7 @@ class TimeUp(SimulationExit):
     """Raised in a run whose time is up."""
 
 
-def within(seconds: float, function: Callable[[], Result]) -> Result:
+def within(seconds: float, function: Callable[[], Any]) -> None:
     """Call a function, and raise ``TimeUp`` in it when the time is up.
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
@@ -57,7 +69,7 @@ def within(seconds: float, function: Callable[[], Result]) -> Result:
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
     try:
         watcher.start()
-        return function()
+        function()
     finally:
         # TimeUp may still be raised until the watcher has ended, and is then delivered at once. (It is not revoked: in
         # CPython that would leave the interpreter checking for it forever.)
@@ -91,7 +103,7 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
     """Ignore what a model prints, and its warnings; leave the global generators as they were.
 
     Yields:
-        The warnings for which a filter was added.
+        The warnings of environments that are findings.
     """
     states, silenced = global_generators(), io.StringIO()
     try:
@@ -102,10 +114,33 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
             redirect_stderr(silenced),
         ):
             warnings.simplefilter("ignore")
+            for pattern in _WARNINGS:
+                warnings.filterwarnings("always", f".*{pattern}")
             yield caught
     finally:
         random.setstate(states["Python's random"])
         np.random.set_state(states["numpy.random"])
+
+
+# -- environments ---------------------------------------------------------------------------------
+
+
+def make_environment(plan: Plan, view: str, **options: Any) -> Any:
+    """Make an environment of a plan with changed options."""
+    if view != "joint" and plan.options.flatten:
+        options["flatten"] = False
+    plan = plan.amended(options)
+    return view_class(plan, view)(plan)
+
+
+def fitting_views(plan: Plan) -> tuple[str, ...]:
+    """Return the views that a plan allows."""
+    found = []
+    for view in VIEWS:
+        with suppress(Exception):  # of the plan, or of the model if the view resets it
+            make_environment(plan, view).close()
+            found.append(view)
+    return tuple(found)
 
 
 # -- runs -----------------------------------------------------------------------------------------
@@ -118,6 +153,7 @@ class Run:
     entries: list[tuple[str, Fingerprint]] = field(default_factory=list)  # points and decisions, or agents and steps
     actions: list[Any] = field(default_factory=list)  # the random ones
     simulation: Any = None
+    in_main_loop: bool = False  # whether a plain run is in the simulation's main loop
     fingerprint: Fingerprint | None = None  # of the simulation at its end, or when it was cut
     cut: bool = False  # whether it has reached its limit of decisions
     error: BaseException | None = None
@@ -139,7 +175,7 @@ class Run:
         except (Exception, SystemExit) as error:
             if not self.cut:
                 self.error = error
-        self.drawn = {name for name, state in global_generators().items() if not alike(state, states[name])}
+        self.drawn = {name for name, state in global_generators().items() if repr(state) != repr(states[name])}
         return self
 
     def difference(self, other: Run) -> str:
@@ -158,14 +194,26 @@ class Run:
 
 
 @dataclass(kw_only=True)
-class Runner:
-    """Runs a simulation in different ways, within a number of decisions and of seconds."""
+class Subject:
+    """A simulation with its decision points and options, the limits of its runs, and what is known so far."""
 
     plan: Plan
     max_steps: int
-    seconds: float = 30.0  # for a single run
+    seconds: float  # the time limit of a single run
     own: Callable[[Any], Any] | None = None  # the user's callable by which simulations are compared
+    seeds: tuple[int, ...] = ()
+    episodes: int = 0
+    end: float = math.inf  # of the time limit for all checks, as time.monotonic()
+    plain: dict[int, Run] = field(default_factory=dict)  # plain runs, by seed
+    repeats: bool = True  # whether the same seed gives the same plain run
+    drawn: set[str] = field(default_factory=set)  # the global generators that it draws from
     unstable: frozenset[str] = frozenset()  # parts that are not compared
+    views: tuple[str, ...] = ()  # that the plan allows; none if the plain runs fail or decide nothing
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return time.monotonic() >= self.end
 
     def look(self, simulation: Any) -> Fingerprint:
         """Return the fingerprint of a simulation: of the user's callable, of its ``state()``, or of its attributes."""
@@ -182,13 +230,23 @@ class Runner:
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
     def run_plainly(self, seed: int) -> Run:
-        """Run the simulation's own loop; only the results of its rules are recorded."""
-        run = Run()
+        """Run the simulation's own loop, with the plan's handlers and generators; record the results of its rules."""
+        run, rng = Run(), GlobalRandom() if self.plan.options.global_rng else None
 
         def start() -> None:
-            with set_up(self.plan, seed) as (run.simulation, main):
-                run.result = main()
-                run.fingerprint = self.look(run.simulation)
+            installation = Installation(self.plan.patches)
+            try:
+                with environment_context(self.plan.plugins, rng):
+                    run.simulation = make_simulation(self.plan.source)
+                    if rng is not None:
+                        rng.begin(seed)
+                    resetter(run.simulation)(seed, None)
+                    run.in_main_loop = True
+                    run.result = run.simulation.run()
+                    run.in_main_loop = False
+                    run.fingerprint = self.look(run.simulation)
+            finally:
+                installation.uninstall()
 
         return self._record(run, start)
 
@@ -197,15 +255,37 @@ class Runner:
         run = Run(simulation=env.simulation)
 
         def start() -> None:
-            _play_rules(env, seed)
+            env.reset(seed=seed)
+            if not hasattr(env, "agents"):
+                while not any(env.step(RULE)[2:4]):
+                    pass
+            while getattr(env, "agents", ()):
+                over = hasattr(env, "agent_selection") and (env.terminations | env.truncations)[env.agent_selection]
+                env.step(None if over else RULE)
             run.fingerprint = self.look(run.simulation)
 
         return self._record(run, start)
 
     def _record(self, run: Run, start: Callable[[], None]) -> Run:
-        """Record the decisions of a run, and cut it at the limit."""
+        """Play a run in which the decisions of the rules are recorded."""
+        points = list(dict.fromkeys(bound.point for bound in self.plan.points))
+        for point in points:
+            point.hook.replace_rule(self._recording_rule(run, point))
+        try:
+            return run.play(self.seconds, start)
+        finally:
+            for point in points:
+                point.hook.replace_rule()
 
-        def begin(name: str) -> Callable[[Any], None]:
+    def _recording_rule(self, run: Run, point: DecisionPoint) -> Callable[..., Any]:
+        """Return a rule that records each of its decisions, and cuts the run at the limit."""
+        name, rule = point.name, point.rule
+
+        def decide(*args: Any, **kwargs: Any) -> Any:
+            stack = stack_of(getcurrent())
+            # In a reset or a mapping, rules do not count as decisions.
+            if not (run.in_main_loop if stack is None else stack.decides(point.hook)):
+                return rule(*args, **kwargs)
             place = len(run.entries)
             if place >= self.max_steps:
                 if not run.cut:
@@ -213,14 +293,19 @@ class Runner:
                 raise Cut
             run.entries.append((name, {}))
             run.latest = time.monotonic()
+            value = rule(*args, **kwargs)
+            return end(place, value) if point.hook.kind == "function" else wait(place, value)
 
-            def end(value: Any) -> None:
-                run.entries[place] = name, fingerprint(f"the decision of {name}", value, follow=False)
+        def end(place: int, value: Any) -> Any:
+            run.entries[place] = name, fingerprint(f"the decision of {name}", value, follow=False)
+            return value
 
-            return end
+        @types.coroutine
+        def wait(place: int, running: Any) -> Generator[Any, Any, Any]:
+            awaited = running.__await__() if point.hook.kind == "coroutine" else running
+            return end(place, (yield from awaited))
 
-        with watching_rules(self.plan, begin):
-            return run.play(self.seconds, start)
+        return decide
 
     def run_randomly(
         self, env: Any, seed: int, *, salt: int = 0, most: int | None = None, beside: Any = None, collect: Any = None
@@ -260,18 +345,6 @@ class Runner:
         finally:
             sys.setprofile(before)
         return "; ".join(list(found)[:3])
-
-
-def _play_rules(env: Any, seed: int) -> None:
-    """Play an episode in any view with ``RULE`` throughout."""
-    env.reset(seed=seed)
-    if not hasattr(env, "agents"):
-        while not any(env.step(RULE)[2:4]):
-            pass
-        return
-    while env.agents:
-        over = hasattr(env, "agent_selection") and (env.terminations | env.truncations)[env.agent_selection]
-        env.step(None if over else RULE)
 
 
 def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[str, Any]]:

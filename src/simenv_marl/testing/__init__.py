@@ -24,15 +24,7 @@ from ..errors import OptionValueError, SimEnvError, short_repr
 from ..simulation import TRUNCATED
 from .checks import CHECKS, Report
 from .report import SEVERITIES, CheckReport, Finding, Inspection, PointStatistics, Range, order_of
-from .runs import (
-    Run,
-    Subject,
-    describe_with_place,
-    fitting_views,
-    make_environment,
-    quietly,
-    seed_global_generators,
-)
+from .runs import Run, Subject, describe_with_place, fitting_views, make_environment, quietly
 
 __all__ = [
     "CheckReport",
@@ -148,7 +140,6 @@ def inspect_simulation(
     """
     with quietly():
         plan = Plan.draw_up(simulation, points, options)
-        seed_global_generators(seed)
         subject = Subject(plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None)
         run = subject.run_plainly(seed)
         views = fitting_views(plan)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from ..core.actions import MASK
 from ..errors import AgentError, InvalidActionError, error_text, short_repr
 from ..simulation import RULE, make_simulation, takes
 from .fingerprint import ABSENT, STATE, describe_differences, general
-from .report import Finding, PointStatistics, Range, finding
+from .report import FINDINGS, SEVERITIES, Finding, PointStatistics, Range
 from .runs import (
     Run,
     Subject,
@@ -41,21 +40,17 @@ class Report:
     episodes: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("terminated", "truncated", "cut"), 0))
     errors: set[tuple[str, str]] = field(default_factory=set)  # by class and place
 
-    @property
-    def has_errors(self) -> bool:
-        """Whether there is a finding of severity "error"."""
-        return any(finding.severity == "error" for finding in self.findings)
-
     def add(self, name: str, evidence: str = "", **words: Any) -> None:
-        """Add a finding, as ``finding`` makes it."""
-        self.findings.append(finding(name, evidence, **words))
+        """Add a finding of ``FINDINGS``; words are the values of placeholders there."""
+        severity = next(severity for severity in SEVERITIES if name in FINDINGS[severity])
+        title, text = FINDINGS[severity][name].format(**words).split("\n", 1)
+        self.findings.append(Finding(severity, title, " ".join(text.split()), evidence))
 
     def add_error(self, run: Run, where: str) -> None:
         """Add the finding for the exception of a run; the same one from the same place is reported once."""
         error: Any = run.error
         if isinstance(error, TimeUp):
-            waits = time.monotonic() - run.latest > run.seconds / 2
-            self.add("stuck" if waits else "out_of_time", f"{where}, after {len(run.entries)} steps")
+            self.add("stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.entries)} steps")
             return
         key = type(error).__name__, place_of(error) or error_text(error)
         if key not in self.errors:
@@ -74,7 +69,7 @@ class Report:
         try:
             yield env
         finally:
-            closing = Run().play(subject.seconds, env.close)
+            closing = subject.play(env.close)
             if closing.error is not None:
                 self.add_error(closing, "when an environment was closed in mid-episode")
 
@@ -87,7 +82,6 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
     if not takes(make_simulation(subject.plan.source).reset, "seed"):
         report.add("unseeded_reset")
     for seed in subject.seeds:
-        seed_global_generators(seed)
         run = subject.plain[seed] = subject.run_plainly(seed)
         if not subject.plan.options.global_rng:
             subject.drawn |= run.drawn
@@ -112,8 +106,7 @@ def check_repeated_run(subject: Subject, report: Report) -> None:
     # If it draws from the global generators, run it with these in another state, too.
     runs = []
     for other_seed in (seed, seed + 1) if subject.drawn else (seed,):
-        seed_global_generators(other_seed)
-        runs.append(subject.run_plainly(seed))
+        runs.append(subject.run_plainly(seed, shared_seed=other_seed))
         if isinstance(runs[-1].error, TimeUp):
             return
     if subject.drawn:
@@ -147,7 +140,6 @@ def check_views(subject: Subject, report: Report) -> None:
             continue
         seed_global_generators(seed)
         with report.opened(subject, view, driver=driver, policies=policies, max_steps=None) as env:
-            seed_global_generators(seed)
             run = subject.run_rules(env, seed)
         where = f"{view} view, driver {driver}, seed {seed}"
         if run.error is not None:
@@ -200,25 +192,31 @@ class PointRecord:
             if array.shape == low.shape:
                 self.values[name] = number + 1, np.minimum(low, array), total + array, np.maximum(high, array)
 
-    def ranges(self, name: str) -> tuple[Range, ...]:
-        """Return the ranges of all elements of arrays of the same name."""
-        number, low, total, high = self.values.get(name, (0, *[np.zeros(0)] * 3))
-        return tuple(
-            Range(f"{name}{list(place)}" if place else name, *(float(a[place]) for a in (low, total / number, high)))
-            for place in np.ndindex(low.shape)
-        )
-
-    def statistics(self) -> PointStatistics:
-        """Return the statistics."""
-        never = np.flatnonzero(~self.legal) if isinstance(self.legal, np.ndarray) else np.zeros(0, int)
-        return PointStatistics(
-            point=self.point.point.name,
-            agents=self.point.agent or "agents named by each call",
-            decisions=self.decisions,
-            observations=tuple(part for name in self.values if name != "reward" for part in self.ranges(name)),
-            rewards=next(iter(self.ranges("reward")), None),
-            never_legal=tuple((never + int(getattr(self.point.definition.action_space, "start", 0))).tolist()),
-        )
+    def results(self, report: Report, called: set[str]) -> PointStatistics:
+        """Return the statistics, and report what they show; plain runs have called some points."""
+        ranges = {
+            name: [
+                Range(f"{name}{list(place)}" if place else name, low[place].item(), mean.item(), high[place].item())
+                for place, mean in np.ndenumerate(total / number)
+            ]
+            for name, (number, low, total, high) in self.values.items()
+        }
+        point, rewards = self.point.point.name, ranges.pop("reward", [None])[0]
+        never: tuple[int, ...] = ()
+        if isinstance(self.legal, np.ndarray):
+            start = int(getattr(self.point.definition.action_space, "start", 0))
+            never = tuple((np.flatnonzero(~self.legal) + start).tolist())
+        if not self.decisions and point not in called:
+            report.add("never_called", point=point)
+        if self.unfit:
+            report.add("outside", self.unfit, point=point)
+        if never:
+            report.add("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=point)
+        if rewards and rewards.minimum == rewards.maximum and self.values["reward"][0] > 1:
+            name = "same_rewards" if rewards.minimum else "zero_rewards"
+            report.add(name, f"{self.values['reward'][0]} rewards of {rewards.mean:.6g}", point=point)
+        agents, observations = self.point.agent or "agents named by each call", tuple(chain(*ranges.values()))
+        return PointStatistics(point, agents, self.decisions, observations, rewards, never)
 
 
 def _collect(records: Mapping[Any, PointRecord], acted: set[str], env: Any, agent: str, step: Any) -> None:
@@ -257,34 +255,16 @@ def check_episodes(subject: Subject, report: Report) -> None:
                 continue
             first = run if number == 1 else first
             report.episodes[run.result if len(run.actions) < subject.max_steps else "cut"] += 1
-        report.statistics = tuple(record.statistics() for record in records.values())
+        called = {name for run in subject.plain.values() for name in run.calls}
+        report.statistics = tuple(record.results(report, called) for record in records.values())
         episodes = sum(report.episodes.values())
         if episodes:
-            called = {name for run in subject.plain.values() for name in run.calls}
-            for statistics, record in zip(report.statistics, records.values(), strict=True):
-                _judge(statistics, record, called, report)
             report.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
         if report.episodes["cut"] == episodes > 0:
             report.add("cut_runs", most=subject.max_steps)
         if first is not None and not failures and subject.repeats:
             _compare_episodes(subject, report, env, first)
-        Run().play(subject.seconds, partial(env.reset, seed=subject.seeds[0]))  # to be closed in mid-episode
-
-
-def _judge(statistics: PointStatistics, record: PointRecord, called: set[str], report: Report) -> None:
-    """Add what the statistics of a decision point show; plain runs have called some points."""
-    point, rewards, never = statistics.point, statistics.rewards, statistics.never_legal
-    if not statistics.decisions:
-        if point not in called:
-            report.add("never_called", point=point)
-        return
-    if record.unfit:
-        report.add("outside", record.unfit, point=point)
-    if never:
-        report.add("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=point)
-    if rewards and rewards.minimum == rewards.maximum and record.values["reward"][0] > 1:
-        name = "same_rewards" if rewards.minimum else "zero_rewards"
-        report.add(name, f"{record.values['reward'][0]} rewards of {rewards.mean:.6g}", point=point)
+        subject.play(partial(env.reset, seed=subject.seeds[0]))  # to be closed in mid-episode
 
 
 def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -> None:
@@ -325,13 +305,13 @@ _TESTS: Final[tuple[tuple[str, str, Callable[[Callable[[], Any]], Any]], ...]] =
 def check_conformance(subject: Subject, report: Report) -> None:
     """Run the tests of PettingZoo and Gymnasium, unless errors were found that they would only repeat."""
     passed = []
-    seed_global_generators(0)
     for name, view, test in _TESTS:
-        skipped = report.has_errors or view not in subject.views or (subject.drawn and "seed" in name)
+        failed = any(finding.severity == "error" for finding in report.findings)
+        skipped = failed or view not in subject.views or (subject.drawn and "seed" in name)
         if subject.late or skipped:
             continue
         make = partial(make_environment, subject.plan, view, max_steps=subject.max_steps)
-        run = Run().play(subject.seconds, partial(test, make))
+        run = subject.play(partial(test, make))
         if run.error is None:
             passed.append(name)
         elif isinstance(run.error, AssertionError):

@@ -110,13 +110,6 @@ Either there were too few episodes for them to be legal, or the action space is 
 """By severity and name, the title of a finding in the first line, then what it means and what to do."""
 
 
-def finding(name: str, evidence: str = "", **words: Any) -> Finding:
-    """Make a finding from its text in ``FINDINGS``; words are the values of placeholders there."""
-    severity = next(severity for severity in SEVERITIES if name in FINDINGS[severity])
-    title, text = FINDINGS[severity][name].format(**words).split("\n", 1)
-    return Finding(severity, title, " ".join(text.split()), evidence)
-
-
 @dataclass(frozen=True)
 class Range:
     """The range of one number over all episodes."""

@@ -7,7 +7,6 @@ its time is up, an exit is raised in whatever Python code the model is executing
 from __future__ import annotations
 
 import ctypes
-import datetime
 import io
 import math
 import os
@@ -21,6 +20,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field
+from datetime import date, datetime
 from itertools import islice
 from typing import Any, Final
 
@@ -160,23 +160,12 @@ class Run:
     result: Any = None  # what run() returned in a plain run, or how an episode of random actions ended
     drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
     latest: float = field(default_factory=time.monotonic)  # the time of the latest entry
-    seconds: float = 0.0  # its limit
+    stuck: bool = False  # whether its time was up long after the latest entry
 
     @property
     def calls(self) -> list[str]:
         """The names of the points that were called, in that order."""
         return [name for name, _ in self.entries]
-
-    def play(self, seconds: float, function: Callable[[], Any]) -> Run:
-        """Call a function that plays this run; record its error and the global generators."""
-        states, self.seconds = global_generators(), seconds
-        try:
-            within(seconds, function)
-        except (Exception, SystemExit) as error:
-            if not self.cut:
-                self.error = error
-        self.drawn = {name for name, state in global_generators().items() if repr(state) != repr(states[name])}
-        return self
 
     def difference(self, other: Run) -> str:
         """Describe the first difference from the entries of another run; empty if there is none."""
@@ -229,8 +218,24 @@ class Subject:
             return []
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
-    def run_plainly(self, seed: int) -> Run:
-        """Run the simulation's own loop, with the plan's handlers and generators; record the results of its rules."""
+    def play(self, function: Callable[[], Any], run: Run | None = None, *, seed: int = 0) -> Run:
+        """Seed the global generators, call a function within the time limit, and record its error and its draws."""
+        run = Run() if run is None else run
+        seed_global_generators(seed)
+        states = global_generators()
+        try:
+            within(self.seconds, function)
+        except (Exception, SystemExit) as error:
+            run.error = None if run.cut else error
+            run.stuck = time.monotonic() - run.latest > self.seconds / 2
+        run.drawn = {name for name, state in global_generators().items() if repr(state) != repr(states[name])}
+        return run
+
+    def run_plainly(self, seed: int, *, shared_seed: int | None = None) -> Run:
+        """Run the simulation's own loop, with the plan's handlers and generators; record the results of its rules.
+
+        The global generators get the same seed, or a ``shared_seed``.
+        """
         run, rng = Run(), GlobalRandom() if self.plan.options.global_rng else None
 
         def start() -> None:
@@ -248,7 +253,7 @@ class Subject:
             finally:
                 installation.uninstall()
 
-        return self._record(run, start)
+        return self._record(run, start, seed if shared_seed is None else shared_seed)
 
     def run_rules(self, env: Any, seed: int) -> Run:
         """Run an environment of any view with ``RULE`` throughout; the results of rules are recorded."""
@@ -264,15 +269,15 @@ class Subject:
                 env.step(None if over else RULE)
             run.fingerprint = self.look(run.simulation)
 
-        return self._record(run, start)
+        return self._record(run, start, seed)
 
-    def _record(self, run: Run, start: Callable[[], None]) -> Run:
+    def _record(self, run: Run, start: Callable[[], None], seed: int) -> Run:
         """Play a run in which the decisions of the rules are recorded."""
         points = list(dict.fromkeys(bound.point for bound in self.plan.points))
         for point in points:
             point.hook.replace_rule(self._recording_rule(run, point))
         try:
-            return run.play(self.seconds, start)
+            return self.play(start, run, seed=seed)
         finally:
             for point in points:
                 point.hook.replace_rule()
@@ -324,8 +329,7 @@ class Subject:
                     collect(env, agent, step)
                 next(other, None)
 
-        seed_global_generators(seed)
-        return run.play(self.seconds, start)
+        return self.play(start, run, seed=seed)
 
     def sources_of_chance(self, seed: int) -> str:
         """Run the simulation, and say where it uses clocks, entropy and Python's global generator."""
@@ -335,8 +339,11 @@ class Subject:
             source = _CHANCE.get(argument) if event == "c_call" else None
             if frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
                 source = "a random.Random is made without a seed"
-            if source and (place := _caller(frame)):
-                found[f"{source} at {place}"] = None
+            while source and frame is not None and frame.f_code.co_filename.startswith((_LIBRARY, "<")):
+                frame = frame.f_back
+            if source and frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
+                code = frame.f_code
+                found[f"{source} at {code.co_filename}:{frame.f_lineno}, in {code.co_name}"] = None
 
         before = sys.getprofile()
         sys.setprofile(profile)
@@ -366,14 +373,7 @@ def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[st
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
 _LIBRARY: Final = random.__file__.rpartition("random.py")[0]
-_CLOCKS: Final = (
-    time.time,
-    time.time_ns,
-    time.monotonic,
-    time.perf_counter,
-    datetime.datetime.now,
-    datetime.date.today,
-)
+_CLOCKS: Final = (time.time, time.time_ns, time.monotonic, time.perf_counter, datetime.now, date.today)
 _CHANCE: Final[dict[Any, str]] = {
     **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},
     **dict.fromkeys((random.random, random.getrandbits), "Python's global generator is used"),
@@ -398,11 +398,3 @@ def describe_with_place(error: BaseException) -> str:
     text = text if len(text) <= 400 else f"{text[:396]} ..."
     notes = "".join(f"\n{note.removeprefix('simenv_marl: ')}" for note in error_notes(error)[:2])
     return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "") + notes
-
-
-def _caller(frame: Any) -> str:
-    """Return the place in the model from which the standard library was called; empty if this library called it."""
-    while frame is not None and frame.f_code.co_filename.startswith((_LIBRARY, "<")):
-        frame = frame.f_back
-    path = frame.f_code.co_filename if frame is not None else _PACKAGE
-    return "" if path.startswith(_PACKAGE) else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"

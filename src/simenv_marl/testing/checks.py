@@ -46,9 +46,11 @@ class Report:
         title, text = FINDINGS[severity][name].format(**words).split("\n", 1)
         self.findings.append(Finding(severity, title, " ".join(text.split()), evidence))
 
-    def add_error(self, run: Run, where: str) -> None:
+    def add_error(self, run: Run, where: str, view: str = "aec") -> None:
         """Add the finding for the exception of a run; the same one from the same place is reported once."""
         error: Any = run.error
+        if view == "joint" and isinstance(error, AgentError):
+            return  # that view needs to know all agents
         if isinstance(error, TimeUp):
             self.add("stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.entries)} steps")
             return
@@ -56,11 +58,6 @@ class Report:
         if key not in self.errors:
             self.errors.add(key)
             self.add("raises", f"{where}: {describe_with_place(error)}", kind=type(error).__name__)
-
-    def add_unrepeatable(self, subject: Subject, evidence: str) -> None:
-        """Add the finding that two runs of the same seed differ."""
-        sources = subject.sources_of_chance(subject.seeds[0])
-        self.add("unrepeatable", f"{evidence}\nin the model, {sources}" if sources else evidence)
 
     @contextmanager
     def opened(self, subject: Subject, view: str = "aec", **options: Any) -> Iterator[Any]:
@@ -113,12 +110,12 @@ def check_repeated_run(subject: Subject, report: Report) -> None:
         differs = first.difference(runs[1]) or subject.differences(first, runs[1])
         names = " and ".join(sorted(subject.drawn))
         name = "unseeded_generators" if differs else "shared_generators"
-        report.add(name, subject.sources_of_chance(seed), names=names)
+        report.add(name, subject.sources_of_chance().lstrip(), names=names)
     parts = subject.differences(first, runs[0])
     difference = first.difference(runs[0]) or describe_differences([part for part in parts if STATE in part[0]])
     if difference:
         subject.repeats = False
-        report.add_unrepeatable(subject, f"two plain runs of seed {seed}: {difference}")
+        report.add("unrepeatable", f"two plain runs of seed {seed}: {difference}{subject.sources_of_chance()}")
     elif parts:
         report.add("unstable", describe_differences(parts))
         subject.unstable = frozenset(general(path) for path, _, _ in parts)
@@ -143,8 +140,7 @@ def check_views(subject: Subject, report: Report) -> None:
             run = subject.run_rules(env, seed)
         where = f"{view} view, driver {driver}, seed {seed}"
         if run.error is not None:
-            if not (view == "joint" and isinstance(run.error, AgentError)):  # that view needs to know all agents
-                report.add_error(run, f"in the {where}, with RULE throughout")
+            report.add_error(run, f"in the {where}, with RULE throughout", view)
             continue
         if run.drawn - subject.drawn:
             report.add("unseeded_generators", f"in the {where}", names=" and ".join(sorted(run.drawn - subject.drawn)))
@@ -280,8 +276,8 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -
                 return
             difference = first.difference(again)
             if difference:
-                evidence = f"seed {seed}, the same actions: {difference}"
-                report.add_unrepeatable(subject, evidence) if env is new and not beside else report.add(name, evidence)
+                sources = subject.sources_of_chance() if name == "unrepeatable" else ""
+                report.add(name, f"seed {seed}, the same actions: {difference}{sources}")
                 return
         other = subject.run_randomly(used, seed, salt=1)
         if len(other.entries) > 1 and repr(first.actions) != repr(other.actions) and not first.difference(other):
@@ -307,8 +303,7 @@ def check_conformance(subject: Subject, report: Report) -> None:
     passed = []
     for name, view, test in _TESTS:
         failed = any(finding.severity == "error" for finding in report.findings)
-        skipped = failed or view not in subject.views or (subject.drawn and "seed" in name)
-        if subject.late or skipped:
+        if failed or subject.late or view not in subject.views or (subject.drawn and "seed" in name):
             continue
         make = partial(make_environment, subject.plan, view, max_steps=subject.max_steps)
         run = subject.play(partial(test, make))
@@ -316,11 +311,8 @@ def check_conformance(subject: Subject, report: Report) -> None:
             passed.append(name)
         elif isinstance(run.error, AssertionError):
             report.add("failed_test", describe_with_place(run.error), test=name)
-        # These tests ignore masks, or masks that change within a round; the joint view needs to know all agents.
-        elif not isinstance(run.error, (TimeUp, InvalidActionError)) and not (
-            view == "joint" and isinstance(run.error, AgentError)
-        ):
-            report.add_error(run, f"in {name}")
+        elif not isinstance(run.error, (TimeUp, InvalidActionError)):  # tests ignore masks, or that these change
+            report.add_error(run, f"in {name}", view)
     if passed:
         report.checked.append(", ".join(passed))
 

@@ -22,6 +22,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppres
 from dataclasses import dataclass, field
 from datetime import date, datetime
 from itertools import islice
+from textwrap import shorten
 from typing import Any, Final
 
 import numpy as np
@@ -34,7 +35,7 @@ from ..core.plan import Plan
 from ..core.rng import GlobalRandom
 from ..decision import DecisionPoint
 from ..envs.make import VIEWS, view_class
-from ..errors import error_notes, error_text
+from ..errors import describe_error, error_notes
 from ..hooks.patches import Installation
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import RULE, make_simulation, resetter
@@ -236,9 +237,10 @@ class Subject:
 
         The global generators get the same seed, or a ``shared_seed``.
         """
-        run, rng = Run(), GlobalRandom() if self.plan.options.global_rng else None
+        run = Run()
 
         def start() -> None:
+            rng = GlobalRandom() if self.plan.options.global_rng else None
             installation = Installation(self.plan.patches)
             try:
                 with environment_context(self.plan.plugins, rng):
@@ -331,8 +333,8 @@ class Subject:
 
         return self.play(start, run, seed=seed)
 
-    def sources_of_chance(self, seed: int) -> str:
-        """Run the simulation, and say where it uses clocks, entropy and Python's global generator."""
+    def sources_of_chance(self) -> str:
+        """Run the simulation, and say where it uses clocks, entropy and Python's global generator, if it does."""
         found: dict[str, None] = {}
 
         def profile(frame: Any, event: str, argument: Any) -> None:
@@ -348,10 +350,10 @@ class Subject:
         before = sys.getprofile()
         sys.setprofile(profile)
         try:
-            self.run_plainly(seed)
+            self.run_plainly(self.seeds[0])
         finally:
             sys.setprofile(before)
-        return "; ".join(list(found)[:3])
+        return f"\nin the model, {'; '.join(list(found)[:3])}" if found else ""
 
 
 def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[str, Any]]:
@@ -384,17 +386,14 @@ _CHANCE: Final[dict[Any, str]] = {
 
 def place_of(error: BaseException) -> str:
     """Return where an error was raised, outside of this library: file, line and function; empty if nowhere."""
-    places = [
-        f"{frame.filename}:{frame.lineno}, in {frame.name}"
-        for frame in traceback.extract_tb(error.__traceback__)
-        if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename
-    ]
-    return places[-1] if places else ""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename:
+            return f"{frame.filename}:{frame.lineno}, in {frame.name}"
+    return ""
 
 
 def describe_with_place(error: BaseException) -> str:
     """Describe an error: its class, the beginning of its text, where it was raised, and this library's notes."""
-    text, place = " ".join(error_text(error).split()), place_of(error)
-    text = text if len(text) <= 400 else f"{text[:396]} ..."
+    text, place = shorten(describe_error(error), 400, placeholder=" ..."), place_of(error)
     notes = "".join(f"\n{note.removeprefix('simenv_marl: ')}" for note in error_notes(error)[:2])
-    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "") + notes
+    return text + (f" ({place})" if place else "") + notes

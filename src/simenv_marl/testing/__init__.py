@@ -151,7 +151,7 @@ def inspect_simulation(
         views=views,
         calls=order_of(run.calls),
         counts=dict(Counter(run.calls)),
-        ended=f"{len(run.entries)} decisions, then {how}",
+        ended=f"{len(run.calls)} decisions, then {how}",
     )
 
 

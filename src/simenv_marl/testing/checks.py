@@ -52,7 +52,7 @@ class Report:
         if view == "joint" and isinstance(error, AgentError):
             return  # that view needs to know all agents
         if isinstance(error, TimeUp):
-            self.add("stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.entries)} steps")
+            self.add("stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.calls)} steps")
             return
         key = type(error).__name__, place_of(error) or error_text(error)
         if key not in self.errors:
@@ -85,7 +85,7 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
         if run.error is not None:
             report.add_error(run, f"in a plain run without any environment, seed {seed}")
             return
-    if not any(run.entries for run in subject.plain.values()):
+    if not any(run.calls for run in subject.plain.values()):
         report.add("no_decision", points=", ".join(bound.point.name for bound in subject.plan.active))
         return
     subject.views = fitting_views(subject.plan)
@@ -101,11 +101,10 @@ def check_repeated_run(subject: Subject, report: Report) -> None:
     seed = subject.seeds[0]
     first = subject.plain[seed]
     # If it draws from the global generators, run it with these in another state, too.
-    runs = []
-    for other_seed in (seed, seed + 1) if subject.drawn else (seed,):
-        runs.append(subject.run_plainly(seed, shared_seed=other_seed))
-        if isinstance(runs[-1].error, TimeUp):
-            return
+    shared_seeds = (seed, seed + 1) if subject.drawn else (seed,)
+    runs = [subject.run_plainly(seed, shared_seed=shared_seed) for shared_seed in shared_seeds]
+    if any(isinstance(run.error, TimeUp) for run in runs):
+        return
     if subject.drawn:
         differs = first.difference(runs[1]) or subject.differences(first, runs[1])
         names = " and ".join(sorted(subject.drawn))
@@ -133,7 +132,7 @@ def check_views(subject: Subject, report: Report) -> None:
     policies = dict.fromkeys(subject.plan.options.policies or (), RULE) or None
     for driver, view, seed in product(drivers, subject.views, subject.plain):
         plain = subject.plain[seed]
-        if subject.late or not plain.entries:
+        if subject.late or not plain.calls:
             continue
         seed_global_generators(seed)
         with report.opened(subject, view, driver=driver, policies=policies, max_steps=None) as env:
@@ -151,11 +150,11 @@ def check_views(subject: Subject, report: Report) -> None:
             only_more = not decisions and all(here is ABSENT for _, here, _ in parts)
             report.add("writing_mappings" if only_more else "changed_model", evidence)
             return
-    most = max(len(run.entries) for run in subject.plain.values())
+    most = max(len(run.calls) for run in subject.plain.values())
     views, seeds = ", ".join(subject.views), ", ".join(map(str, subject.seeds))
     report.checked.append(
         f"plain runs against RULE throughout ({views}; drivers {', '.join(drivers)}; seeds {seeds}; up to {most}"
-        f" decisions each): the decisions, and {len(plain.fingerprint or ())} parts that the simulation holds then"
+        f" decisions each): the decisions, and {len(plain.fingerprint)} parts that the simulation holds then"
     )
 
 
@@ -267,7 +266,7 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -
     """Compare the first episode with episodes of its seed in a new environment, in a used one, and beside another."""
     seed = subject.seeds[0]
     with report.opened(subject, max_steps=subject.max_steps) as new:
-        subject.run_randomly(used, seed, most=1 + len(first.entries) // 2)  # broken off
+        subject.run_randomly(used, seed, most=1 + len(first.calls) // 2)  # broken off
         for name, env, beside in (("unrepeatable", new, None), ("left_over", used, None), ("disturbance", new, used)):
             again = subject.run_randomly(env, seed, beside=beside)
             if again.error is not None:
@@ -280,7 +279,7 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -
                 report.add(name, f"seed {seed}, the same actions: {difference}{sources}")
                 return
         other = subject.run_randomly(used, seed, salt=1)
-        if len(other.entries) > 1 and repr(first.actions) != repr(other.actions) and not first.difference(other):
+        if len(other.calls) > 1 and repr(first.actions) != repr(other.actions) and not first.difference(other):
             report.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
     report.checked.append("the same seed and actions in a new environment, in a used one, and beside another one")
 

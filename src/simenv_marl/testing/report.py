@@ -40,8 +40,7 @@ space or exclude the action with action_mask_mapping. If only a later episode fa
 An environment would wait forever. Look for an endless loop, for a loop that waits for an event that some actions never
 cause, and for an except that catches everything, SimulationExit too. If the model is only slow: time_limit=.""",
         "no_decision": """The simulation never asks for a decision
-run() ends and never calls {points}. Does the simulation call the function as an attribute of its class or module,
-and not by an earlier reference?""",
+run() never calls {points}. Does it call an earlier reference instead of the attribute of a class or module?""",
         "unrepeatable": """The same seed does not give the same run
 Two runs with the same seed differ, so no result can be repeated. The usual causes: a generator that reset() does not
 seed, a clock, values left over in class attributes or global variables, or the order of a set.""",
@@ -50,9 +49,8 @@ The same seed does not give the same episode: all other code that draws from the
 model a generator of its own, random.Random(seed) or numpy.random.default_rng(seed), seeded in reset(); or, if you
 cannot change it, give environments the option global_rng=True. Mappings should only read the model.""",
         "changed_model": """The model behaves differently when it is observed
-If its own rule takes all decisions, the run in an environment must be identical to the plain run. It is not, so
-agents would learn on a different model. Mappings (of observations, rewards, masks, agents' names) may only read the
-model: they must not change it or draw random numbers from it.""",
+With its own rule throughout, a run in an environment must be identical to the plain run, else agents learn on another
+model. Mappings (of observations, rewards, masks, agents' names) must not change it or draw random numbers from it.""",
         "left_over": """Something is left over from earlier episodes
 An episode after others in the same environment, the last of them broken off, differs from the same episode in a new
 environment. reset() must restore everything that run() changes. The usual cause is an attribute that __init__ sets.""",
@@ -62,14 +60,12 @@ variables, a file, or objects that were made when the module was imported.""",
         "failed_test": """{test} fails
 Learning libraries rely on the properties that it tests.""",
         "outside": """Observations at {point} lie outside their space
-Learning code relies on the bounds (to normalise, or to size its networks). Widen the observation_space, or clip in
-the observation_space_mapping.""",
+Learning code relies on the bounds. Widen the observation_space, or clip in the observation_space_mapping.""",
     },
     "warning": {
         "shared_generators": """The model uses generators that the whole process shares ({names})
-The model seeds them itself, so a single environment repeats its episodes. But two environments side by side disturb
-each other, and training code that draws from the same generators disturbs both. Give the model a generator of its
-own, random.Random(seed) or numpy.random.default_rng(seed); or give environments the option global_rng=True.""",
+The model seeds them itself, so that one environment repeats its episodes. But environments side by side and training
+code disturb each other. Give the model a generator of its own, or its environments the option global_rng=True.""",
         "writing_mappings": """Mappings write into the model
 In an environment the simulation holds values that it does not hold in a plain run, though its decisions are the
 same. Keep such values outside the model; difference() computes changes since the last decision.""",
@@ -85,22 +81,18 @@ model (action_space_mapping, apply), and do observations and rewards show what t
 No episode asked for this decision, so its agent cannot learn anything. Does the simulation call the function as an
 attribute of its class or module, and do episodes last long enough?""",
         "zero_rewards": """Rewards at {point} are always zero
-Random actions never earned a reward. A rare reward makes learning hard; if it should not be rare, check the
-reward_mapping.""",
+Random actions never earned a reward, and what is rare is hard to learn. Should it be rare? See the reward_mapping.""",
     },
     "note": {
         "unseeded_reset": """reset() takes no seed
-The same seed should give the same episode each time. Write reset(self, seed=None) and seed the model's generator
-with it, unless nothing in the model is random.""",
+Write reset(self, seed=None) and seed the model's generator with it, unless nothing in the model is random.""",
         "cut_runs": """Runs were stopped before their end
-They make more than {most} decisions, or never end. If the model never ends, its environments need the option
-max_steps.""",
+They make more than {most} decisions, or never end. If they never end, environments need the option max_steps.""",
         "unstable": """Some attributes of the model differ between two plain runs with the same seed
 The decisions were the same, so this may be harmless: the time of day, or a counter that all simulations of the
 process share. The comparisons leave it out.""",
         "same_seeds": """All seeds give the same episode
-If the model draws random numbers, reset() does not use its seed for them. If it draws none, every episode begins
-alike, and agents may memorise it.""",
+If the model draws random numbers, reset() does not seed them. If it draws none, agents may memorise the episode.""",
         "same_rewards": """Rewards at {point} are always the same
 All random actions earned the same. Check the reward_mapping, unless only the length of the episode should count.""",
         "never_legal": """Some actions at {point} were never legal

@@ -58,12 +58,11 @@ def within(seconds: float, function: Callable[[], Any]) -> None:
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
     """
-    deadline = time.monotonic() + seconds
     thread, over = threading.get_ident(), threading.Event()
 
     def watch() -> None:
-        pause = deadline - time.monotonic()
-        while not over.wait(max(0.0, pause)):
+        pause = seconds
+        while not over.wait(pause):
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(TimeUp))
             pause = 0.5  # raise it again in a model that swallows it
 
@@ -151,36 +150,35 @@ def fitting_views(plan: Plan) -> tuple[str, ...]:
 class Run:
     """What is recorded of a run."""
 
-    entries: list[tuple[str, Fingerprint]] = field(default_factory=list)  # points and decisions, or agents and steps
+    calls: list[str] = field(default_factory=list)  # the names of the points that were called, or of the agents
+    steps: Fingerprint = field(default_factory=dict)  # the decisions, or the results of ``last()``
     actions: list[Any] = field(default_factory=list)  # the random ones
     simulation: Any = None
     in_main_loop: bool = False  # whether a plain run is in the simulation's main loop
-    fingerprint: Fingerprint | None = None  # of the simulation at its end, or when it was cut
+    fingerprint: Fingerprint = field(default_factory=dict)  # of the simulation at its end, or when it was cut
     cut: bool = False  # whether it has reached its limit of decisions
     error: BaseException | None = None
     result: Any = None  # what run() returned in a plain run, or how an episode of random actions ended
     drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
-    latest: float = field(default_factory=time.monotonic)  # the time of the latest entry
-    stuck: bool = False  # whether its time was up long after the latest entry
+    latest: float = field(default_factory=time.monotonic)  # the time of the latest call
+    stuck: bool = False  # whether its time was up long after the latest call
 
-    @property
-    def calls(self) -> list[str]:
-        """The names of the points that were called, in that order."""
-        return [name for name, _ in self.entries]
+    def begin_step(self, name: str) -> str:
+        """Record that a point was called or an agent asked; return the name of this step in ``steps``."""
+        self.calls.append(name)
+        self.latest = time.monotonic()
+        step = f"in step {len(self.calls)}, {name}"
+        self.steps[step] = "without a result"
+        return step
 
     def difference(self, other: Run) -> str:
-        """Describe the first difference from the entries of another run; empty if there is none."""
-        pairs = zip(self.entries, other.entries, strict=False)
-        for number, ((name, value), (other_name, other_value)) in enumerate(pairs, 1):
-            if name != other_name:
-                return f"step {number} is first of {name}, then of {other_name}"
-            if parts := differences(value, other_value):
-                return f"in step {number}, {describe_differences(parts)}"
+        """Describe the first differences from the steps of another run; empty if there are none."""
         if other.error is not None:
             return f"the second one raises {describe_with_place(other.error)}"
-        if len(self.entries) != len(other.entries):
-            return f"there are first {len(self.entries)} steps, then {len(other.entries)}"
-        return ""
+        parts = differences(self.steps, other.steps)
+        if not parts and len(self.calls) != len(other.calls):
+            return f"there are first {len(self.calls)} steps, then {len(other.calls)}"
+        return describe_differences(parts)
 
 
 @dataclass(kw_only=True)
@@ -215,8 +213,6 @@ class Subject:
 
     def differences(self, run: Run, other: Run) -> list[Difference]:
         """Return the parts in which the simulations differ after two runs."""
-        if run.fingerprint is None or other.fingerprint is None:
-            return []
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
     def play(self, function: Callable[[], Any], run: Run | None = None, *, seed: int = 0) -> Run:
@@ -293,24 +289,22 @@ class Subject:
             # In a reset or a mapping, rules do not count as decisions.
             if not (run.in_main_loop if stack is None else stack.decides(point.hook)):
                 return rule(*args, **kwargs)
-            place = len(run.entries)
-            if place >= self.max_steps:
+            if len(run.calls) >= self.max_steps:
                 if not run.cut:
                     run.cut, run.fingerprint = True, self.look(run.simulation)
                 raise Cut
-            run.entries.append((name, {}))
-            run.latest = time.monotonic()
+            step = run.begin_step(name)
             value = rule(*args, **kwargs)
-            return end(place, value) if point.hook.kind == "function" else wait(place, value)
+            return end(step, value) if point.hook.kind == "function" else wait(step, value)
 
-        def end(place: int, value: Any) -> Any:
-            run.entries[place] = name, fingerprint(f"the decision of {name}", value, follow=False)
+        def end(step: str, value: Any) -> Any:
+            run.steps |= fingerprint(step, value, follow=False)
             return value
 
         @types.coroutine
-        def wait(place: int, running: Any) -> Generator[Any, Any, Any]:
+        def wait(step: str, running: Any) -> Generator[Any, Any, Any]:
             awaited = running.__await__() if point.hook.kind == "coroutine" else running
-            return end(place, (yield from awaited))
+            return end(step, (yield from awaited))
 
         return decide
 
@@ -325,7 +319,7 @@ class Subject:
         run = Run()
 
         def start() -> None:
-            other = _random_steps(Run(), beside, seed + 1, salt) if beside is not None else iter(())
+            other = iter(()) if beside is None else _random_steps(Run(), beside, seed + 1, salt)
             for agent, step in islice(_random_steps(run, env, seed, salt), most):
                 if collect is not None:
                     collect(env, agent, step)
@@ -361,8 +355,8 @@ def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[st
     env.reset(seed=seed)
     while env.agents:
         agent, step, action = env.agent_selection, env.last(), None
-        run.entries.append((agent, fingerprint(agent, step)))
-        run.latest, run.result = time.monotonic(), "truncated" if step[3] else "terminated"
+        run.steps |= fingerprint(run.begin_step(agent), step)
+        run.result = "truncated" if step[3] else "terminated"
         if not (step[2] or step[3]):
             for _ in range(1 + salt):  # the space is seeded by the reset
                 action = env.action_space(agent).sample(step[4].get(MASK))

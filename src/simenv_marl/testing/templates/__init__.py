@@ -44,14 +44,13 @@ def write_template(kind: str, name: str, folder: Path | None = None) -> str:
     Raises:
         OptionValueError: The name cannot be used, a file exists already, or the folder cannot be written to.
     """
+    problem = ""
     if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower() or name.startswith("_"):
-        raise OptionValueError(f"{short_repr(name)} cannot be the name of a module; choose one like water_tank")
-    spec = find_spec(name)
-    if spec is not None and spec.origin is not None:
-        raise OptionValueError(
-            f"{short_repr(name)} is the name of another module ({spec.origin}), which the new file would hide; choose"
-            " one like water_tank"
-        )
+        problem = "cannot be the name of a module"
+    elif (spec := find_spec(name)) is not None and spec.origin is not None:
+        problem = f"is the name of another module ({spec.origin}), which the new file would hide"
+    if problem:
+        raise OptionValueError(f"{short_repr(name)} {problem}; choose one like water_tank")
     folder, title = Path(name) if folder is None else folder, name.title().replace("_", "")
     template = Path(__file__).with_name(f"{kind}.py").read_text(encoding="utf-8")
     texts = {folder / f"{name}.py": template, folder / f"test_{name}.py": _TESTS.replace("my_model", name)}

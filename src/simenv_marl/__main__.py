@@ -23,14 +23,7 @@ from .testing.templates import KINDS, write_template
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: The arguments after the program's name. None: those of this process.
-
-    Returns:
-        The exit code.
-    """
+    """Run the command line with arguments, or with those of this process, and return the exit code."""
     options = _parser().parse_args(arguments)
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
@@ -120,11 +113,7 @@ def _inspect(options: argparse.Namespace) -> Any:
 
 
 def _find(text: str) -> Any:
-    """Import the object that ``module:name`` names.
-
-    Raises:
-        OptionValueError: It does not exist.
-    """
+    """Import the object that ``module:name`` names, or raise ``OptionValueError``."""
     name, _, path = text.partition(":")
     if not (name and path):
         raise OptionValueError(f"{text!r} is not of the form module:Simulation, such as examples.shop:Shop")

@@ -100,11 +100,7 @@ def global_generators() -> dict[str, Any]:
 
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Ignore what a model prints, and its warnings; leave the global generators as they were.
-
-    Yields:
-        The warnings of environments that are findings.
-    """
+    """Ignore what a model prints and warns; restore the global generators; yield warnings that are findings."""
     states, silenced = global_generators(), io.StringIO()
     try:
         with (

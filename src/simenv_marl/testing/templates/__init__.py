@@ -31,15 +31,10 @@ def test_there_is_nothing_to_complain_of() -> None:
 
 
 def write_template(kind: str, name: str, folder: Path | None = None) -> str:
-    """Write a template and its tests into a folder.
+    """Write a template and its tests into a folder, and return what was written and what to do next.
 
-    Args:
-        kind: One of ``KINDS``.
-        name: The name of the new module. ``water_tank`` has a ``WaterTankModel`` and a ``WaterTankSimulation``.
-        folder: The folder to write to, which may be new. None: a folder of that name in the current one.
-
-    Returns:
-        What was written, and what to do next.
+    Without a folder, the current one gets a new one with the name of the module. ``water_tank`` has a
+    ``WaterTankModel`` and a ``WaterTankSimulation``.
 
     Raises:
         OptionValueError: The name cannot be used, a file exists already, or the folder cannot be written to.

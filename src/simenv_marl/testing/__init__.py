@@ -145,24 +145,22 @@ def inspect_simulation(
         views = fitting_views(plan)
     how = "truncated (a limit of time)" if run.result is TRUNCATED else "terminated (an end of the task)"
     how = describe_with_place(run.error) if run.error is not None else "cut" if run.cut else how
+    uses = ("action_mask_mapping", "choices", "apply", "removed_by", "goal_space")
     return Inspection(
         simulation=plan.name,
-        points=tuple(map(_describe_point, plan.active)),
+        points=tuple(
+            {
+                "point": bound.point.name,
+                "agent": bound.agent or "named by each call",
+                "observations": str(bound.definition.observation_space),
+                "actions": str(bound.definition.action_space),
+                "uses": ", ".join(name for name in uses if getattr(bound.definition, name))
+                or "no masks, choices, removals or goals",
+            }
+            for bound in plan.active
+        ),
         views=views,
         calls=order_of(run.calls),
         counts=dict(Counter(run.calls)),
         ended=f"{len(run.calls)} decisions, then {how}",
     )
-
-
-def _describe_point(bound: Any) -> dict[str, str]:
-    definition = bound.definition
-    uses = ("action_mask_mapping", "choices", "apply", "removed_by", "goal_space")
-    used = ", ".join(name for name in uses if getattr(definition, name))
-    return {
-        "point": bound.point.name,
-        "agent": bound.agent or "named by each call",
-        "observations": str(definition.observation_space),
-        "actions": str(definition.action_space),
-        "uses": used or "no masks, choices, removals or goals",
-    }

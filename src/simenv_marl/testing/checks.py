@@ -19,9 +19,9 @@ from ..simulation import RULE, make_simulation, takes
 from .fingerprint import ABSENT, STATE, describe_differences, general
 from .report import FINDINGS, SEVERITIES, Finding, PointStatistics, Range
 from .runs import (
+    LimitReached,
     Run,
     Subject,
-    TimeUp,
     describe_with_place,
     fitting_views,
     make_environment,
@@ -51,7 +51,7 @@ class Report:
         error: Any = run.error
         if view == "joint" and isinstance(error, AgentError):
             return  # that view needs to know all agents
-        if isinstance(error, TimeUp):
+        if isinstance(error, LimitReached):
             self.add("stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.calls)} steps")
             return
         key = type(error).__name__, place_of(error) or error_text(error)
@@ -103,7 +103,7 @@ def check_repeated_run(subject: Subject, report: Report) -> None:
     # If it draws from the global generators, run it with these in another state, too.
     shared_seeds = (seed, seed + 1) if subject.drawn else (seed,)
     runs = [subject.run_plainly(seed, shared_seed=shared_seed) for shared_seed in shared_seeds]
-    if any(isinstance(run.error, TimeUp) for run in runs):
+    if any(isinstance(run.error, LimitReached) for run in runs):
         return
     if subject.drawn:
         differs = first.difference(runs[1]) or subject.differences(first, runs[1])
@@ -245,7 +245,7 @@ def check_episodes(subject: Subject, report: Report) -> None:
             if run.error is not None:
                 failures += 1
                 report.add_error(run, f"in episode {number} of random legal actions, seed {seed}")
-                if isinstance(run.error, TimeUp):
+                if isinstance(run.error, LimitReached):
                     break
                 continue
             first = run if number == 1 else first
@@ -310,7 +310,7 @@ def check_conformance(subject: Subject, report: Report) -> None:
             passed.append(name)
         elif isinstance(run.error, AssertionError):
             report.add("failed_test", describe_with_place(run.error), test=name)
-        elif not isinstance(run.error, (TimeUp, InvalidActionError)):  # tests ignore masks, or that these change
+        elif not isinstance(run.error, (LimitReached, InvalidActionError)):  # tests ignore masks, or that these change
             report.add_error(run, f"in {name}", view)
     if passed:
         report.checked.append(", ".join(passed))

@@ -202,14 +202,11 @@ class Inspection:
     def __str__(self) -> str:
         counts = ", ".join(f"{point} {number} times" for point, number in self.counts.items())
         episode = f"calls    {counts or 'none'}\norder    {self.calls or '-'}"
-        return "\n\n".join(
-            [
-                f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}",
-                *("\n  ".join(f"{key:<13} {text}" for key, text in point.items()) for point in self.points),
-                f"Possible views: {', '.join(self.views)}",
-                f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}",
-            ]
-        )
+        parts = [f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}"]
+        parts += ["\n  ".join(f"{key:<13} {text}" for key, text in point.items()) for point in self.points]
+        parts.append(f"Possible views: {', '.join(self.views)}")
+        parts.append(f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}")
+        return "\n\n".join(parts)
 
 
 def order_of(calls: Sequence[str]) -> str:

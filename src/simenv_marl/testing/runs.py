@@ -45,16 +45,12 @@ _WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appe
 """Texts in the warnings of environments that are findings."""
 
 
-class Cut(SimulationExit):
-    """Raised in a run that has reached its limit of decisions."""
-
-
-class TimeUp(SimulationExit):
-    """Raised in a run whose time is up."""
+class LimitReached(SimulationExit):
+    """Raised in a run that has reached its limit of decisions or of time."""
 
 
 def within(seconds: float, function: Callable[[], Any]) -> None:
-    """Call a function, and raise ``TimeUp`` in it when the time is up.
+    """Call a function, and raise ``LimitReached`` in it when the time is up.
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
     """
@@ -63,7 +59,7 @@ def within(seconds: float, function: Callable[[], Any]) -> None:
     def watch() -> None:
         pause = seconds
         while not over.wait(pause):
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(TimeUp))
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(LimitReached))
             pause = 0.5  # raise it again in a model that swallows it
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
@@ -71,7 +67,7 @@ def within(seconds: float, function: Callable[[], Any]) -> None:
         watcher.start()
         function()
     finally:
-        # TimeUp may still be raised until the watcher has ended, and is then delivered at once. (It is not revoked: in
+        # It may still be raised until the watcher has ended, and is then delivered at once. (It is not revoked: in
         # CPython that would leave the interpreter checking for it forever.)
         while True:
             try:
@@ -80,7 +76,7 @@ def within(seconds: float, function: Callable[[], Any]) -> None:
                 for _ in range(10):
                     pass
                 break
-            except TimeUp:
+            except LimitReached:
                 continue
 
 
@@ -288,7 +284,7 @@ class Subject:
             if len(run.calls) >= self.max_steps:
                 if not run.cut:
                     run.cut, run.fingerprint = True, self.look(run.simulation)
-                raise Cut
+                raise LimitReached
             step = run.begin_step(name)
             value = rule(*args, **kwargs)
             return end(step, value) if point.hook.kind == "function" else wait(step, value)
@@ -349,8 +345,8 @@ class Subject:
 def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[str, Any]]:
     """Play one step at a time, record it, and yield the agent and the result of ``last()``."""
     env.reset(seed=seed)
-    while env.agents:
-        agent, step, action = env.agent_selection, env.last(), None
+    for agent in env.agent_iter():
+        step, action = env.last(), None
         run.steps |= fingerprint(run.begin_step(agent), step)
         run.result = "truncated" if step[3] else "terminated"
         if not (step[2] or step[3]):

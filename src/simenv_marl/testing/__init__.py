@@ -22,9 +22,9 @@ from ..core.plan import Plan
 from ..core.points import Points
 from ..errors import OptionValueError, SimEnvError, short_repr
 from ..simulation import TRUNCATED
-from .checks import CHECKS, Report
+from .checks import CHECKS, Report, fitting_views, make_environment
 from .report import SEVERITIES, CheckReport, Finding, Inspection, PointStatistics, Range, order_of
-from .runs import Run, Subject, describe_with_place, fitting_views, make_environment, quietly
+from .runs import Run, Subject, describe_with_place, quietly
 
 __all__ = [
     "CheckReport",

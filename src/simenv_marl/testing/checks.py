@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, count, islice, product
@@ -14,20 +14,31 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
 from ..core.actions import MASK
+from ..core.plan import Plan
+from ..envs.make import VIEWS, view_class
 from ..errors import AgentError, InvalidActionError, error_text, short_repr
 from ..simulation import RULE, make_simulation, takes
 from .fingerprint import ABSENT, STATE, describe_differences, general
 from .report import FINDINGS, SEVERITIES, Finding, PointStatistics, Range
-from .runs import (
-    LimitReached,
-    Run,
-    Subject,
-    describe_with_place,
-    fitting_views,
-    make_environment,
-    place_of,
-    seed_global_generators,
-)
+from .runs import LimitReached, Run, Subject, describe_with_place, place_of, seed_global_generators
+
+
+def make_environment(plan: Plan, view: str, **options: Any) -> Any:
+    """Make an environment of a plan with changed options."""
+    if view != "joint" and plan.options.flatten:
+        options["flatten"] = False
+    plan = plan.amended(options)
+    return view_class(plan, view)(plan)
+
+
+def fitting_views(plan: Plan) -> tuple[str, ...]:
+    """Return the views that a plan allows."""
+    found = []
+    for view in VIEWS:
+        with suppress(Exception):  # of the plan, or of the model if the view resets it
+            make_environment(plan, view).close()
+            found.append(view)
+    return tuple(found)
 
 
 @dataclass

@@ -18,7 +18,7 @@ import traceback
 import types
 import warnings
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from datetime import date, datetime
 from itertools import islice
@@ -34,7 +34,6 @@ from ..core.driver import SimulationExit
 from ..core.plan import Plan
 from ..core.rng import GlobalRandom
 from ..decision import DecisionPoint
-from ..envs.make import VIEWS, view_class
 from ..errors import describe_error, error_notes
 from ..hooks.patches import Installation
 from ..hooks.stacks import outside_simulation, stack_of
@@ -112,27 +111,6 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
     finally:
         random.setstate(states["Python's random"])
         np.random.set_state(states["numpy.random"])
-
-
-# -- environments ---------------------------------------------------------------------------------
-
-
-def make_environment(plan: Plan, view: str, **options: Any) -> Any:
-    """Make an environment of a plan with changed options."""
-    if view != "joint" and plan.options.flatten:
-        options["flatten"] = False
-    plan = plan.amended(options)
-    return view_class(plan, view)(plan)
-
-
-def fitting_views(plan: Plan) -> tuple[str, ...]:
-    """Return the views that a plan allows."""
-    found = []
-    for view in VIEWS:
-        with suppress(Exception):  # of the plan, or of the model if the view resets it
-            make_environment(plan, view).close()
-            found.append(view)
-    return tuple(found)
 
 
 # -- runs -----------------------------------------------------------------------------------------

@@ -23,14 +23,7 @@ from .testing.templates import KINDS, write_template
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: The arguments after the program's name. None: those of this process.
-
-    Returns:
-        The exit code.
-    """
+    """Run the command line with arguments, or with those of this process, and return the exit code."""
     options = _parser().parse_args(arguments)
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
@@ -68,18 +61,12 @@ def _parser() -> argparse.ArgumentParser:
     check("--time-limit", type=float, default=60.0, metavar="SECONDS", help="for the whole check (default: 60)")
     wire = add("wire-check", _wire_check, "test a simulator in another process, and report what it does wrong")
     wire("--seed", type=int, default=1, metavar="N", help="the seed of the episodes (default: 1)")
-    wire(
-        "--options",
-        type=_json,
-        default={},
-        metavar="JSON",
-        help="the options in the start message (default: {})",
-    )
+    wire("--options", type=_json, default={}, metavar="JSON", help="the options in the start message (default: {})")
     wire("--decisions", type=int, default=1000, metavar="N", help="the longest episode (default: 1000)")
     wire("--timeout", type=float, default=30.0, metavar="SECONDS", help="the longest wait for a line (default: 30)")
+    wire("program", metavar="COMMAND", nargs=argparse.REMAINDER, help="the program and its arguments")
     for command in (check, inspect, wire):
         command("--json", action="store_true", help="print JSON instead of text")
-    wire("program", metavar="COMMAND", nargs=argparse.REMAINDER, help="the program and its arguments")
     return parser
 
 
@@ -101,22 +88,16 @@ def _wire_check(options: argparse.Namespace) -> Any:
     program = options.program[1:] if options.program[:1] == ["--"] else options.program
     if not program:
         raise OptionValueError("wire-check needs a command: the simulator's program and its arguments")
-    return check_wire(
-        program, options=options.options, seed=options.seed, decisions=options.decisions, timeout=options.timeout
-    )
+    limits = {"decisions": options.decisions, "timeout": options.timeout}
+    return check_wire(program, options=options.options, seed=options.seed, **limits)
 
 
 def _check(options: argparse.Namespace) -> Any:
     from .testing import check_simulation
 
-    return check_simulation(
-        _find(options.simulation),
-        options.points,
-        seeds=range(options.seed, options.seed + 3),
-        episodes=options.episodes,
-        max_steps=options.max_steps,
-        time_limit=options.time_limit,
-    )
+    seeds = range(options.seed, options.seed + 3)
+    extent = {"episodes": options.episodes, "max_steps": options.max_steps, "time_limit": options.time_limit}
+    return check_simulation(_find(options.simulation), options.points, seeds=seeds, **extent)
 
 
 def _inspect(options: argparse.Namespace) -> Any:
@@ -132,25 +113,12 @@ def _inspect(options: argparse.Namespace) -> Any:
 
 
 def _find(text: str) -> Any:
-    """Import the object that ``module:name`` names.
-
-    Raises:
-        OptionValueError: It does not exist.
-    """
-    module_name, _, path = text.partition(":")
-    if not (module_name and path):
+    """Import the object that ``module:name`` names, or raise ``OptionValueError``."""
+    name, _, path = text.partition(":")
+    if not (name and path):
         raise OptionValueError(f"{text!r} is not of the form module:Simulation, such as examples.shop:Shop")
-    module = _find_module(module_name)
     try:
-        return attrgetter(path)(module)
-    except AttributeError as error:
-        hint = did_you_mean(error.name, dir(error.obj))
-        raise OptionValueError(f"{getattr(error.obj, '__name__', error.obj)} has no {error.name!r}{hint}") from None
-
-
-def _find_module(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
+        module = importlib.import_module(name)
     except ModuleNotFoundError as error:
         missing = error.name or ""
         if not f"{name}.".startswith(f"{missing}."):
@@ -162,6 +130,11 @@ def _find_module(name: str) -> Any:
         raise OptionValueError(f"there is no module {missing!r}{hint} (looked for in {folders[0]})") from None
     except Exception as error:
         raise OptionValueError(f"the module {name!r} cannot be imported: {describe_error(error)}") from error
+    try:
+        return attrgetter(path)(module)
+    except AttributeError as error:
+        hint = did_you_mean(error.name, dir(error.obj))
+        raise OptionValueError(f"{getattr(error.obj, '__name__', error.obj)} has no {error.name!r}{hint}") from None
 
 
 if __name__ == "__main__":

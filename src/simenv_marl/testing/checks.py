@@ -2,48 +2,43 @@
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain, count, islice, product
 from typing import Any, Final
 
+import numpy as np
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
-from ..errors import AgentError, InvalidActionError, error_text
-from ..simulation import RULE, takes
-from .fingerprint import ABSENT, STATE, alike, describe_differences, general
-from .internals import fitting_views, make_environment, make_simulation
-from .report import Finding, PointStatistics, finding
-from .runs import Run, Runner, TimeUp, describe_with_place, place_of, seed_global_generators
-from .statistics import Statistics
+from ..core.actions import MASK
+from ..core.plan import Plan
+from ..envs.make import VIEWS, view_class
+from ..errors import AgentError, InvalidActionError, error_text, short_repr
+from ..simulation import RULE, make_simulation, takes
+from .fingerprint import ABSENT, STATE, describe_differences, general
+from .report import FINDINGS, SEVERITIES, Finding, PointStatistics, Range
+from .runs import LimitReached, Run, Subject, describe_with_place, place_of, seed_global_generators
 
 
-@dataclass(kw_only=True)
-class Subject(Runner):
-    """A simulation with its decision points and options, the parameters of the check, and what is known so far."""
+def make_environment(plan: Plan, view: str, **options: Any) -> Any:
+    """Make an environment of a plan with changed options."""
+    if view != "joint" and plan.options.flatten:
+        options["flatten"] = False
+    plan = plan.amended(options)
+    return view_class(plan, view)(plan)
 
-    seeds: tuple[int, ...]
-    episodes: int
-    end: float = math.inf  # of the time limit, as time.monotonic()
-    plain: dict[int, Run] = field(default_factory=dict)  # plain runs, by seed
-    playable: bool = False  # whether plain runs decide something and end
-    repeats: bool = True  # whether the same seed gives the same plain run
-    drawn: set[str] = field(default_factory=set)  # the global generators that it draws from
 
-    @property
-    def late(self) -> bool:
-        """Whether the time is up."""
-        return time.monotonic() >= self.end
-
-    @cached_property
-    def views(self) -> tuple[str, ...]:
-        """The views that its plan allows."""
-        return fitting_views(self.plan)
+def fitting_views(plan: Plan) -> tuple[str, ...]:
+    """Return the views that a plan allows."""
+    found = []
+    for view in VIEWS:
+        with suppress(Exception):  # of the plan, or of the model if the view resets it
+            make_environment(plan, view).close()
+            found.append(view)
+    return tuple(found)
 
 
 @dataclass
@@ -56,31 +51,24 @@ class Report:
     episodes: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("terminated", "truncated", "cut"), 0))
     errors: set[tuple[str, str]] = field(default_factory=set)  # by class and place
 
-    @property
-    def has_errors(self) -> bool:
-        """Whether there is a finding of severity "error"."""
-        return any(finding.severity == "error" for finding in self.findings)
-
     def add(self, name: str, evidence: str = "", **words: Any) -> None:
-        """Add a finding, as ``finding`` makes it."""
-        self.findings.append(finding(name, evidence, **words))
+        """Add a finding of ``FINDINGS``; words are the values of placeholders there."""
+        severity = next(severity for severity in SEVERITIES if name in FINDINGS[severity])
+        title, text = FINDINGS[severity][name].format(**words).split("\n", 1)
+        self.findings.append(Finding(severity, title, " ".join(text.split()), evidence))
 
-    def add_error(self, run: Run, where: str) -> None:
+    def add_error(self, run: Run, where: str, view: str = "aec") -> None:
         """Add the finding for the exception of a run; the same one from the same place is reported once."""
         error: Any = run.error
-        if isinstance(error, TimeUp):
-            waits = time.monotonic() - run.latest > run.seconds / 2
-            self.add("stuck" if waits else "out_of_time", f"{where}, after {len(run.entries)} steps")
+        if view == "joint" and isinstance(error, AgentError):
+            return  # that view needs to know all agents
+        if isinstance(error, LimitReached):
+            self.add("stuck" if run.stuck else "out_of_time", f"{where}, after {len(run.calls)} steps")
             return
         key = type(error).__name__, place_of(error) or error_text(error)
         if key not in self.errors:
             self.errors.add(key)
             self.add("raises", f"{where}: {describe_with_place(error)}", kind=type(error).__name__)
-
-    def add_unrepeatable(self, subject: Subject, evidence: str) -> None:
-        """Add the finding that two runs of the same seed differ."""
-        sources = subject.sources_of_chance(subject.seeds[0])
-        self.add("unrepeatable", f"{evidence}\nin the model, {sources}" if sources else evidence)
 
     @contextmanager
     def opened(self, subject: Subject, view: str = "aec", **options: Any) -> Iterator[Any]:
@@ -89,7 +77,7 @@ class Report:
         try:
             yield env
         finally:
-            closing = Run().play(subject.seconds, env.close)
+            closing = subject.play(env.close)
             if closing.error is not None:
                 self.add_error(closing, "when an environment was closed in mid-episode")
 
@@ -102,17 +90,16 @@ def check_plain_runs(subject: Subject, report: Report) -> None:
     if not takes(make_simulation(subject.plan.source).reset, "seed"):
         report.add("unseeded_reset")
     for seed in subject.seeds:
-        seed_global_generators(seed)
         run = subject.plain[seed] = subject.run_plainly(seed)
         if not subject.plan.options.global_rng:
             subject.drawn |= run.drawn
         if run.error is not None:
             report.add_error(run, f"in a plain run without any environment, seed {seed}")
             return
-    if not any(run.entries for run in subject.plain.values()):
+    if not any(run.calls for run in subject.plain.values()):
         report.add("no_decision", points=", ".join(bound.point.name for bound in subject.plan.active))
         return
-    subject.playable = True
+    subject.views = fitting_views(subject.plan)
     if any(run.cut for run in subject.plain.values()):
         report.add("cut_runs", most=subject.max_steps)
     first, *others = subject.plain.values()
@@ -125,22 +112,20 @@ def check_repeated_run(subject: Subject, report: Report) -> None:
     seed = subject.seeds[0]
     first = subject.plain[seed]
     # If it draws from the global generators, run it with these in another state, too.
-    runs = []
-    for other_seed in (seed, seed + 1) if subject.drawn else (seed,):
-        seed_global_generators(other_seed)
-        runs.append(subject.run_plainly(seed))
-        if isinstance(runs[-1].error, TimeUp):
-            return
+    shared_seeds = (seed, seed + 1) if subject.drawn else (seed,)
+    runs = [subject.run_plainly(seed, shared_seed=shared_seed) for shared_seed in shared_seeds]
+    if any(isinstance(run.error, LimitReached) for run in runs):
+        return
     if subject.drawn:
         differs = first.difference(runs[1]) or subject.differences(first, runs[1])
         names = " and ".join(sorted(subject.drawn))
         name = "unseeded_generators" if differs else "shared_generators"
-        report.add(name, subject.sources_of_chance(seed), names=names)
+        report.add(name, subject.sources_of_chance().lstrip(), names=names)
     parts = subject.differences(first, runs[0])
     difference = first.difference(runs[0]) or describe_differences([part for part in parts if STATE in part[0]])
     if difference:
         subject.repeats = False
-        report.add_unrepeatable(subject, f"two plain runs of seed {seed}: {difference}")
+        report.add("unrepeatable", f"two plain runs of seed {seed}: {difference}{subject.sources_of_chance()}")
     elif parts:
         report.add("unstable", describe_differences(parts))
         subject.unstable = frozenset(general(path) for path, _, _ in parts)
@@ -158,16 +143,14 @@ def check_views(subject: Subject, report: Report) -> None:
     policies = dict.fromkeys(subject.plan.options.policies or (), RULE) or None
     for driver, view, seed in product(drivers, subject.views, subject.plain):
         plain = subject.plain[seed]
-        if subject.late or not plain.entries:
+        if subject.late or not plain.calls:
             continue
         seed_global_generators(seed)
         with report.opened(subject, view, driver=driver, policies=policies, max_steps=None) as env:
-            seed_global_generators(seed)
             run = subject.run_rules(env, seed)
         where = f"{view} view, driver {driver}, seed {seed}"
         if run.error is not None:
-            if not (view == "joint" and isinstance(run.error, AgentError)):  # that view needs to know all agents
-                report.add_error(run, f"in the {where}, with RULE throughout")
+            report.add_error(run, f"in the {where}, with RULE throughout", view)
             continue
         if run.drawn - subject.drawn:
             report.add("unseeded_generators", f"in the {where}", names=" and ".join(sorted(run.drawn - subject.drawn)))
@@ -178,52 +161,123 @@ def check_views(subject: Subject, report: Report) -> None:
             only_more = not decisions and all(here is ABSENT for _, here, _ in parts)
             report.add("writing_mappings" if only_more else "changed_model", evidence)
             return
-    most = max(len(run.entries) for run in subject.plain.values())
+    most = max(len(run.calls) for run in subject.plain.values())
     views, seeds = ", ".join(subject.views), ", ".join(map(str, subject.seeds))
     report.checked.append(
         f"plain runs against RULE throughout ({views}; drivers {', '.join(drivers)}; seeds {seeds}; up to {most}"
-        f" decisions each): the decisions, and {len(plain.fingerprint or ())} parts that the simulation holds then"
+        f" decisions each): the decisions, and {len(plain.fingerprint)} parts that the simulation holds then"
     )
 
 
 # -- episodes of random legal actions -------------------------------------------------------------
 
 
+@dataclass
+class PointRecord:
+    """What episodes have shown of one decision point."""
+
+    point: Any
+    decisions: int = 0
+    values: dict[str, tuple[int, Any, Any, Any]] = field(default_factory=dict)
+    """The number, minimum, sum and maximum of the rewards, and of each array in the observations."""
+    legal: Any = False  # for each action of a masked space, whether it was legal at least once
+    unfit: str = ""  # an observation outside of its space
+
+    def record(self, name: str, value: Any) -> None:
+        """Add a number, an array, or a dict or tuple of these."""
+        if isinstance(value, Mapping):
+            for key in value:
+                if key != MASK:
+                    self.record(f"{name}.{key}", value[key])
+        elif isinstance(value, tuple):
+            for number, part in enumerate(value):
+                self.record(f"{name}.{number}", part)
+        elif isinstance(value, (np.ndarray, np.generic, int, float)):
+            array = np.array(value, float)
+            number, low, total, high = self.values.get(name, (0, array, np.zeros_like(array), array))
+            if array.shape == low.shape:
+                self.values[name] = number + 1, np.minimum(low, array), total + array, np.maximum(high, array)
+
+    def results(self, report: Report, called: set[str]) -> PointStatistics:
+        """Return the statistics, and report what they show; plain runs have called some points."""
+        ranges = {
+            name: [
+                Range(f"{name}{list(place)}" if place else name, low[place].item(), mean.item(), high[place].item())
+                for place, mean in np.ndenumerate(total / number)
+            ]
+            for name, (number, low, total, high) in self.values.items()
+        }
+        point, rewards = self.point.point.name, ranges.pop("reward", [None])[0]
+        never: tuple[int, ...] = ()
+        if isinstance(self.legal, np.ndarray):
+            start = int(getattr(self.point.definition.action_space, "start", 0))
+            never = tuple((np.flatnonzero(~self.legal) + start).tolist())
+        if not self.decisions and point not in called:
+            report.add("never_called", point=point)
+        if self.unfit:
+            report.add("outside", self.unfit, point=point)
+        if never:
+            report.add("never_legal", f"actions {', '.join(map(str, never[:10]))}", point=point)
+        if rewards and rewards.minimum == rewards.maximum and self.values["reward"][0] > 1:
+            name = "same_rewards" if rewards.minimum else "zero_rewards"
+            report.add(name, f"{self.values['reward'][0]} rewards of {rewards.mean:.6g}", point=point)
+        agents, observations = self.point.agent or "agents named by each call", tuple(chain(*ranges.values()))
+        return PointStatistics(point, agents, self.decisions, observations, rewards, never)
+
+
+def _collect(records: Mapping[Any, PointRecord], acted: set[str], env: Any, agent: str, step: Any) -> None:
+    """Record a step of an episode. Rewards count only for agents that have acted in it."""
+    bound = env._point(agent)
+    record = records[bound.point.name, bound.agent]
+    observation, reward, terminated, truncated, info = step
+    record.record("observation", observation)
+    space = env.observation_space(agent)
+    if not record.unfit and not space.contains(observation):
+        record.unfit = f"{agent} has observed {short_repr(observation)}; the space is {space}"
+    if agent in acted:
+        record.record("reward", reward)
+    acted.add(agent)
+    if not (terminated or truncated):
+        record.decisions += 1
+        if isinstance(info.get(MASK), np.ndarray):
+            record.legal = record.legal | info[MASK].astype(bool)
+
+
 def check_episodes(subject: Subject, report: Report) -> None:
     """Play episodes with random legal actions; collect statistics; compare episodes of the same seed."""
-    statistics = Statistics(subject.plan)
+    records = {(bound.point.name, bound.agent): PointRecord(bound) for bound in subject.plan.active}
     first, failures = None, 0
     with report.opened(subject, max_steps=subject.max_steps) as env:
         seeds = islice(chain(subject.seeds, count(max(subject.seeds) + 1)), subject.episodes)
         for number, seed in enumerate(seeds, 1):
             if subject.late or failures == 3:
                 break
-            run = subject.run_randomly(env, seed, collect=statistics.collector())
+            run = subject.run_randomly(env, seed, collect=partial(_collect, records, set()))
             if run.error is not None:
                 failures += 1
                 report.add_error(run, f"in episode {number} of random legal actions, seed {seed}")
-                if isinstance(run.error, TimeUp):
+                if isinstance(run.error, LimitReached):
                     break
                 continue
             first = run if number == 1 else first
             report.episodes[run.result if len(run.actions) < subject.max_steps else "cut"] += 1
-        report.statistics, findings = statistics.results({name for run in subject.plain.values() for name in run.calls})
+        called = {name for run in subject.plain.values() for name in run.calls}
+        report.statistics = tuple(record.results(report, called) for record in records.values())
         episodes = sum(report.episodes.values())
         if episodes:
-            report.findings += findings
             report.checked.append(f"{episodes} episodes of random legal actions in the AEC view")
         if report.episodes["cut"] == episodes > 0:
             report.add("cut_runs", most=subject.max_steps)
         if first is not None and not failures and subject.repeats:
             _compare_episodes(subject, report, env, first)
-        Run().play(subject.seconds, partial(env.reset, seed=subject.seeds[0]))  # to be closed in mid-episode
+        subject.play(partial(env.reset, seed=subject.seeds[0]))  # to be closed in mid-episode
 
 
 def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -> None:
     """Compare the first episode with episodes of its seed in a new environment, in a used one, and beside another."""
     seed = subject.seeds[0]
     with report.opened(subject, max_steps=subject.max_steps) as new:
-        subject.run_randomly(used, seed, most=1 + len(first.entries) // 2)  # broken off
+        subject.run_randomly(used, seed, most=1 + len(first.calls) // 2)  # broken off
         for name, env, beside in (("unrepeatable", new, None), ("left_over", used, None), ("disturbance", new, used)):
             again = subject.run_randomly(env, seed, beside=beside)
             if again.error is not None:
@@ -232,11 +286,11 @@ def _compare_episodes(subject: Subject, report: Report, used: Any, first: Run) -
                 return
             difference = first.difference(again)
             if difference:
-                evidence = f"seed {seed}, the same actions: {difference}"
-                report.add_unrepeatable(subject, evidence) if env is new and not beside else report.add(name, evidence)
+                sources = subject.sources_of_chance() if name == "unrepeatable" else ""
+                report.add(name, f"seed {seed}, the same actions: {difference}{sources}")
                 return
         other = subject.run_randomly(used, seed, salt=1)
-        if len(other.entries) > 1 and not alike(first.actions, other.actions) and not first.difference(other):
+        if len(other.calls) > 1 and repr(first.actions) != repr(other.actions) and not first.difference(other):
             report.add("no_effect", f"seed {seed}, {len(first.actions)} actions")
     report.checked.append("the same seed and actions in a new environment, in a used one, and beside another one")
 
@@ -257,22 +311,18 @@ _TESTS: Final[tuple[tuple[str, str, Callable[[Callable[[], Any]], Any]], ...]] =
 def check_conformance(subject: Subject, report: Report) -> None:
     """Run the tests of PettingZoo and Gymnasium, unless errors were found that they would only repeat."""
     passed = []
-    seed_global_generators(0)
     for name, view, test in _TESTS:
-        skipped = report.has_errors or view not in subject.views or (subject.drawn and "seed" in name)
-        if subject.late or skipped:
+        failed = any(finding.severity == "error" for finding in report.findings)
+        if failed or subject.late or view not in subject.views or (subject.drawn and "seed" in name):
             continue
         make = partial(make_environment, subject.plan, view, max_steps=subject.max_steps)
-        run = Run().play(subject.seconds, partial(test, make))
+        run = subject.play(partial(test, make))
         if run.error is None:
             passed.append(name)
         elif isinstance(run.error, AssertionError):
             report.add("failed_test", describe_with_place(run.error), test=name)
-        # These tests ignore masks, or masks that change within a round; the joint view needs to know all agents.
-        elif not isinstance(run.error, (TimeUp, InvalidActionError)) and not (
-            view == "joint" and isinstance(run.error, AgentError)
-        ):
-            report.add_error(run, f"in {name}")
+        elif not isinstance(run.error, (LimitReached, InvalidActionError)):  # tests ignore masks, or that these change
+            report.add_error(run, f"in {name}", view)
     if passed:
         report.checked.append(", ".join(passed))
 

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..errors import short_repr
+from ..errors import name_of, short_repr
 from ..simulation import Sentinel
 
 MOST_PARTS: Final = 50_000  # larger models are compared by the parts that both fingerprints have
@@ -50,13 +50,13 @@ def fingerprint(name: str, root: Any, *, follow: bool = True) -> Fingerprint:
         elif isinstance(value, np.ndarray) and value.dtype != object:
             parts[path] = value.copy()
         elif isinstance(value, _NAMED):
-            parts[path] = class_name(value)
+            parts[path] = name_of(value)
         elif isinstance(value, (random.Random, np.random.Generator, np.random.RandomState)):
             parts[f"{path} ({STATE})"] = _state_of(value)
         elif id(value) in found:
             parts[path] = f"the same object as {found[id(value)][0]}"
         else:
-            parts[path] = class_name(type(value))
+            parts[path] = name_of(type(value))
             if not follow and not isinstance(value, (list, tuple, dict)):
                 continue
             if not isinstance(value, (tuple, frozenset)):  # equal ones may or may not be the same object
@@ -70,10 +70,9 @@ def fingerprint(name: str, root: Any, *, follow: bool = True) -> Fingerprint:
 
 def _state_of(generator: Any) -> str:
     """Return the state of a random generator as a text."""
-    if isinstance(generator, random.Random):
-        return str(generator.getstate())
-    bits = generator.bit_generator if isinstance(generator, np.random.Generator) else generator._bit_generator
-    return str(bits.state)
+    if isinstance(generator, np.random.Generator):
+        return str(generator.bit_generator.state)
+    return str(generator.getstate() if isinstance(generator, random.Random) else generator.get_state(legacy=False))
 
 
 def _members(value: Any) -> Iterator[tuple[str, Any]]:
@@ -84,7 +83,7 @@ def _members(value: Any) -> Iterator[tuple[str, Any]]:
             if not isinstance(getattr(type(value), str(name), None), cached_property):  # computed when it is first read
                 yield f".{name}", part
     if isinstance(value, (set, frozenset)):  # it has no order: of other objects, only the classes
-        yield " (members)", sorted(repr(item) if isinstance(item, _ATOMS) else class_name(type(item)) for item in value)
+        yield " (members)", sorted(repr(item) if isinstance(item, _ATOMS) else name_of(type(item)) for item in value)
     elif isinstance(value, (list, tuple, deque, np.ndarray)):
         items = value.ravel() if isinstance(value, np.ndarray) else value
         yield from ((f"[{number}]", item) for number, item in enumerate(items))
@@ -120,22 +119,12 @@ def _same(one: Any, other: Any) -> bool:
     return bool(one == other or (one != one and other != other))
 
 
-def alike(one: Any, other: Any) -> bool:
-    """Return whether two objects have the same parts."""
-    return not differences(fingerprint("", one), fingerprint("", other))
-
-
 def general(path: str) -> str:
     """Return a path that is the same for all members of a list or dict."""
     return re.sub(r"\[[^\]]*\]", "[]", path)
 
 
-def class_name(thing: Any) -> str:
-    """Return the name of a class, function or module."""
-    return str(getattr(thing, "__qualname__", None) or getattr(thing, "__name__", thing))
-
-
-def describe_differences(parts: list[Difference], here: str = "first", there: str = "then") -> str:
+def describe_differences(parts: list[Difference]) -> str:
     """Describe the differences of two fingerprints."""
-    texts = [f"{path} is {here} {short_repr(one, 60)}, {there} {short_repr(other, 60)}" for path, one, other in parts]
+    texts = [f"{path} is first {short_repr(one, 60)}, then {short_repr(other, 60)}" for path, one, other in parts]
     return "; ".join(texts[:3]) + (f"; {len(texts) - 3} more" if len(texts) > 3 else "")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.resources import files
 from textwrap import TextWrapper
 from typing import Any, Final, Literal
 
@@ -32,17 +30,76 @@ class Finding:
         return f"{self.severity.upper():<9}{self.title}\n{_wrapped(self.explanation + seen, 9)}"
 
 
-_TEXTS: Final[dict[Any, dict[str, str]]] = tomllib.loads(
-    files(__package__).joinpath("findings.toml").read_text(encoding="utf-8")
-)
-"""By severity and name, the title of a finding, a line break, and its explanation."""
-
-
-def finding(name: str, evidence: str = "", **words: Any) -> Finding:
-    """Make a finding from its text in ``findings.toml``; words are the values of placeholders there."""
-    severity = next(severity for severity in SEVERITIES if name in _TEXTS[severity])
-    title, text = _TEXTS[severity][name].format(**words).split("\n", 1)
-    return Finding(severity, title, " ".join(text.split()), evidence)
+FINDINGS: Final[dict[Severity, dict[str, str]]] = {
+    "error": {
+        "raises": """The simulation raises {kind}
+The error comes from the model, from one of its mappings, or from the environment, which refuses what they return.
+Learning code tries every action that is in the action space and not masked: if an action causes the error, narrow the
+space or exclude the action with action_mask_mapping. If only a later episode fails, reset() must restore more.""",
+        "stuck": """The simulation neither ends nor asks for a decision
+An environment would wait forever. Look for an endless loop, for a loop that waits for an event that some actions never
+cause, and for an except that catches everything, SimulationExit too. If the model is only slow: time_limit=.""",
+        "no_decision": """The simulation never asks for a decision
+run() never calls {points}. Does it call an earlier reference instead of the attribute of a class or module?""",
+        "unrepeatable": """The same seed does not give the same run
+Two runs with the same seed differ, so no result can be repeated. The usual causes: a generator that reset() does not
+seed, a clock, values left over in class attributes or global variables, or the order of a set.""",
+        "unseeded_generators": """The model or a mapping draws from generators that the whole process shares ({names})
+The same seed does not give the same episode: all other code that draws from these generators changes them. Give the
+model a generator of its own, random.Random(seed) or numpy.random.default_rng(seed), seeded in reset(); or, if you
+cannot change it, give environments the option global_rng=True. Mappings should only read the model.""",
+        "changed_model": """The model behaves differently when it is observed
+With its own rule throughout, a run in an environment must be identical to the plain run, else agents learn on another
+model. Mappings (of observations, rewards, masks, agents' names) must not change it or draw random numbers from it.""",
+        "left_over": """Something is left over from earlier episodes
+An episode after others in the same environment, the last of them broken off, differs from the same episode in a new
+environment. reset() must restore everything that run() changes. The usual cause is an attribute that __init__ sets.""",
+        "disturbance": """Two environments of the model disturb each other
+Stepped in turns, they give other episodes than each alone. They share something: attributes of classes, global
+variables, a file, or objects that were made when the module was imported.""",
+        "failed_test": """{test} fails
+Learning libraries rely on the properties that it tests.""",
+        "outside": """Observations at {point} lie outside their space
+Learning code relies on the bounds. Widen the observation_space, or clip in the observation_space_mapping.""",
+    },
+    "warning": {
+        "shared_generators": """The model uses generators that the whole process shares ({names})
+The model seeds them itself, so that one environment repeats its episodes. But environments side by side and training
+code disturb each other. Give the model a generator of its own, or its environments the option global_rng=True.""",
+        "writing_mappings": """Mappings write into the model
+In an environment the simulation holds values that it does not hold in a plain run, though its decisions are the
+same. Keep such values outside the model; difference() computes changes since the last decision.""",
+        "warned": """An environment warns
+The simulation may refuse to end (an except that catches everything), several objects may decide as one agent (see
+agent= of make_step), or agents that the options name do not exist.""",
+        "out_of_time": """The time limit has stopped the check
+Give it more time (time_limit=), or less work (episodes=, max_steps=, fewer seeds=).""",
+        "no_effect": """What the agents do changes nothing
+Two episodes of the same seed with different actions gave the same observations and rewards. Do the actions reach the
+model (action_space_mapping, apply), and do observations and rewards show what they bring about?""",
+        "never_called": """{point} was never called
+No episode asked for this decision, so its agent cannot learn anything. Does the simulation call the function as an
+attribute of its class or module, and do episodes last long enough?""",
+        "zero_rewards": """Rewards at {point} are always zero
+Random actions never earned a reward, and what is rare is hard to learn. Should it be rare? See the reward_mapping.""",
+    },
+    "note": {
+        "unseeded_reset": """reset() takes no seed
+Write reset(self, seed=None) and seed the model's generator with it, unless nothing in the model is random.""",
+        "cut_runs": """Runs were stopped before their end
+They make more than {most} decisions, or never end. If they never end, environments need the option max_steps.""",
+        "unstable": """Some attributes of the model differ between two plain runs with the same seed
+The decisions were the same, so this may be harmless: the time of day, or a counter that all simulations of the
+process share. The comparisons leave it out.""",
+        "same_seeds": """All seeds give the same episode
+If the model draws random numbers, reset() does not seed them. If it draws none, agents may memorise the episode.""",
+        "same_rewards": """Rewards at {point} are always the same
+All random actions earned the same. Check the reward_mapping, unless only the length of the episode should count.""",
+        "never_legal": """Some actions at {point} were never legal
+Either there were too few episodes for them to be legal, or the action space is larger than necessary.""",
+    },
+}
+"""By severity and name, the title of a finding in the first line, then what it means and what to do."""
 
 
 @dataclass(frozen=True)
@@ -145,14 +202,11 @@ class Inspection:
     def __str__(self) -> str:
         counts = ", ".join(f"{point} {number} times" for point, number in self.counts.items())
         episode = f"calls    {counts or 'none'}\norder    {self.calls or '-'}"
-        return "\n\n".join(
-            [
-                f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}",
-                *("\n  ".join(f"{key:<13} {text}" for key, text in point.items()) for point in self.points),
-                f"Possible views: {', '.join(self.views)}",
-                f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}",
-            ]
-        )
+        parts = [f"{self.simulation}: {len(self.points)} decision point{'s' * (len(self.points) != 1)}"]
+        parts += ["\n  ".join(f"{key:<13} {text}" for key, text in point.items()) for point in self.points]
+        parts.append(f"Possible views: {', '.join(self.views)}")
+        parts.append(f"One episode with the model's own rules: {self.ended}\n{_wrapped(episode, 2)}")
+        return "\n\n".join(parts)
 
 
 def order_of(calls: Sequence[str]) -> str:

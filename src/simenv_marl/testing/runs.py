@@ -7,59 +7,66 @@ its time is up, an exit is raised in whatever Python code the model is executing
 from __future__ import annotations
 
 import ctypes
-import datetime
 import io
+import math
 import os
 import random
 import sys
 import threading
 import time
 import traceback
+import types
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
+from datetime import date, datetime
 from itertools import islice
-from typing import Any, Final, TypeVar
+from textwrap import shorten
+from typing import Any, Final
 
 import numpy as np
+from greenlet import getcurrent
 
-from ..errors import error_notes, error_text
-from ..simulation import RULE
-from .fingerprint import Difference, Fingerprint, alike, describe_differences, differences, fingerprint
-from .internals import MASK, Plan, SimulationExit, outside_simulation, set_up, watching_rules
+from ..core.actions import MASK
+from ..core.context import environment_context
+from ..core.driver import SimulationExit
+from ..core.plan import Plan
+from ..core.rng import GlobalRandom
+from ..decision import DecisionPoint
+from ..errors import describe_error, error_notes
+from ..hooks.patches import Installation
+from ..hooks.stacks import outside_simulation, stack_of
+from ..simulation import RULE, make_simulation, resetter
+from .fingerprint import Difference, Fingerprint, describe_differences, differences, fingerprint
 
-Result = TypeVar("Result")
+_WARNINGS: Final = ("refuses to end", "several objects decide at", "did not appear in the episode")
+"""Texts in the warnings of environments that are findings."""
 
 
-class Cut(SimulationExit):
-    """Raised in a run that has reached its limit of decisions."""
+class LimitReached(SimulationExit):
+    """Raised in a run that has reached its limit of decisions or of time."""
 
 
-class TimeUp(SimulationExit):
-    """Raised in a run whose time is up."""
-
-
-def within(seconds: float, function: Callable[[], Result]) -> Result:
-    """Call a function, and raise ``TimeUp`` in it when the time is up.
+def within(seconds: float, function: Callable[[], Any]) -> None:
+    """Call a function, and raise ``LimitReached`` in it when the time is up.
 
     This interrupts Python code. Waiting outside of Python (in a sleep, for example) is interrupted when it returns.
     """
-    deadline = time.monotonic() + seconds
     thread, over = threading.get_ident(), threading.Event()
 
     def watch() -> None:
-        pause = deadline - time.monotonic()
-        while not over.wait(max(0.0, pause)):
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(TimeUp))
+        pause = seconds
+        while not over.wait(pause):
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(LimitReached))
             pause = 0.5  # raise it again in a model that swallows it
 
     watcher = threading.Thread(target=watch, daemon=True, name="time limit of a check")
     try:
         watcher.start()
-        return function()
+        function()
     finally:
-        # TimeUp may still be raised until the watcher has ended, and is then delivered at once. (It is not revoked: in
+        # It may still be raised until the watcher has ended, and is then delivered at once. (It is not revoked: in
         # CPython that would leave the interpreter checking for it forever.)
         while True:
             try:
@@ -68,7 +75,7 @@ def within(seconds: float, function: Callable[[], Result]) -> Result:
                 for _ in range(10):
                     pass
                 break
-            except TimeUp:
+            except LimitReached:
                 continue
 
 
@@ -88,11 +95,7 @@ def global_generators() -> dict[str, Any]:
 
 @contextmanager
 def quietly() -> Iterator[list[warnings.WarningMessage]]:
-    """Ignore what a model prints, and its warnings; leave the global generators as they were.
-
-    Yields:
-        The warnings for which a filter was added.
-    """
+    """Ignore what a model prints and warns; restore the global generators; yield warnings that are findings."""
     states, silenced = global_generators(), io.StringIO()
     try:
         with (
@@ -102,6 +105,8 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
             redirect_stderr(silenced),
         ):
             warnings.simplefilter("ignore")
+            for pattern in _WARNINGS:
+                warnings.filterwarnings("always", f".*{pattern}")
             yield caught
     finally:
         random.setstate(states["Python's random"])
@@ -115,57 +120,58 @@ def quietly() -> Iterator[list[warnings.WarningMessage]]:
 class Run:
     """What is recorded of a run."""
 
-    entries: list[tuple[str, Fingerprint]] = field(default_factory=list)  # points and decisions, or agents and steps
+    calls: list[str] = field(default_factory=list)  # the names of the points that were called, or of the agents
+    steps: Fingerprint = field(default_factory=dict)  # the decisions, or the results of ``last()``
     actions: list[Any] = field(default_factory=list)  # the random ones
     simulation: Any = None
-    fingerprint: Fingerprint | None = None  # of the simulation at its end, or when it was cut
+    in_main_loop: bool = False  # whether a plain run is in the simulation's main loop
+    fingerprint: Fingerprint = field(default_factory=dict)  # of the simulation at its end, or when it was cut
     cut: bool = False  # whether it has reached its limit of decisions
     error: BaseException | None = None
     result: Any = None  # what run() returned in a plain run, or how an episode of random actions ended
     drawn: set[str] = field(default_factory=set)  # the global generators from which it has drawn
-    latest: float = field(default_factory=time.monotonic)  # the time of the latest entry
-    seconds: float = 0.0  # its limit
+    latest: float = field(default_factory=time.monotonic)  # the time of the latest call
+    stuck: bool = False  # whether its time was up long after the latest call
 
-    @property
-    def calls(self) -> list[str]:
-        """The names of the points that were called, in that order."""
-        return [name for name, _ in self.entries]
-
-    def play(self, seconds: float, function: Callable[[], Any]) -> Run:
-        """Call a function that plays this run; record its error and the global generators."""
-        states, self.seconds = global_generators(), seconds
-        try:
-            within(seconds, function)
-        except (Exception, SystemExit) as error:
-            if not self.cut:
-                self.error = error
-        self.drawn = {name for name, state in global_generators().items() if not alike(state, states[name])}
-        return self
+    def begin_step(self, name: str) -> str:
+        """Record that a point was called or an agent asked; return the name of this step in ``steps``."""
+        self.calls.append(name)
+        self.latest = time.monotonic()
+        step = f"in step {len(self.calls)}, {name}"
+        self.steps[step] = "without a result"
+        return step
 
     def difference(self, other: Run) -> str:
-        """Describe the first difference from the entries of another run; empty if there is none."""
-        pairs = zip(self.entries, other.entries, strict=False)
-        for number, ((name, value), (other_name, other_value)) in enumerate(pairs, 1):
-            if name != other_name:
-                return f"step {number} is first of {name}, then of {other_name}"
-            if parts := differences(value, other_value):
-                return f"in step {number}, {describe_differences(parts)}"
+        """Describe the first differences from the steps of another run; empty if there are none."""
         if other.error is not None:
             return f"the second one raises {describe_with_place(other.error)}"
-        if len(self.entries) != len(other.entries):
-            return f"there are first {len(self.entries)} steps, then {len(other.entries)}"
-        return ""
+        parts = differences(self.steps, other.steps)
+        if not parts and len(self.calls) != len(other.calls):
+            return f"there are first {len(self.calls)} steps, then {len(other.calls)}"
+        return describe_differences(parts)
 
 
 @dataclass(kw_only=True)
-class Runner:
-    """Runs a simulation in different ways, within a number of decisions and of seconds."""
+class Subject:
+    """A simulation with its decision points and options, the limits of its runs, and what is known so far."""
 
     plan: Plan
     max_steps: int
-    seconds: float = 30.0  # for a single run
+    seconds: float  # the time limit of a single run
     own: Callable[[Any], Any] | None = None  # the user's callable by which simulations are compared
+    seeds: tuple[int, ...] = ()
+    episodes: int = 0
+    end: float = math.inf  # of the time limit for all checks, as time.monotonic()
+    plain: dict[int, Run] = field(default_factory=dict)  # plain runs, by seed
+    repeats: bool = True  # whether the same seed gives the same plain run
+    drawn: set[str] = field(default_factory=set)  # the global generators that it draws from
     unstable: frozenset[str] = frozenset()  # parts that are not compared
+    views: tuple[str, ...] = ()  # that the plan allows; none if the plain runs fail or decide nothing
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return time.monotonic() >= self.end
 
     def look(self, simulation: Any) -> Fingerprint:
         """Return the fingerprint of a simulation: of the user's callable, of its ``state()``, or of its attributes."""
@@ -177,50 +183,100 @@ class Runner:
 
     def differences(self, run: Run, other: Run) -> list[Difference]:
         """Return the parts in which the simulations differ after two runs."""
-        if run.fingerprint is None or other.fingerprint is None:
-            return []
         return differences(run.fingerprint, other.fingerprint, self.unstable)
 
-    def run_plainly(self, seed: int) -> Run:
-        """Run the simulation's own loop; only the results of its rules are recorded."""
+    def play(self, function: Callable[[], Any], run: Run | None = None, *, seed: int = 0) -> Run:
+        """Seed the global generators, call a function within the time limit, and record its error and its draws."""
+        run = Run() if run is None else run
+        seed_global_generators(seed)
+        states = global_generators()
+        try:
+            within(self.seconds, function)
+        except (Exception, SystemExit) as error:
+            run.error = None if run.cut else error
+            run.stuck = time.monotonic() - run.latest > self.seconds / 2
+        run.drawn = {name for name, state in global_generators().items() if repr(state) != repr(states[name])}
+        return run
+
+    def run_plainly(self, seed: int, *, shared_seed: int | None = None) -> Run:
+        """Run the simulation's own loop, with the plan's handlers and generators; record the results of its rules.
+
+        The global generators get the same seed, or a ``shared_seed``.
+        """
         run = Run()
 
         def start() -> None:
-            with set_up(self.plan, seed) as (run.simulation, main):
-                run.result = main()
-                run.fingerprint = self.look(run.simulation)
+            rng = GlobalRandom() if self.plan.options.global_rng else None
+            installation = Installation(self.plan.patches)
+            try:
+                with environment_context(self.plan.plugins, rng):
+                    run.simulation = make_simulation(self.plan.source)
+                    if rng is not None:
+                        rng.begin(seed)
+                    resetter(run.simulation)(seed, None)
+                    run.in_main_loop = True
+                    run.result = run.simulation.run()
+                    run.in_main_loop = False
+                    run.fingerprint = self.look(run.simulation)
+            finally:
+                installation.uninstall()
 
-        return self._record(run, start)
+        return self._record(run, start, seed if shared_seed is None else shared_seed)
 
     def run_rules(self, env: Any, seed: int) -> Run:
         """Run an environment of any view with ``RULE`` throughout; the results of rules are recorded."""
         run = Run(simulation=env.simulation)
 
         def start() -> None:
-            _play_rules(env, seed)
+            env.reset(seed=seed)
+            if not hasattr(env, "agents"):
+                while not any(env.step(RULE)[2:4]):
+                    pass
+            while getattr(env, "agents", ()):
+                over = hasattr(env, "agent_selection") and (env.terminations | env.truncations)[env.agent_selection]
+                env.step(None if over else RULE)
             run.fingerprint = self.look(run.simulation)
 
-        return self._record(run, start)
+        return self._record(run, start, seed)
 
-    def _record(self, run: Run, start: Callable[[], None]) -> Run:
-        """Record the decisions of a run, and cut it at the limit."""
+    def _record(self, run: Run, start: Callable[[], None], seed: int) -> Run:
+        """Play a run in which the decisions of the rules are recorded."""
+        points = list(dict.fromkeys(bound.point for bound in self.plan.points))
+        for point in points:
+            point.hook.replace_rule(self._recording_rule(run, point))
+        try:
+            return self.play(start, run, seed=seed)
+        finally:
+            for point in points:
+                point.hook.replace_rule()
 
-        def begin(name: str) -> Callable[[Any], None]:
-            place = len(run.entries)
-            if place >= self.max_steps:
+    def _recording_rule(self, run: Run, point: DecisionPoint) -> Callable[..., Any]:
+        """Return a rule that records each of its decisions, and cuts the run at the limit."""
+        name, rule = point.name, point.rule
+
+        def decide(*args: Any, **kwargs: Any) -> Any:
+            stack = stack_of(getcurrent())
+            # In a reset or a mapping, rules do not count as decisions.
+            if not (run.in_main_loop if stack is None else stack.decides(point.hook)):
+                return rule(*args, **kwargs)
+            if len(run.calls) >= self.max_steps:
                 if not run.cut:
                     run.cut, run.fingerprint = True, self.look(run.simulation)
-                raise Cut
-            run.entries.append((name, {}))
-            run.latest = time.monotonic()
+                raise LimitReached
+            step = run.begin_step(name)
+            value = rule(*args, **kwargs)
+            return end(step, value) if point.hook.kind == "function" else wait(step, value)
 
-            def end(value: Any) -> None:
-                run.entries[place] = name, fingerprint(f"the decision of {name}", value, follow=False)
+        def end(step: str, value: Any) -> Any:
+            run.steps |= fingerprint(step, value, follow=False)
+            return value
 
-            return end
+        @types.coroutine
+        def wait(step: str, running: Any) -> Generator[Any, Any, Any]:
+            awaited = running.__await__() if point.hook.kind == "coroutine" else running
+            return end(step, (yield from awaited))
 
-        with watching_rules(self.plan, begin):
-            return run.play(self.seconds, start)
+        return decide
 
     def run_randomly(
         self, env: Any, seed: int, *, salt: int = 0, most: int | None = None, beside: Any = None, collect: Any = None
@@ -233,54 +289,44 @@ class Runner:
         run = Run()
 
         def start() -> None:
-            other = _random_steps(Run(), beside, seed + 1, salt) if beside is not None else iter(())
+            other = iter(()) if beside is None else _random_steps(Run(), beside, seed + 1, salt)
             for agent, step in islice(_random_steps(run, env, seed, salt), most):
                 if collect is not None:
                     collect(env, agent, step)
                 next(other, None)
 
-        seed_global_generators(seed)
-        return run.play(self.seconds, start)
+        return self.play(start, run, seed=seed)
 
-    def sources_of_chance(self, seed: int) -> str:
-        """Run the simulation, and say where it uses clocks, entropy and Python's global generator."""
+    def sources_of_chance(self) -> str:
+        """Run the simulation, and say where it uses clocks, entropy and Python's global generator, if it does."""
         found: dict[str, None] = {}
 
         def profile(frame: Any, event: str, argument: Any) -> None:
             source = _CHANCE.get(argument) if event == "c_call" else None
             if frame.f_code is random.Random.seed.__code__ and frame.f_locals.get("a", 0) is None:
                 source = "a random.Random is made without a seed"
-            if source and (place := _caller(frame)):
-                found[f"{source} at {place}"] = None
+            while source and frame is not None and frame.f_code.co_filename.startswith((_LIBRARY, "<")):
+                frame = frame.f_back
+            if source and frame is not None and not frame.f_code.co_filename.startswith(_PACKAGE):
+                code = frame.f_code
+                found[f"{source} at {code.co_filename}:{frame.f_lineno}, in {code.co_name}"] = None
 
         before = sys.getprofile()
         sys.setprofile(profile)
         try:
-            self.run_plainly(seed)
+            self.run_plainly(self.seeds[0])
         finally:
             sys.setprofile(before)
-        return "; ".join(list(found)[:3])
-
-
-def _play_rules(env: Any, seed: int) -> None:
-    """Play an episode in any view with ``RULE`` throughout."""
-    env.reset(seed=seed)
-    if not hasattr(env, "agents"):
-        while not any(env.step(RULE)[2:4]):
-            pass
-        return
-    while env.agents:
-        over = hasattr(env, "agent_selection") and (env.terminations | env.truncations)[env.agent_selection]
-        env.step(None if over else RULE)
+        return f"\nin the model, {'; '.join(list(found)[:3])}" if found else ""
 
 
 def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[str, Any]]:
     """Play one step at a time, record it, and yield the agent and the result of ``last()``."""
     env.reset(seed=seed)
-    while env.agents:
-        agent, step, action = env.agent_selection, env.last(), None
-        run.entries.append((agent, fingerprint(agent, step)))
-        run.latest, run.result = time.monotonic(), "truncated" if step[3] else "terminated"
+    for agent in env.agent_iter():
+        step, action = env.last(), None
+        run.steps |= fingerprint(run.begin_step(agent), step)
+        run.result = "truncated" if step[3] else "terminated"
         if not (step[2] or step[3]):
             for _ in range(1 + salt):  # the space is seeded by the reset
                 action = env.action_space(agent).sample(step[4].get(MASK))
@@ -293,14 +339,7 @@ def _random_steps(run: Run, env: Any, seed: int, salt: int) -> Iterator[tuple[st
 
 _PACKAGE: Final = __file__.rpartition("testing")[0]
 _LIBRARY: Final = random.__file__.rpartition("random.py")[0]
-_CLOCKS: Final = (
-    time.time,
-    time.time_ns,
-    time.monotonic,
-    time.perf_counter,
-    datetime.datetime.now,
-    datetime.date.today,
-)
+_CLOCKS: Final = (time.time, time.time_ns, time.monotonic, time.perf_counter, datetime.now, date.today)
 _CHANCE: Final[dict[Any, str]] = {
     **{clock: f"the clock is read ({clock.__name__})" for clock in _CLOCKS},
     **dict.fromkeys((random.random, random.getrandbits), "Python's global generator is used"),
@@ -311,25 +350,14 @@ _CHANCE: Final[dict[Any, str]] = {
 
 def place_of(error: BaseException) -> str:
     """Return where an error was raised, outside of this library: file, line and function; empty if nowhere."""
-    places = [
-        f"{frame.filename}:{frame.lineno}, in {frame.name}"
-        for frame in traceback.extract_tb(error.__traceback__)
-        if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename
-    ]
-    return places[-1] if places else ""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if not frame.filename.startswith((_PACKAGE, "<")) and "site-packages" not in frame.filename:
+            return f"{frame.filename}:{frame.lineno}, in {frame.name}"
+    return ""
 
 
 def describe_with_place(error: BaseException) -> str:
     """Describe an error: its class, the beginning of its text, where it was raised, and this library's notes."""
-    text, place = " ".join(error_text(error).split()), place_of(error)
-    text = text if len(text) <= 400 else f"{text[:396]} ..."
+    text, place = shorten(describe_error(error), 400, placeholder=" ..."), place_of(error)
     notes = "".join(f"\n{note.removeprefix('simenv_marl: ')}" for note in error_notes(error)[:2])
-    return f"{type(error).__name__}: {text}" + (f" ({place})" if place else "") + notes
-
-
-def _caller(frame: Any) -> str:
-    """Return the place in the model from which the standard library was called; empty if this library called it."""
-    while frame is not None and frame.f_code.co_filename.startswith((_LIBRARY, "<")):
-        frame = frame.f_back
-    path = frame.f_code.co_filename if frame is not None else _PACKAGE
-    return "" if path.startswith(_PACKAGE) else f"{path}:{frame.f_lineno}, in {frame.f_code.co_name}"
+    return text + (f" ({place})" if place else "") + notes

@@ -92,6 +92,18 @@ def write_beside(axes: Axes, text: str, height: float, at: Any) -> None:
     axes.annotate(text, (1.0, height), (6, 0), at, "offset points", va="center", fontsize=8.5, annotation_clip=False)
 
 
+def label_below(axes: Any, names: list[str]) -> None:
+    """Write names below the axes, slanted if they would overlap, and draw a grid."""
+    axes.tick_params(labelsize=8, colors=INK, color=PALE)
+    axes.grid(axis="y", color=ABSENT, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.set_xticks(range(len(names)), names)
+    inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
+    if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter
+        for label in axes.get_xticklabels():
+            label.set(rotation=30, ha="right", rotation_mode="anchor")
+
+
 # -- many episodes --------------------------------------------------------------------------------
 
 

@@ -20,19 +20,7 @@ from ..core.provenance import as_json, describe, source_name
 from ..core.reuse import reuse_resources
 from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
-from .runner import (
-    RUN_COLUMNS,
-    STATUS_COLUMNS,
-    TEAM,
-    Policies,
-    Returns,
-    Runner,
-    checked_contenders,
-    distinct_seeds,
-    make_runner,
-    make_table,
-    plain_value,
-)
+from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Returns, Runner, distinct_seeds, make_table, plain_value
 from .store import Provenance, Result, Run, Store, Writer, check_rows, new_session, to_json, warn_of_changes
 from .variants import Variant, check_call
 
@@ -59,7 +47,7 @@ def run_experiment(
     make: Any,
     design: Any,
     *,
-    contenders: Mapping[str, Policies] | None = None,
+    contenders: Mapping[str, Mapping[Any, Any]] | None = None,
     seeds: Iterable[int],
     points: Points = None,
     metric: Any = None,
@@ -107,20 +95,27 @@ def run_experiment(
         SimEnvError: Something else cannot work. The subclass tells what.
     """
     import_extra("pandas", "run_experiment")
-    by_name = checked_contenders(contenders or {}, batched=bool(batched))
-    if by_name.pop(BY_RULE, {}):
+    table, rows = _checked_design(design)
+    keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
+    runner = Runner(
+        contenders or {}, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
+        factors=list(table.columns),
+    )  # fmt: skip
+    if runner.contenders.pop(BY_RULE, {}):
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another name"
         )
-    by_name = {BY_RULE: {}, **by_name}
-    table, rows = _checked_design(design)
-    keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
-    runner = make_runner(
-        by_name, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
-        factors=list(table.columns),
-    )  # fmt: skip
-    _check_make(make, rows[0])
-    storage = Store(_checked_folder(store), list(table.columns), list(runner.metrics))
+    runner.contenders = {BY_RULE: {}, **runner.contenders}
+    if isinstance(make, Variant):
+        _source(make, rows[0])  # a variant checks its parameters
+    else:
+        what = "make must be a callable of the factors, such as a class, or a Variant"
+        check_call(make, rows[0], OptionValueError, what, f"the factors {', '.join(rows[0]) or '(none)'}")
+    try:
+        folder = Path(store).absolute()  # other processes may have another working directory
+    except TypeError as error:
+        raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
+    storage = Store(folder, list(table.columns), list(runner.metrics))
     stored = storage.read(keys)
     check_rows(storage, stored, keys)
     work = make, runner, storage.folder, new_session()
@@ -130,7 +125,9 @@ def run_experiment(
     storage.create()
     warn_of_changes(storage, stored, row, provenances)
     finished = {run for run, result in stored.runs.items() if not (retry_errors and isinstance(result, str))}
-    runs = list(product(dict.fromkeys(keys), by_name, all_seeds))  # a row that occurs twice has the same results
+    runs = list(
+        product(dict.fromkeys(keys), runner.contenders, all_seeds)
+    )  # a row that occurs twice has the same results
     missing = [run for run in runs if run not in finished]
     with progress_bar(len(runs), "run", len(runs) - len(missing)) if progress else nullcontext() as bar:
         if workers and missing:
@@ -167,22 +164,6 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
     advice = "; other values cannot be stored: use a name as the value, and look it up in make"
     levels = {name: [plain_value(f"the factor {name!r}", value, advice) for value in table[name]] for name in names}
     return table, [{name: levels[name][place] for name in names} for place in range(len(table))]
-
-
-def _checked_folder(store: Any) -> Path:
-    try:
-        return Path(store).absolute()  # other processes may have another working directory
-    except TypeError as error:
-        raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
-
-
-def _check_make(make: Any, row: Mapping[str, Any]) -> None:
-    """Check that ``make`` takes the factors."""
-    if isinstance(make, Variant):
-        _source(make, row)  # a variant checks its parameters
-    else:
-        what = "make must be a callable of the factors, such as a class, or a Variant"
-        check_call(make, row, OptionValueError, what, f"the factors {', '.join(row) or '(none)'}")
 
 
 def _try_contenders(make: Any, runner: Runner, keys: Sequence[str]) -> tuple[str, dict[str, Provenance]]:

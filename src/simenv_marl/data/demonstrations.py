@@ -18,8 +18,7 @@ from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
-from .collect import LeftToRule, collect_episodes
-from .rule import check_known, follows_rule, policy_name
+from .collect import LeftToRule, check_known, collect_episodes, follows_rule, policy_name
 from .trajectories import Trajectories
 
 __all__ = ["record_dataset", "save_dataset"]
@@ -69,25 +68,20 @@ def record_dataset(
     if not isinstance(policies, Mapping) or not policies:
         raise OptionValueError(f"policies must be a dict from agents or points to policies, not {short_repr(policies)}")
     names = _dataset_ids(dataset_id, policies)
-    for name in names.values():
-        _free_path(name)
+    paths = {key: _free_path(name) for key, name in names.items()}
     left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
     sizes: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress}
     collected = collect_episodes(simulation, {**policies, **left}, seeds=seeds, points=points, **sizes, **options)
-    for key, name in names.items():
-        _check_writable(name, collected[key])
     origin = provenance(simulation, points, **options)
-    written, begun = {}, list[Path]()
+    written: dict[Any, Any] = {}
     try:
         for key, name in names.items():
-            begun.append(_free_path(name))
-            written[key] = save_dataset(
-                name, collected[key], **{"algorithm_name": policy_name(policies[key]), **(metadata or {})}
-            )
+            described = {"algorithm_name": policy_name(policies[key]), **(metadata or {})}
+            written[key] = save_dataset(name, collected[key], **described)
             written[key].storage.update_metadata({"provenance": origin})
     except BaseException:
-        for path in begun:
-            shutil.rmtree(path, ignore_errors=True)  # all of them or none
+        for key in written:
+            shutil.rmtree(paths[key], ignore_errors=True)  # all of them or none
         raise
     return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
 
@@ -145,7 +139,11 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
             f" key, not {short_repr(trajectories)}"
         )
     path = _free_path(dataset_id)
-    _check_writable(dataset_id, trajectories)
+    if not len(trajectories):
+        raise OptionValueError(
+            f"there is nothing to write to {short_repr(dataset_id)}: no agent has decided in any episode"
+        )
+    check_known(trajectories)
     import minari
 
     try:
@@ -191,13 +189,6 @@ def _free_path(name: str) -> Path:
             " with minari.delete_dataset"
         )
     return path
-
-
-def _check_writable(name: str, found: Trajectories) -> None:
-    """Check that there are decisions to write, and that their actions are known."""
-    if not len(found):
-        raise OptionValueError(f"there is nothing to write to {short_repr(name)}: no agent has decided in any episode")
-    check_known(found)
 
 
 def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:

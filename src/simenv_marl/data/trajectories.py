@@ -4,7 +4,7 @@ While the episodes run, a ``Recorder`` keeps a log for each group of decisions, 
 get the same rows sorted by policy, episode, agent and step, independent of that order.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from math import nan
@@ -313,17 +313,21 @@ class Recorder:
         """Record the reward when an episode reaches its next decision or its end: see ``Watcher``."""
         if episode.pending is not None:
             _reward(episode.pending)
-        for agent in episode.just_ended:
-            _end(agent, episode.turns, terminated=True, truncated=False)
+        ended = [(agent, True, False) for agent in episode.just_ended]
         episode.just_ended = []
         if episode.over:
-            for agent in episode.agents.values():
-                _end(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
+            ended += [(agent, episode.terminated, episode.truncated) for agent in episode.agents.values()]
+        for agent, terminated, truncated in ended:
+            _reward(agent)
+            trajectory: _TrajectoryLog | None = agent.notes
+            if trajectory is not None:
+                trajectory.last_observation, trajectory.last_turn = agent.observation, episode.turns
+                trajectory.terminated, trajectory.truncated = terminated, truncated
 
-    def records(self, plan: Plan, keys: Mapping[Any, int]) -> dict[int, Records]:
-        """Return the records by the place of their policy, from the places by key."""
-        records = {}
-        for key, place in keys.items():
+    def records(self, plan: Plan, keys: Iterable[Any]) -> list[Records]:
+        """Return the records of each policy, in the order of the policies, which have these keys."""
+        records = []
+        for place, key in enumerate(keys):
             logs = [log for log in self._logs.values() if place in log.trajectories]
             if len(logs) > 1:
                 raise AgentError(
@@ -333,7 +337,7 @@ class Recorder:
             if not logs:
                 point = next((point for point in plan.points if is_answered_by(plan, point, place)), None)
                 logs = [_DecisionLog(point)]
-            records[place] = logs[0].records(place)
+            records.append(logs[0].records(place))
         return records
 
 
@@ -353,15 +357,6 @@ def _reward(agent: Agent) -> None:
     log.elapsed[row] = agent.info.get("elapsed", nan)
     if agent.rule_action is not None:
         log.rule_actions[row], agent.rule_action = agent.rule_action, None
-
-
-def _end(agent: Agent, turns: int, *, terminated: bool, truncated: bool) -> None:
-    """Record the agent's last reward and its end."""
-    _reward(agent)
-    trajectory: _TrajectoryLog | None = agent.notes
-    if trajectory is not None:
-        trajectory.last_observation, trajectory.last_turn = agent.observation, turns
-        trajectory.terminated, trajectory.truncated = terminated, truncated
 
 
 def _stacker(space: spaces.Space[Any] | None) -> Stacker:

@@ -140,7 +140,7 @@ class Runner:
         policies, points, options = self.contenders[contender], self._points, self._options
         with noting(f"of the contender {contender!r}"):
             try:
-                return learners_plan(simulation, policies, points, options, all_points=True)[0]
+                return learners_plan(simulation, policies, points, options, all_points=True)
             except (AgentError, UnknownPointError) as error:
                 if points is not None:
                     raise
@@ -148,7 +148,7 @@ class Runner:
                 keys = dict.fromkeys(key for own in self.contenders.values() for key in own)
                 points = [key for key in keys if not isinstance(key, str) or "." in key] or None
                 with suppress(AgentError, UnknownPointError):
-                    plan = learners_plan(simulation, policies, points, options, all_points=points is not None)[0]
+                    plan = learners_plan(simulation, policies, points, options, all_points=points is not None)
                     if points is None and decision_points():
                         warn_user(f"returns are not counted, because the decision points are not known: {error}")
                     return plan

@@ -318,10 +318,8 @@ def _shadow(policy: Any) -> Any:
 
 
 def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> Any:
-    recorded = np.empty(len(identities), object)
-    for place, action in enumerate(_ask(policy, batch_policy, observations, infos, identities)):
-        recorded[place] = action
-    return RULE, {SHADOW: recorded}
+    actions = _ask(policy, batch_policy, observations, infos, identities)
+    return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 
 
 def _record_one(policy: PlannerPolicy, observation: Any, info: Any, *, _environment: Any) -> Any:

@@ -54,19 +54,18 @@ def style(what: str) -> Iterator[Any]:
     make = import_extra("matplotlib.figure", what).Figure
 
     def new_figure(width: float, height: float) -> Any:
-        figure: Any = make(figsize=(width, height), layout="constrained")
-        figure._repr_png_ = lambda: _png(figure)  # for notebooks in which Matplotlib has not registered figures
+        figure = make(figsize=(width, height), layout="constrained")
+
+        def image() -> bytes:
+            buffer = BytesIO()
+            figure.savefig(buffer, format="png", dpi=100)
+            return buffer.getvalue()
+
+        figure._repr_png_ = image  # for notebooks in which Matplotlib has not registered figures
         return figure
 
     with rc_context(STYLE):
         yield new_figure
-
-
-def _png(figure: Figure) -> bytes:
-    """Return the image of a figure for a notebook."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    return buffer.getvalue()
 
 
 def by_key(trajectories: Any) -> Mapping[Any, Trajectories]:

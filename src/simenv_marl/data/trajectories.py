@@ -118,12 +118,9 @@ class Trajectories:
     @cached_property
     def next_observations(self) -> Any:
         """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
-        if not len(self):
-            return self.observations
-        number = len(self)
-        following = np.arange(1, number + 1)
-        following[self.starts[1:] - 1] = number + np.arange(len(self.starts) - 1)
-        following[-1] = number + len(self.starts) - 1
+        ends = self.starts + self.lengths - 1
+        following = np.arange(1, len(self) + 1)
+        following[ends] = len(self) + np.arange(len(ends))  # the last observations lie behind all others
         return taken(joined([self.observations, self.last_observations]), following)
 
 

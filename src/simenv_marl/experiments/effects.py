@@ -152,19 +152,19 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    main, zero_or_one = [], is_proportion(table[metric])
-    for codes, own in coded.values():
-        for code in range(len(own)):
+    main: dict[tuple[str, Any], list[float]] = {}
+    zero_or_one = is_proportion(table[metric])
+    for name, (codes, own) in coded.items():
+        for code, level in enumerate(own):
             here = values[codes == code]
             by_seed = here.groupby(table["seed"].to_numpy()[codes == code]).mean()
             sample = by_seed if len(by_seed) > 1 else here
             proportion = zero_or_one and len(sample) == len(here)  # not means of several runs
             low, high, _ = interval(sample.to_numpy(), confidence, proportion=proportion)
-            main.append([here.mean(), low, high, here.mean() - values.mean(), len(here)])
-    index = pandas.MultiIndex.from_tuples(
-        [(name, level) for name, own in levels.items() for level in own], names=["factor", "level"]
-    )
-    rows = pandas.DataFrame(main, index, columns=["mean", "low", "high", "effect", "count"]).astype({"count": int})
+            main[name, level] = [here.mean(), low, high, here.mean() - values.mean(), len(here)]
+    index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
+    columns = ["mean", "low", "high", "effect", "count"]
+    rows = pandas.DataFrame(list(main.values()), index, columns).astype({"count": int})
     cells: dict[tuple[str, str], DataFrame] = {}
     strengths = []
     for one, other in combinations(levels, 2):

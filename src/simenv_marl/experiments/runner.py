@@ -156,16 +156,47 @@ class Runner:
 
     def run(self, plan: Plan, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
         """Run one episode for each seed. ``report`` gets the seed and its results when the simulation is closed."""
+        if not self.batch_size:
+            for seed in seeds:
+                self._run_alone(plan, seed, report)
+            return
         tally = Tally()
 
         def finish(place: int, simulation: Any) -> Callable[[], None]:
             return partial(report, seeds[place], tally.outcome(place, simulation, self.metrics))
 
-        if self.batch_size:
-            run(plan, seeds, self.batch_size, finish, tally)
-            return
-        for place, seed in enumerate(seeds):
-            _run_alone(plan, seed, place, finish, tally)
+        run(plan, seeds, self.batch_size, finish, tally)
+
+    def _run_alone(self, plan: Plan, seed: int, report: Callable[[int, Outcome], None]) -> None:
+        """Run an episode whose policies answer one decision at a time."""
+        tally = Tally()
+        with noting(f"while the simulation was made; seed {seed}"):
+            session = Session(plan)
+        try:
+            with outside_simulation():
+                episode = session.start(seed, None)
+                context = episode.context if plan.options.global_rng else nullcontext
+                tally.moved(episode)
+                while (agent := episode.pending) is not None:
+                    tally.count(0, agent)
+                    if agent.is_planner:
+                        agent.consultations += 1
+                    try:
+                        with context():
+                            action = agent.policy(agent.observation, agent.info)
+                    except BaseException as error:
+                        episode.fail(error)
+                        raise
+                    episode.step(action)
+                    tally.moved(episode)
+                session.end()
+                with noting(f"after the simulation's end; seed {seed}"):
+                    outcome = tally.outcome(0, session.simulation, self.metrics)
+                    session.close()
+                    report(seed, outcome)
+        except BaseException as error:
+            close_after(error, session.close, "the simulation")
+            raise
 
     def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
         """Return agent, return, length and metrics for each agent and for the team."""
@@ -197,37 +228,6 @@ def _check_contender(name: Any, policies: Any, *, batched: bool) -> None:
                 f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)}, answers many decisions at"
                 " once, as mixtures do; pass batched=True, and only policies as simulate_many takes them"
             )
-
-
-def _run_alone(plan: Plan, seed: int, place: int, finish: Callable[..., Callable[[], None]], tally: Tally) -> None:
-    """Run an episode whose policies answer one decision at a time."""
-    with noting(f"while the simulation was made; seed {seed}"):
-        session = Session(plan)
-    try:
-        with outside_simulation():
-            episode = session.start(seed, None)
-            context = episode.context if plan.options.global_rng else nullcontext
-            tally.moved(episode)
-            while (agent := episode.pending) is not None:
-                tally.count(place, agent)
-                if agent.is_planner:
-                    agent.consultations += 1
-                try:
-                    with context():
-                        action = agent.policy(agent.observation, agent.info)
-                except BaseException as error:
-                    episode.fail(error)
-                    raise
-                episode.step(action)
-                tally.moved(episode)
-            session.end()
-            with noting(f"after the simulation's end; seed {seed}"):
-                report = finish(place, session.simulation)
-                session.close()
-                report()
-    except BaseException as error:
-        close_after(error, session.close, "the simulation")
-        raise
 
 
 class Tally:

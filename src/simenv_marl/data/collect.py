@@ -304,20 +304,18 @@ def compare_with_rule(
             "others must be a dict of policies for agents or points that policies does not name, not"
             f" {short_repr(others)}"
         )
-    shadows = {id(policy): _shadow(policy) for policy in policies.values()}  # one for each, so that keys share batches
+    shadows: dict[int, Any] = {}  # policies that record an action; one for each, so that keys share batches
+    for policy in policies.values():
+        shadows[id(policy)] = partial(_record, policy, BatchPolicy(policy))
+        if is_planner(policy):
+            shadows[id(policy)] = partial(_record_one, PlannerPolicy(policy))
     deciding = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
     collected = collect_episodes(simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options)
     return {key: _compare(collected[key], float(tolerance)) for key in policies}
 
 
-def _shadow(policy: Any) -> Any:
-    """Make a policy that records the action of another policy as an extra, and leaves the decision to the rule."""
-    if is_planner(policy):
-        return partial(_record_one, PlannerPolicy(policy))
-    return partial(_record, policy, BatchPolicy(policy))
-
-
 def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> Any:
+    """Record the actions of a policy as an extra, and leave the decisions to the rule."""
     actions = _ask(policy, batch_policy, observations, infos, identities)
     return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
 

@@ -193,11 +193,21 @@ def _free_path(name: str) -> Path:
 
 def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
     """Make a Minari episode buffer of each trajectory."""
-    number = len(found.starts)
+    number, lasts = len(found.starts), found.starts + found.lengths - 1
     # The rows of the ends follow those of the decisions.
-    columns = {"observations": joined([found.observations, found.last_observations]), "infos": _infos(found, number)}
-    for place, (start, length) in enumerate(zip(found.starts, found.lengths, strict=True)):
-        rows = np.arange(start, start + length)
+    infos: dict[str, Any] = {"by_rule": _extend(found.by_rule, number, False)}
+    if isinstance(found.action_masks, tuple):
+        infos["action_mask"] = {str(place): _extend(mask, number, 1) for place, mask in enumerate(found.action_masks)}
+    elif found.action_masks is not None:
+        infos["action_mask"] = _extend(found.action_masks, number, 1)
+    if found.times is not None and found.elapsed is not None:
+        infos["time"] = np.append(found.times, found.times[lasts] + found.elapsed[lasts])
+    for name, values in found.extras.items():
+        if values.dtype.kind in "biufc":
+            infos.setdefault(name, _extend(values, number, 0))
+    columns = {"observations": joined([found.observations, found.last_observations]), "infos": infos}
+    for place, (start, last) in enumerate(zip(found.starts, lasts, strict=True)):
+        rows = np.arange(start, last + 1)
         seed = found.seeds[found.episodes[start]]
         own = taken(columns, np.append(rows, len(found) + place))
         yield buffer(
@@ -209,22 +219,6 @@ def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
             truncations=found.truncations[rows],
             infos=own["infos"],
         )
-
-
-def _infos(found: Trajectories, ends: int) -> dict[str, Any]:
-    """Return the infos by name: the rows of the decisions, and behind them those of the ends."""
-    infos: dict[str, Any] = {"by_rule": _extend(found.by_rule, ends, False)}
-    if isinstance(found.action_masks, tuple):
-        infos["action_mask"] = {str(place): _extend(mask, ends, 1) for place, mask in enumerate(found.action_masks)}
-    elif found.action_masks is not None:
-        infos["action_mask"] = _extend(found.action_masks, ends, 1)
-    if found.times is not None and found.elapsed is not None:
-        last = found.starts + found.lengths - 1
-        infos["time"] = np.append(found.times, found.times[last] + found.elapsed[last])
-    for name, values in found.extras.items():
-        if values.dtype.kind in "biufc":
-            infos.setdefault(name, _extend(values, ends, 0))
-    return infos
 
 
 def _extend(values: NDArray[Any], number: int, filler: Any) -> NDArray[Any]:

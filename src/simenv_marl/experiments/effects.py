@@ -172,7 +172,9 @@ def effects(
         means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
         means.index, means.columns = pandas.Index(levels[one], name=one), pandas.Index(levels[other], name=other)
         cells |= {(one, other): means, (other, one): means.T}
-        strengths.append([one, other, _strength(means.to_numpy(np.float64))])
+        grid = means.to_numpy(np.float64)
+        rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0, keepdims=True) + grid.mean()
+        strengths.append([one, other, float(np.sqrt((rest**2).mean()))])  # nan if a combination is missing
     interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(["factor", "other"])
     return Effects(rows, interactions.sort_values("strength", ascending=False), metric, levels, cells)
 
@@ -215,12 +217,6 @@ def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     if any(level != level for level in values):  # nan
         levels.append(nan)
     return np.array([places.get(level, len(levels) - 1) for level in values]), levels
-
-
-def _strength(means: NDArray[np.float64]) -> float:
-    """Return how far the means of combinations are from the sum of both main effects; nan if some are missing."""
-    rest = means - means.mean(axis=1, keepdims=True) - means.mean(axis=0, keepdims=True) + means.mean()
-    return float(np.sqrt((rest**2).mean()))
 
 
 # -- shares of the variance -----------------------------------------------------------------------

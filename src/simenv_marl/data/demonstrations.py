@@ -88,16 +88,14 @@ def record_dataset(
 
 def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]:
     """Return the name of each data set, by the key of its policy."""
-    if isinstance(dataset_id, str):
-        if len(policies) > 1:
-            raise OptionValueError(
-                f"{len(policies)} policies need a data set each: give a dict from their keys to names, not"
-                f" {dataset_id!r}"
-            )
+    if isinstance(dataset_id, str) and len(policies) == 1:
         return {next(iter(policies)): dataset_id}
     names = list(dataset_id.values()) if isinstance(dataset_id, Mapping) else []
     if not names or not all(isinstance(name, str) for name in names):
-        raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {short_repr(dataset_id)}")
+        raise OptionValueError(
+            f"dataset_id must be a name, or for {len(policies)} policies a dict from their keys to names, not"
+            f" {short_repr(dataset_id)}"
+        )
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
         raise OptionValueError(

@@ -177,7 +177,7 @@ Columns = Sequence[Sequence[Any]]
 
 def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     steps = [factor.steps(n) for factor in factors]
-    _checked_rows(prod(map(len, steps)))
+    _rows(prod(map(len, steps)))
     return list(zip(*product(*steps), strict=True))
 
 
@@ -246,7 +246,7 @@ def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> C
     if len(ranges) < 2:
         raise OptionValueError(f"a central composite design needs at least two ranges (low, high), not {len(ranges)}")
     levels = [factor.steps(None) for factor in lists]
-    number = _checked_rows((2 ** len(ranges) + 2 * len(ranges) + 1) * prod(map(len, levels)))
+    number = _rows((2 ** len(ranges) + 2 * len(ranges) + 1) * prod(map(len, levels)))
     if n is not None and n != number:
         raise OptionValueError(f"a central composite design of these {len(factors)} factors has {number} runs, not {n}")
     # The centre occurs once: a simulation with the same seed would have the same result.
@@ -276,7 +276,7 @@ def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     rows, names = _rows(n), [factor.name for factor in factors]
     if rows & (rows - 1):
         raise OptionValueError(f"the number of samples of a Saltelli design must be a power of two, not {rows}")
-    _checked_rows(rows * (2 * len(names) + 2))
+    _rows(rows * (2 * len(names) + 2))
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     return _spread(factors, import_extra("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
 
@@ -291,18 +291,15 @@ def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Colum
     return [list(column) for column in zip(*rows, strict=True)]
 
 
-def _rows(n: int | None) -> int:
-    if n is None:
+def _rows(number: int | None) -> int:
+    """Return the number of rows, which must be known and not too large."""
+    if number is None:
         raise OptionValueError("this method needs n, the number of rows")
-    return _checked_rows(n)
-
-
-def _checked_rows(rows: int) -> int:
-    if rows > MOST_ROWS:
+    if number > MOST_ROWS:
         raise OptionValueError(
-            f"the design would have {rows:,} rows, more than {MOST_ROWS:,}; choose another method or a smaller n"
+            f"the design would have {number:,} rows, more than {MOST_ROWS:,}; choose another method or a smaller n"
         )
-    return rows
+    return number
 
 
 def _spread(factors: Sequence[Factor], points: Any) -> Columns:

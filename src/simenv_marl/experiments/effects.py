@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from itertools import combinations
 from math import ceil, nan
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +19,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 __all__ = ["Effects", "effects", "sobol_indices"]
-
-MANY: Final = 8
-"""Numeric factors with more levels than this are grouped into ``GROUPS``."""
-
-GROUPS: Final = 4
-
-PAIRS: Final = 4
-"""The largest number of interactions that are drawn."""
-
-ABREAST: Final = 5
-"""The largest number of factors side by side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +58,8 @@ class Effects:
         ``figure`` and the result are as in ``plot_timeline``.
         """
         factors = list(self.levels)
-        pairs = [pair for pair, strength in self.interactions["strength"].items() if strength > 0][:PAIRS]
-        columns = min(max(len(factors), len(pairs)), ABREAST)
+        pairs = [pair for pair, strength in self.interactions["strength"].items() if strength > 0][:4]
+        columns = min(max(len(factors), len(pairs)), 5)  # more would be too small to read
         above = ceil(len(factors) / columns)
         with style("plot") as new_figure:
             if figure is None:
@@ -204,11 +193,11 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
 def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     """Return the place of each row's level, and the levels: numbers sorted, others as they appear, missing ones last.
 
-    Numeric factors with many values are grouped into quarters.
+    Numeric factors with more than eight values are grouped into quarters.
     """
     pandas = import_extra("pandas", "effects")
-    if column.nunique() > MANY and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
-        column = pandas.qcut(column, GROUPS, duplicates="drop")
+    if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
+        column = pandas.qcut(column, 4, duplicates="drop")
     values = column.tolist()
     levels = [level for level in dict.fromkeys(values) if level == level]
     if all(type(level) in (int, float, pandas.Interval) for level in levels):

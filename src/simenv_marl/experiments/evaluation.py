@@ -38,9 +38,6 @@ MOST_SEEDS: Final = 10_000_000
 LINES: Final = 200
 """The largest number of seeds that are drawn as lines."""
 
-WIDEST: Final = 14.0
-"""The largest width of a figure, in inches."""
-
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -156,7 +153,7 @@ class Evaluation:
         sizes = [len(names), len(others)] if others else [len(names)]
         with style("plot") as new_figure:
             if figure is None:
-                figure = new_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, WIDEST), 4.2)
+                figure = new_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, 14.0), 4.2)
             axes = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)[0]
             for row in values.to_numpy()[:LINES]:
                 axes[0].plot(range(len(names)), row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)

@@ -111,7 +111,24 @@ class Runner:
         if not isinstance(contenders, Mapping):
             raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
         for name, policies in contenders.items():
-            _check_contender(name, policies, batched=batched)
+            if not isinstance(name, str) or not name:
+                raise OptionValueError(f"the name of a contender must be a string, not {short_repr(name)}")
+            if not isinstance(policies, Mapping):
+                raise OptionValueError(
+                    f"the contender {name!r} must be a dict from agents or points to policies, {{}} for the model as"
+                    f" it is, not {short_repr(policies)}"
+                )
+            for key, policy in policies.items():
+                whose = f"the policy of {short_repr(key)} in {name!r}"
+                if policy is RULE:
+                    continue
+                if not callable(policy):
+                    raise OptionValueError(f"{whose} must be callable, not {short_repr(policy)}")
+                if not batched and takes_identities(policy):
+                    raise OptionValueError(
+                        f"{whose}, {short_repr(policy)}, answers many decisions at once, as mixtures do; pass"
+                        " batched=True, and only policies as simulate_many takes them"
+                    )
         if team is not None and not callable(team):
             raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
         if "policies" in options:
@@ -207,27 +224,6 @@ class Runner:
             return [*rows, (TEAM, float(value), sum(outcome.lengths.values()), *metrics)]
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
-
-
-def _check_contender(name: Any, policies: Any, *, batched: bool) -> None:
-    """Check the name and the policies of a contender. Policies that answer many decisions at once need ``batched``."""
-    if not isinstance(name, str) or not name:
-        raise OptionValueError(f"the name of a contender must be a string, not {short_repr(name)}")
-    if not isinstance(policies, Mapping):
-        raise OptionValueError(
-            f"the contender {name!r} must be a dict from agents or points to policies, {{}} for the model as it is,"
-            f" not {short_repr(policies)}"
-        )
-    for key, policy in policies.items():
-        if policy is not RULE and not callable(policy):
-            raise OptionValueError(
-                f"the policy of {short_repr(key)} in {name!r} must be callable, not {short_repr(policy)}"
-            )
-        if policy is not RULE and not batched and takes_identities(policy):
-            raise OptionValueError(
-                f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)}, answers many decisions at"
-                " once, as mixtures do; pass batched=True, and only policies as simulate_many takes them"
-            )
 
 
 class Tally:

@@ -38,9 +38,6 @@ __all__ = ["Variant", "run_experiment"]
 BY_RULE: Final = "rule"
 """The contender that is always present: the model as it is."""
 
-SHARE: Final = 16
-"""The number of parts of the work per process: few enough to cost nothing, enough for all to end together."""
-
 
 def run_experiment(
     make: Any,
@@ -129,7 +126,8 @@ def run_experiment(
     missing = [run for run in runs if run not in finished]
     with progress_bar(len(runs), "run", len(runs) - len(missing)) if progress else nullcontext() as bar:
         if workers and missing:
-            for number, _ in spread(_run_part, work, missing, int(workers), len(all_seeds) if batched else 1, SHARE):
+            least, share = len(all_seeds) if batched else 1, 16  # few parts cost nothing, many end together
+            for number, _ in spread(_run_part, work, missing, int(workers), least, share):
                 if bar is not None:
                     bar.update(number)
         elif missing:
@@ -254,23 +252,19 @@ def _make_frame(
     """Return the table of all runs, in the order of the design, the contenders and the seeds."""
     places: list[int] = []
     rows: list[tuple[Any, ...]] = []
-    for place, key in enumerate(keys):
-        for contender, seed in product(runner.contenders, seeds):
-            for row in _rows(runner, results.get((key, contender, seed), "its result is no longer stored")):
-                places.append(place)
-                rows.append((contender, seed, *row))
+    for (place, key), contender, seed in product(enumerate(keys), runner.contenders, seeds):
+        result = results.get((key, contender, seed), "its result is no longer stored")
+        own: list[tuple[Any, ...]] = []
+        if not isinstance(result, str):
+            try:
+                own = [(*row, "ok", None) for row in runner.rows(result)]
+            except Exception as error:  # raised by team=, which is called for stored runs, too
+                result = describe_error(error)
+        for row in own or [(TEAM, nan, 0, *[None] * len(runner.metrics), "error", result)]:
+            places.append(place)
+            rows.append((contender, seed, *row))
     factors = table.iloc[places].reset_index(drop=True)
     return factors.join(make_table((*RUN_COLUMNS, *runner.metrics, *STATUS_COLUMNS), rows))
-
-
-def _rows(runner: Runner, result: Result) -> list[tuple[Any, ...]]:
-    """Return agent, return, length, metrics, status and error for each agent and for the team."""
-    if not isinstance(result, str):
-        try:
-            return [(*row, "ok", None) for row in runner.rows(result)]
-        except Exception as error:  # raised by team=, which is called for stored runs, too
-            result = describe_error(error)
-    return [(TEAM, nan, 0, *[None] * len(runner.metrics), "error", result)]
 
 
 # -- variants -------------------------------------------------------------------------------------

@@ -93,7 +93,6 @@ def write_beside(axes: Axes, text: str, height: float, at: Any) -> None:
 
 def label_below(axes: Any, names: list[str]) -> None:
     """Write names below the axes, slanted if they would overlap, and draw a grid."""
-    axes.tick_params(labelsize=8, colors=INK, color=PALE)
     axes.grid(axis="y", color=ABSENT, linewidth=0.7)
     axes.set_axisbelow(True)
     axes.set_xticks(range(len(names)), names)

@@ -310,6 +310,8 @@ class Recorder:
         """Record the reward when an episode reaches its next decision or its end: see ``Watcher``."""
         if episode.pending is not None:
             _reward(episode.pending)
+        if not (episode.over or episode.just_ended):
+            return
         ended = [(agent, True, False) for agent in episode.just_ended]
         episode.just_ended = []
         if episode.over:

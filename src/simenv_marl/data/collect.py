@@ -71,7 +71,7 @@ def collect_episodes(
     policies = checked_policies(policies)
     plan = learners_plan(simulation, policies, points, options)
     arguments = ((simulation, policies, points, options), collect, int(batch_size))
-    parts: list[Part] = []
+    parts: list[tuple[list[Records], list[Any]]] = []
     with progress_bar(len(episodes)) if progress else nullcontext() as bar:
         if workers and episodes:
             for number, part in spread(_play, arguments, episodes, int(workers), int(batch_size)):
@@ -121,10 +121,6 @@ def _follow_rule(observations: Any) -> Any:
     return RULE
 
 
-Part = tuple[list[Records], list[Any]]
-"""The results of some episodes: the records by the place of their policy, and what ``collect`` returned."""
-
-
 def _play(
     arguments: tuple[Any, ...],
     collect: Callable[[Any], Any] | None,
@@ -132,8 +128,12 @@ def _play(
     episodes: list[tuple[int, int]],
     plan: Plan | None = None,
     bar: Any = None,
-) -> Part:
-    """Play episodes, which are pairs of number and seed. Without a plan, in a worker, it makes one."""
+) -> tuple[list[Records], list[Any]]:
+    """Play episodes, which are pairs of number and seed. Without a plan, in a worker, it makes one.
+
+    Returns:
+        The records, by the place of their policy, and what ``collect`` returned.
+    """
     plan = plan or learners_plan(*arguments)
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)

@@ -21,8 +21,6 @@ from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_re
 from .collect import LeftToRule, check_known, collect_episodes, follows_rule, policy_name
 from .trajectories import Trajectories
 
-__all__ = ["record_dataset", "save_dataset"]
-
 
 def record_dataset(
     dataset_id: str | Mapping[Any, str],

@@ -31,9 +31,6 @@ NAMED: Final = 12
 UNKNOWN: Final = "#BDBDBD"
 """The colour of decisions whose action is unknown."""
 
-REWARDS: Final = ("#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B")
-"""The scale of rewards, from the lowest to the highest."""
-
 ENDS: Final = {"x": "terminated", "|": "truncated"}
 """The marks of terminations and truncations."""
 
@@ -388,5 +385,5 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
     extend = ("neither", "min", "max", "both")[int(rewards.min() < -most) + 2 * int(rewards.max() > most)]
-    colours = LinearSegmentedColormap.from_list("reward", REWARDS)
+    colours = LinearSegmentedColormap.from_list("reward", ["#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B"])
     _colour_by_scale(axes, _cells(rows, slim=False), rewards, colours, (-most, most), extend)

@@ -194,12 +194,14 @@ class _DecisionLog:
     """
 
     def __init__(self, point: Point | None) -> None:
-        self.name = "" if point is None else point.point.name
-        self.observation_space = None if point is None else point.definition.observation_space
-        self.action_space = None if point is None else point.definition.action_space
-        self.stack_observations = _stacker(self.observation_space)
-        self.stack_actions = _stacker(self.action_space)
-        self.unknown_action = None if self.action_space is None else blank(self.action_space)
+        self.observation_space = self.action_space = None
+        self.stack_observations: Stacker = np.array
+        self.stack_actions: Stacker = np.array
+        if point is not None:
+            self.name, definition = point.point.name, point.definition
+            self.observation_space, self.action_space = definition.observation_space, definition.action_space
+            self.stack_observations, self.stack_actions = stacker(self.observation_space), stacker(self.action_space)
+            self.unknown_action = blank(self.action_space)
         # One entry for each batch.
         self.observations: list[Any] = []
         self.actions: list[Any] = []
@@ -356,11 +358,6 @@ def _reward(agent: Agent) -> None:
     log.elapsed[row] = agent.info.get("elapsed", nan)
     if agent.rule_action is not None:
         log.rule_actions[row], agent.rule_action = agent.rule_action, None
-
-
-def _stacker(space: spaces.Space[Any] | None) -> Stacker:
-    """Return the function that stacks elements of a space; of an unknown space there are none."""
-    return np.array if space is None else stacker(space)
 
 
 def _check_extras(batches: Sequence[Mapping[str, Any]]) -> None:

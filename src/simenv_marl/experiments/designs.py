@@ -19,8 +19,6 @@ from .runner import dtype_of
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["design"]
-
 MOST_ROWS: Final = 10_000_000
 """The largest number of rows. A larger design is considered a mistake."""
 

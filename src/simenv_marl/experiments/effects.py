@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from pandas import DataFrame
 
-__all__ = ["Effects", "effects", "sobol_indices"]
-
 
 @dataclass(frozen=True, eq=False)
 class Effects:

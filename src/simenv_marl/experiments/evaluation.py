@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from pandas import DataFrame, Series
 
-__all__ = ["Evaluation", "evaluate"]
-
 FIRST: Final = 16
 """The number of seeds before the first check of the intervals' width: intervals of fewer seeds are unreliable."""
 

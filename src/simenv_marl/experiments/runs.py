@@ -33,8 +33,6 @@ from .store import Provenance, Result, Run, Store, Writer, new_session, to_json
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["Variant", "run_experiment"]
-
 BY_RULE: Final = "rule"
 """The contender that is always present: the model as it is."""
 

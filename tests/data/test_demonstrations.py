@@ -15,7 +15,7 @@ from simenv_marl.data import (
     record_dataset,
     save_dataset,
 )
-from simenv_marl.data.rule import _random_numbers
+from simenv_marl.data.collect import _random_numbers
 from simenv_marl.errors import (
     DefinitionError,
     InvalidActionError,

@@ -1,9 +1,8 @@
 """Trajectories of many episodes, data sets, comparisons with the rule, and plots."""
 
-from .collect import collect_episodes
+from .collect import Comparison, Mixture, collect_episodes, compare_with_rule
 from .demonstrations import record_dataset, save_dataset
 from .plots import plot_returns
-from .rule import Comparison, Mixture, compare_with_rule
 from .timeline import plot_timeline
 from .trajectories import Trajectories
 

@@ -1,19 +1,30 @@
-"""Trajectories for learning: episodes of many simulations at once, with policies that answer in batches."""
+"""Episodes of many simulations at once: their trajectories for learning, mixtures of policies, and comparisons."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
-from typing import Any, Unpack
+from dataclasses import dataclass, replace
+from functools import partial
+from math import isfinite
+from typing import Any, Final, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
+from ..core.planner import PlannerPolicy, is_planner
 from ..core.points import Points
-from ..errors import DefinitionError
+from ..core.spaces import same
+from ..core.stacking import rows, stacker, taken
+from ..errors import DefinitionError, InvalidActionError, OptionValueError, short_repr
 from ..many.batch import BatchPolicy, PolicyKey, policy_keys, run
 from ..many.parallel import progress_bar, spread
 from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
 from ..simulation import RULE
-from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by
+from .trajectories import Recorder, Records, Trajectories, combine, is_answered_by, leaves
+
+SHADOW: Final = "shadow action"
+"""The extra in which the actions of the compared policies are recorded."""
 
 
 def collect_episodes(
@@ -58,20 +69,23 @@ def collect_episodes(
     check_numbers(batch_size, workers)
     check_collect(collect)
     policies = checked_policies(policies)
-    plan, keys = learners_plan(simulation, policies, points, options)
+    plan = learners_plan(simulation, policies, points, options)
+    arguments = ((simulation, policies, points, options), collect, int(batch_size))
+    parts: list[tuple[list[Records], list[Any]]] = []
     with progress_bar(len(episodes)) if progress else nullcontext() as bar:
-        parts = []
-        if not workers or not episodes:
-            parts.append(_play(plan, keys, collect, int(batch_size), episodes, bar))
-        else:
-            arguments = ((simulation, policies, points, options), collect, int(batch_size))
-            for number, part in spread(_play_part, arguments, episodes, int(workers), int(batch_size)):
+        if workers and episodes:
+            for number, part in spread(_play, arguments, episodes, int(workers), int(batch_size)):
                 parts.append(part)
                 if bar is not None:
                     bar.update(number)
+        else:
+            parts.append(_play(*arguments, episodes, plan, bar))
     all_seeds = tuple(seed for _, seed in episodes)
     collected = None if collect is None else tuple(value for _, values in parts for value in values)
-    return {key: combine([records[place] for records, _ in parts], all_seeds, collected) for key, place in keys.items()}
+    return {
+        key: combine([records[place] for records, _ in parts], all_seeds, collected)
+        for place, key in enumerate(policies)
+    }
 
 
 @dataclass(frozen=True)
@@ -82,57 +96,45 @@ class LeftToRule:
 
 
 def learners_plan(
-    simulation: Any,
-    policies: Mapping[Any, Any],
-    points: Any,
-    options: Mapping[str, Any],
-    *,
-    all_points: bool = False,
-) -> tuple[Plan, dict[Any, int]]:
-    """Return the plan of the episodes, and the place of each policy by its key.
+    simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any], *, all_points: bool = False
+) -> Plan:
+    """Return the plan of the episodes, in which a ``PolicyKey`` has the place of each policy.
 
     With ``all_points``, entities without a policy are agents as well, whose decisions follow the rule.
     """
-    left = [key for key, policy in policies.items() if isinstance(policy, LeftToRule)]
-    policies = {**policies, **{key: policies[key].policy for key in left}}
-    callables = {key: _follow_rule if policy is RULE else policy for key, policy in policies.items()}
-    entries = policy_keys(callables, rewarded=True)
-    keys = {key: entry.place for key, entry in entries.items() if isinstance(entry, PolicyKey)}
-    others = PolicyKey(len(entries), BatchPolicy(_follow_rule)) if all_points else None
-    options = {**options, "policies": entries}
+    callables = {key: policy.policy if isinstance(policy, LeftToRule) else policy for key, policy in policies.items()}
+    callables = {key: _follow_rule if policy is RULE else policy for key, policy in callables.items()}
+    options = {**options, "policies": policy_keys(callables, rewarded=True)}
+    others = PolicyKey(len(policies), BatchPolicy(_follow_rule)) if all_points else None
     plan = Plan(simulation, points, options, unattended=True, rewarded=True, others=others)
-    for key in left:
-        for point in plan.points:
-            if point.report is None and is_answered_by(plan, point, keys[key]):
+    for place, policy in enumerate(policies.values()):
+        for point in plan.points if isinstance(policy, LeftToRule) else ():
+            if point.report is None and is_answered_by(plan, point, place):
                 raise DefinitionError(
                     f"the actions of the rule of {point.point.name} are not known; give its make_step a"
                     " rule_action_mapping, which maps the rule's decision to an action"
                 )
-    return plan, keys
+    return plan
 
 
 def _follow_rule(observations: Any) -> Any:
     return RULE
 
 
-Part = tuple[dict[int, Records], list[Any]]
-"""The results of some episodes: the records by the place of their policy, and what ``collect`` returned."""
-
-
-def _play_part(arguments: tuple[Any, ...], collect: Any, batch_size: int, episodes: list[tuple[int, int]]) -> Part:
-    """Play a part of the episodes, in a worker process."""
-    return _play(*learners_plan(*arguments), collect, batch_size, episodes, None)
-
-
 def _play(
-    plan: Plan,
-    keys: Mapping[Any, int],
+    arguments: tuple[Any, ...],
     collect: Callable[[Any], Any] | None,
     batch_size: int,
     episodes: list[tuple[int, int]],
-    bar: Any,
-) -> Part:
-    """Play episodes, which are pairs of number and seed, in this process."""
+    plan: Plan | None = None,
+    bar: Any = None,
+) -> tuple[list[Records], list[Any]]:
+    """Play episodes, which are pairs of number and seed. Without a plan, in a worker, it makes one.
+
+    Returns:
+        The records, by the place of their policy, and what ``collect`` returned.
+    """
+    plan = plan or learners_plan(*arguments)
     recorder = Recorder(episodes[0][0] if episodes else 0)
     collected: list[Any] = [None] * len(episodes)
 
@@ -143,4 +145,247 @@ def _play(
             bar.update()
 
     run(plan, [seed for _, seed in episodes], batch_size, finish, recorder)
-    return recorder.records(plan, keys), collected
+    _, policies, *_ = arguments
+    return recorder.records(plan, policies), collected
+
+
+# -- mixtures -------------------------------------------------------------------------------------
+
+
+class Mixture:
+    """A policy for ``collect_episodes`` that draws, for each decision, which of several policies answers it.
+
+    The draw depends only on the seed of the episode and the number of the decision in it. It does not depend on other
+    simulations or on the number of processes. ``extras["component"]`` has the index of the policy that decided; the
+    extras of the policies themselves are dropped.
+
+    Example:
+        ``Mixture({RULE: 0.8, trained: 0.2})``
+    """
+
+    def __init__(self, parts: Mapping[Any, float] | Iterable[tuple[Any, float]]) -> None:
+        """Mix policies.
+
+        Args:
+            parts: A dict from policy to weight, or an iterable of such pairs. A policy is anything that
+                ``collect_episodes`` takes. Weights are not negative and need not sum to one.
+
+        Raises:
+            OptionValueError: There are no policies, or a weight is invalid.
+        """
+        pairs = list(parts.items() if isinstance(parts, Mapping) else parts)
+        if not pairs or any(not isinstance(pair, tuple) or len(pair) != 2 for pair in pairs):
+            raise OptionValueError(
+                f"a mixture needs a dict from policies to weights, or pairs of these, not {short_repr(parts)}"
+            )
+        for policy, weight in pairs:
+            if policy is not RULE and not callable(policy):
+                raise OptionValueError(
+                    f"a mixture consists of policies, callables or RULE, not of {short_repr(policy)}"
+                )
+            if is_planner(policy):
+                raise OptionValueError(f"{short_repr(policy)} asks for the environment, which a mixture does not have")
+            number = isinstance(weight, (int, float)) and not isinstance(weight, bool)
+            if not number or not isfinite(weight) or weight < 0:
+                raise OptionValueError(
+                    f"the weight of {short_repr(policy)} must be a number that is not negative, not"
+                    f" {short_repr(weight)}"
+                )
+        weights = np.array([weight for _, weight in pairs], np.float64)
+        if not weights.sum() > 0:
+            raise OptionValueError("at least one weight of a mixture must be positive")
+        self.policies: tuple[Any, ...] = tuple(policy for policy, _ in pairs)
+        self.weights: NDArray[np.float64] = weights / weights.sum()
+        self._bounds = np.cumsum(self.weights)[:-1]
+        self._batch_policies = [None if policy is RULE else BatchPolicy(policy) for policy in self.policies]
+
+    def __repr__(self) -> str:
+        parts = zip(self.policies, self.weights.tolist(), strict=True)
+        return f"<Mixture: {', '.join(f'{weight:.3g} {policy_name(policy)}' for policy, weight in parts)}>"
+
+    def __call__(self, observations: Any, infos: Sequence[Any], identities: Sequence[tuple[int, int]]) -> Any:
+        """Answer a batch of decisions, as policies of ``collect_episodes`` do."""
+        component = np.searchsorted(self._bounds, _random_numbers(identities), side="right")
+        actions: list[Any] = [RULE] * len(identities)
+        for number, batch_policy in enumerate(self._batch_policies):
+            own = np.flatnonzero(component == number)
+            if batch_policy is None or not len(own):
+                continue
+            places = own.tolist()
+            arguments = taken(observations, own), [infos[row] for row in places], [identities[row] for row in places]
+            for row, action in zip(places, _ask(self.policies[number], batch_policy, *arguments), strict=True):
+                actions[row] = action
+        return actions, {"component": component}
+
+
+def _random_numbers(identities: Sequence[tuple[int, int]]) -> NDArray[np.float64]:
+    """Return a number in [0, 1) for each decision, which depends on its identity alone."""
+    # SplitMix64, twice: to make a generator for each decision would take longer than the decision.
+    seeds = np.array([seed % 2**64 for seed, _ in identities], np.uint64)
+    turns = np.array([turn for _, turn in identities], np.uint64)
+    return np.asarray((_splitmix(_splitmix(seeds) + turns) >> np.uint64(11)) * 2.0**-53, np.float64)
+
+
+def _splitmix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state ^ (state >> np.uint64(31))
+
+
+# -- comparisons ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The decisions of the model's own rule, and what a policy would have decided. Made by ``compare_with_rule``.
+
+    Attributes:
+        trajectories: The trajectories of the rule.
+        policy_actions: The actions that the policy would have taken on the same observations, in the form of
+            ``trajectories.actions``. Where the policy would have left the decision to the rule, the rule's action.
+        agreements: ``(N,)`` bool: whether both agree, for each decision.
+    """
+
+    trajectories: Trajectories
+    policy_actions: Any
+    agreements: NDArray[np.bool_]
+
+    @property
+    def agreement(self) -> float:
+        """The share of decisions in which both agree, 0 to 1; nan if there are no decisions."""
+        return float(self.agreements.mean()) if len(self.agreements) else float("nan")
+
+    def __repr__(self) -> str:
+        return f"<Comparison: agreement {self.agreement:.3f} in {len(self.agreements)} decisions>"
+
+
+def compare_with_rule(
+    simulation: Any,
+    policies: Mapping[Any, Any],
+    *,
+    seeds: Iterable[int],
+    points: Points = None,
+    others: Mapping[Any, Any] | None = None,
+    tolerance: float = 0.0,
+    **options: Unpack[EpisodeOptions],
+) -> dict[Any, Comparison]:
+    """Let the model's own rule decide, and record what policies would have decided instead.
+
+    At each decision the policy gets what it would get if it decided; then the rule decides. So the episodes are those
+    of the plain model, unless ``others`` names policies that decide.
+
+    Args:
+        simulation: As ``simulate_many`` takes it.
+        policies: The policies to compare, as ``collect_episodes`` takes them. Their actions may be illegal.
+        seeds: As ``simulate_many`` takes them.
+        points: As ``simulate_many`` takes them.
+        others: Policies that decide instead of the rule, as ``collect_episodes`` takes policies. They are not compared.
+        tolerance: The largest difference between numbers in two actions that agree. It applies to ``Box`` spaces of
+            floats.
+        **options: As ``collect_episodes`` takes them.
+
+    Returns:
+        A dict from each key of ``policies`` to its comparison.
+
+    Raises:
+        DefinitionError: The actions that correspond to the rule's decisions are unknown.
+        OptionValueError: An argument has an invalid value.
+        BaseException: All other errors are those of ``collect_episodes``.
+    """
+    if not isinstance(policies, Mapping) or not all(callable(policy) for policy in policies.values()):
+        raise OptionValueError(
+            f"policies must be a dict from agents or points to callables, not {short_repr(policies)}"
+        )
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance >= 0:
+        raise OptionValueError(f"tolerance must be a number that is not negative, not {short_repr(tolerance)}")
+    if others is not None and (not isinstance(others, Mapping) or others.keys() & policies.keys()):
+        raise OptionValueError(
+            "others must be a dict of policies for agents or points that policies does not name, not"
+            f" {short_repr(others)}"
+        )
+    shadows: dict[int, Any] = {}  # policies that record an action; one for each, so that keys share batches
+    for policy in policies.values():
+        shadows[id(policy)] = partial(_record, policy, BatchPolicy(policy))
+        if is_planner(policy):
+            shadows[id(policy)] = partial(_record_one, PlannerPolicy(policy))
+    deciding = {key: LeftToRule(shadows[id(policy)]) for key, policy in policies.items()}
+    collected = collect_episodes(simulation, {**deciding, **(others or {})}, seeds=seeds, points=points, **options)
+    return {key: _compare(collected[key], float(tolerance)) for key in policies}
+
+
+def _record(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> Any:
+    """Record the actions of a policy as an extra, and leave the decisions to the rule."""
+    actions = _ask(policy, batch_policy, observations, infos, identities)
+    return RULE, {SHADOW: np.fromiter(actions, object, len(actions))}
+
+
+def _record_one(policy: PlannerPolicy, observation: Any, info: Any, *, _environment: Any) -> Any:
+    recorded = np.empty((), object)
+    recorded[()] = policy.answer(observation, info, _environment)
+    return RULE, {SHADOW: recorded}
+
+
+def _compare(found: Trajectories, tolerance: float) -> Comparison:
+    """Compare the rule's actions with those that a shadow has recorded."""
+    recorded = found.extras.get(SHADOW, ())
+    found = replace(found, extras={name: values for name, values in found.extras.items() if name != SHADOW})
+    if not len(found):
+        return Comparison(found, found.actions, np.zeros(0, np.bool_))
+    check_known(found)
+    assert found.action_space is not None
+    actions = [taken(found.actions, np.array(row)) if action is RULE else action for row, action in enumerate(recorded)]
+    policy_actions = stacker(found.action_space)(actions)
+    pairs = zip(leaves(found.actions), leaves(policy_actions), strict=True)
+    agreements = [_agreements(one, other, tolerance) for (_, one), (_, other) in pairs]
+    return Comparison(found, policy_actions, np.all(agreements, axis=0))
+
+
+def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+    """Return in which rows two arrays agree."""
+    if one.dtype == object:
+        return np.array([same(*pair) for pair in zip(one, other, strict=True)], np.bool_)
+    equal = np.abs(one - other) <= tolerance if one.dtype.kind == "f" else one == other
+    return np.asarray(equal.reshape(len(one), -1).all(axis=1), np.bool_)
+
+
+# -- policies and their answers -------------------------------------------------------------------
+
+
+def _ask(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> list[Any]:
+    """Ask a policy for one action for each decision, and drop the extras."""
+    number, answers = len(identities), batch_policy.answers(observations, infos, identities)
+    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
+        answers = answers[0]
+    actions = [RULE] * number if answers is RULE else rows(answers, integers=False)
+    if actions is None or len(actions) != number:
+        returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
+        raise InvalidActionError(
+            f"{short_repr(policy)} was asked for {number} decisions at once and returned {returned}; it must return"
+            " one action for each row of the observations, in their order"
+        )
+    return actions
+
+
+def policy_name(policy: Any) -> str:
+    """Return the name of a policy."""
+    return "rule" if policy is RULE else str(getattr(policy, "__qualname__", None) or short_repr(policy))
+
+
+def follows_rule(policy: Any) -> bool:
+    """Return whether a policy certainly leaves decisions to the rule."""
+    if isinstance(policy, Mixture):
+        return any(follows_rule(part) for part, weight in zip(policy.policies, policy.weights, strict=True) if weight)
+    return policy is RULE
+
+
+def check_known(found: Trajectories) -> None:
+    """Check that the action of each decision is known, also of those that were left to the rule."""
+    unknown = np.flatnonzero(~found.known)
+    if len(unknown):
+        agent, seed = found.names[found.agents[unknown[0]]], found.seeds[found.episodes[unknown[0]]]
+        raise DefinitionError(
+            f"in {len(unknown)} of {len(found)} decisions the action of the rule is not known, first for {agent!r} at"
+            f" turn {found.turns[unknown[0]]} of the episode of seed {seed}; its decision point needs a"
+            " rule_action_mapping that returns an action for every decision of the rule"
+        )

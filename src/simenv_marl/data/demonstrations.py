@@ -18,11 +18,8 @@ from ..core.points import Points
 from ..core.provenance import provenance
 from ..core.stacking import joined, taken
 from ..errors import MissingExtraError, OptionValueError, did_you_mean, short_repr
-from .collect import LeftToRule, collect_episodes
-from .rule import check_known, follows_rule, policy_name
+from .collect import LeftToRule, check_known, collect_episodes, follows_rule, policy_name
 from .trajectories import Trajectories
-
-__all__ = ["record_dataset", "save_dataset"]
 
 
 def record_dataset(
@@ -69,41 +66,34 @@ def record_dataset(
     if not isinstance(policies, Mapping) or not policies:
         raise OptionValueError(f"policies must be a dict from agents or points to policies, not {short_repr(policies)}")
     names = _dataset_ids(dataset_id, policies)
-    for name in names.values():
-        _free_path(name)
+    paths = {key: _free_path(name) for key, name in names.items()}
     left = {key: LeftToRule(policies[key]) for key in names if follows_rule(policies[key])}
     sizes: dict[str, Any] = {"batch_size": batch_size, "workers": workers, "progress": progress}
     collected = collect_episodes(simulation, {**policies, **left}, seeds=seeds, points=points, **sizes, **options)
-    for key, name in names.items():
-        _check_writable(name, collected[key])
     origin = provenance(simulation, points, **options)
-    written, begun = {}, list[Path]()
+    written: dict[Any, Any] = {}
     try:
         for key, name in names.items():
-            begun.append(_free_path(name))
-            written[key] = save_dataset(
-                name, collected[key], **{"algorithm_name": policy_name(policies[key]), **(metadata or {})}
-            )
+            described = {"algorithm_name": policy_name(policies[key]), **(metadata or {})}
+            written[key] = save_dataset(name, collected[key], **described)
             written[key].storage.update_metadata({"provenance": origin})
     except BaseException:
-        for path in begun:
-            shutil.rmtree(path, ignore_errors=True)  # all of them or none
+        for key in written:
+            shutil.rmtree(paths[key], ignore_errors=True)  # all of them or none
         raise
     return written if isinstance(dataset_id, Mapping) else next(iter(written.values()))
 
 
 def _dataset_ids(dataset_id: Any, policies: Mapping[Any, Any]) -> dict[Any, str]:
     """Return the name of each data set, by the key of its policy."""
-    if isinstance(dataset_id, str):
-        if len(policies) > 1:
-            raise OptionValueError(
-                f"{len(policies)} policies need a data set each: give a dict from their keys to names, not"
-                f" {dataset_id!r}"
-            )
+    if isinstance(dataset_id, str) and len(policies) == 1:
         return {next(iter(policies)): dataset_id}
     names = list(dataset_id.values()) if isinstance(dataset_id, Mapping) else []
     if not names or not all(isinstance(name, str) for name in names):
-        raise OptionValueError(f"dataset_id must be a name, or a dict of names, not {short_repr(dataset_id)}")
+        raise OptionValueError(
+            f"dataset_id must be a name, or for {len(policies)} policies a dict from their keys to names, not"
+            f" {short_repr(dataset_id)}"
+        )
     unknown = [key for key in dataset_id if key not in policies]
     if unknown:
         raise OptionValueError(
@@ -145,7 +135,11 @@ def save_dataset(dataset_id: str, trajectories: Trajectories, **metadata: Any) -
             f" key, not {short_repr(trajectories)}"
         )
     path = _free_path(dataset_id)
-    _check_writable(dataset_id, trajectories)
+    if not len(trajectories):
+        raise OptionValueError(
+            f"there is nothing to write to {short_repr(dataset_id)}: no agent has decided in any episode"
+        )
+    check_known(trajectories)
     import minari
 
     try:
@@ -193,20 +187,23 @@ def _free_path(name: str) -> Path:
     return path
 
 
-def _check_writable(name: str, found: Trajectories) -> None:
-    """Check that there are decisions to write, and that their actions are known."""
-    if not len(found):
-        raise OptionValueError(f"there is nothing to write to {short_repr(name)}: no agent has decided in any episode")
-    check_known(found)
-
-
 def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
     """Make a Minari episode buffer of each trajectory."""
-    number = len(found.starts)
+    number, lasts = len(found.starts), found.starts + found.lengths - 1
     # The rows of the ends follow those of the decisions.
-    columns = {"observations": joined([found.observations, found.last_observations]), "infos": _infos(found, number)}
-    for place, (start, length) in enumerate(zip(found.starts, found.lengths, strict=True)):
-        rows = np.arange(start, start + length)
+    infos: dict[str, Any] = {"by_rule": _extend(found.by_rule, number, False)}
+    if isinstance(found.action_masks, tuple):
+        infos["action_mask"] = {str(place): _extend(mask, number, 1) for place, mask in enumerate(found.action_masks)}
+    elif found.action_masks is not None:
+        infos["action_mask"] = _extend(found.action_masks, number, 1)
+    if found.times is not None and found.elapsed is not None:
+        infos["time"] = np.append(found.times, found.times[lasts] + found.elapsed[lasts])
+    for name, values in found.extras.items():
+        if values.dtype.kind in "biufc":
+            infos.setdefault(name, _extend(values, number, 0))
+    columns = {"observations": joined([found.observations, found.last_observations]), "infos": infos}
+    for place, (start, last) in enumerate(zip(found.starts, lasts, strict=True)):
+        rows = np.arange(start, last + 1)
         seed = found.seeds[found.episodes[start]]
         own = taken(columns, np.append(rows, len(found) + place))
         yield buffer(
@@ -218,22 +215,6 @@ def _episodes(found: Trajectories, buffer: Any) -> Iterator[Any]:
             truncations=found.truncations[rows],
             infos=own["infos"],
         )
-
-
-def _infos(found: Trajectories, ends: int) -> dict[str, Any]:
-    """Return the infos by name: the rows of the decisions, and behind them those of the ends."""
-    infos: dict[str, Any] = {"by_rule": _extend(found.by_rule, ends, False)}
-    if isinstance(found.action_masks, tuple):
-        infos["action_mask"] = {str(place): _extend(mask, ends, 1) for place, mask in enumerate(found.action_masks)}
-    elif found.action_masks is not None:
-        infos["action_mask"] = _extend(found.action_masks, ends, 1)
-    if found.times is not None and found.elapsed is not None:
-        last = found.starts + found.lengths - 1
-        infos["time"] = np.append(found.times, found.times[last] + found.elapsed[last])
-    for name, values in found.extras.items():
-        if values.dtype.kind in "biufc":
-            infos.setdefault(name, _extend(values, ends, 0))
-    return infos
 
 
 def _extend(values: NDArray[Any], number: int, filler: Any) -> NDArray[Any]:

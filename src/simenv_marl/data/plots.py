@@ -54,19 +54,18 @@ def style(what: str) -> Iterator[Any]:
     make = import_extra("matplotlib.figure", what).Figure
 
     def new_figure(width: float, height: float) -> Any:
-        figure: Any = make(figsize=(width, height), layout="constrained")
-        figure._repr_png_ = lambda: _png(figure)  # for notebooks in which Matplotlib has not registered figures
+        figure = make(figsize=(width, height), layout="constrained")
+
+        def image() -> bytes:
+            buffer = BytesIO()
+            figure.savefig(buffer, format="png", dpi=100)
+            return buffer.getvalue()
+
+        figure._repr_png_ = image  # for notebooks in which Matplotlib has not registered figures
         return figure
 
     with rc_context(STYLE):
         yield new_figure
-
-
-def _png(figure: Figure) -> bytes:
-    """Return the image of a figure for a notebook."""
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    return buffer.getvalue()
 
 
 def by_key(trajectories: Any) -> Mapping[Any, Trajectories]:
@@ -90,6 +89,17 @@ def title_of(key: Any) -> str:
 def write_beside(axes: Axes, text: str, height: float, at: Any) -> None:
     """Write text to the right of axes."""
     axes.annotate(text, (1.0, height), (6, 0), at, "offset points", va="center", fontsize=8.5, annotation_clip=False)
+
+
+def label_below(axes: Any, names: list[str]) -> None:
+    """Write names below the axes, slanted if they would overlap, and draw a grid."""
+    axes.grid(axis="y", color=ABSENT, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.set_xticks(range(len(names)), names)
+    inches = axes.get_subplotspec().get_position(axes.figure).width * axes.figure.bbox.width / axes.figure.dpi
+    if sum(len(name) + 2 for name in names) * 0.075 > inches:  # the average width of a letter
+        for label in axes.get_xticklabels():
+            label.set(rotation=30, ha="right", rotation_mode="anchor")
 
 
 # -- many episodes --------------------------------------------------------------------------------

@@ -31,9 +31,6 @@ NAMED: Final = 12
 UNKNOWN: Final = "#BDBDBD"
 """The colour of decisions whose action is unknown."""
 
-REWARDS: Final = ("#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B")
-"""The scale of rewards, from the lowest to the highest."""
-
 ENDS: Final = {"x": "terminated", "|": "truncated"}
 """The marks of terminations and truncations."""
 
@@ -115,14 +112,14 @@ def plot_timeline(
         raise OptionValueError(
             f"there is nothing to draw of episode {number} (seed {seeds[number]}): no agent has decided in it"
         )
-    rows = [row for key, found in deciding.items() for row in _rows(key, found, _names(key, action_names), number)]
+    rows = [row for key, found in deciding.items() for row in _rows(key, found, action_names, number)]
     if agents is not None:
         rows = _choose(rows, agents, number)
     begin, end = min(row.times[0] for row in rows), max(row.end for row in rows)
     with style("plot_timeline") as new_figure:
         make = new_figure if figure is None else lambda width, height: figure
         charts = len(rows) <= CHARTED
-        columns = _draw_charts(rows, make, begin, end) if charts else _draw_panels(_panels(rows), make, component)
+        columns = _draw_charts(rows, make, begin, end) if charts else _draw_panels(rows, make, component)
         margin = (0.02 if charts else 0.01) * (end - begin or 1.0)
         clock = all(found.times is not None for found in deciding.values())
         for column in columns:
@@ -137,29 +134,23 @@ def plot_timeline(
 # -- what is drawn --------------------------------------------------------------------------------
 
 
-def _names(key: Any, action_names: Any) -> Mapping[Any, Any]:
-    """Return the names of the actions of one policy."""
+def _components(key: Any, found: Trajectories, action_names: Any) -> dict[str, _Component]:
+    """Split the actions of a policy into their components, by name. Some actions may be unknown."""
     if isinstance(action_names, Mapping) and not isinstance(action_names.get(key, ""), str):
         action_names = action_names[key]
-    if action_names is None or isinstance(action_names, Mapping):
-        return action_names or {}
-    if isinstance(action_names, (str, bytes)) or not isinstance(action_names, Sequence):
+    if isinstance(action_names, (str, bytes)) or not isinstance(action_names, (Mapping, Sequence, type(None))):
         raise OptionValueError(f"action_names must be a sequence or a dict of names, not {short_repr(action_names)}")
-    return dict(enumerate(action_names))
-
-
-def _components(found: Trajectories, names: Mapping[Any, Any]) -> dict[str, _Component]:
-    """Split the actions of a policy into their components, by name. Some actions may be unknown."""
+    given = action_names if isinstance(action_names, Mapping) else dict(enumerate(action_names or ()))
     components = {}
     for part, array in leaves(found.actions):
-        own_names = names
+        names = given
         if array.dtype == object:  # values without a shape are distinguished by their text
             texts, array = np.unique([str(action) for action in array], return_inverse=True)
-            own_names = {code: text if len(text) < 20 else f"{text[:18]}…" for code, text in enumerate(texts)}
+            names = {code: text if len(text) < 20 else f"{text[:18]}…" for code, text in enumerate(texts)}
         values = array.reshape(len(array), -1)
         known = values[found.known]
         distinct = np.unique(known).tolist() if values.dtype.kind in "iub" else []
-        labels = {int(value): str(own_names.get(value, int(value))) for value in distinct}
+        labels = {int(value): str(names.get(value, int(value))) for value in distinct}
         finite = known[np.isfinite(known)]
         limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
         for place, column in enumerate(values.T):
@@ -168,9 +159,9 @@ def _components(found: Trajectories, names: Mapping[Any, Any]) -> dict[str, _Com
     return components
 
 
-def _rows(key: Any, found: Trajectories, names: Mapping[Any, Any], episode: int) -> Iterator[TimelineRow]:
+def _rows(key: Any, found: Trajectories, action_names: Any, episode: int) -> Iterator[TimelineRow]:
     """Yield the row of each agent that a policy answered for in the episode."""
-    actions = _components(found, names)
+    actions = _components(key, found, action_names)
     for place in np.flatnonzero(found.episodes[found.starts] == episode):
         start, last = int(found.starts[place]), int(found.starts[place] + found.lengths[place]) - 1
         rows = slice(start, last + 1)
@@ -204,15 +195,6 @@ def _choose(rows: Sequence[TimelineRow], agents: Any, episode: int) -> list[Time
                 f" {', '.join(list(by_name)[:20])}{' and others' if len(by_name) > 20 else ''}"
             )
     return [by_name[name] for name in dict.fromkeys(agents)]
-
-
-def _panels(rows: list[TimelineRow]) -> list[list[TimelineRow]]:
-    """Group the rows by policy; make one group of them if there are many policies with like actions."""
-    keys = list(dict.fromkeys(row.key for row in rows))
-    kinds = {tuple((name, own.labels is None) for name, own in row.actions.items()) for row in rows}
-    if len(keys) <= CHARTED or len(kinds) > 1:
-        return [[row for row in rows if row.key == key] for key in keys]
-    return [sorted(rows, key=lambda row: row.times[0])]
 
 
 def _mark_legend(axes: Axes, rows: Sequence[TimelineRow], *, charts: bool) -> None:
@@ -300,8 +282,13 @@ def _chart_actions(axes: Axes, row: TimelineRow, part: str) -> None:
 # -- many agents: rows of colours -----------------------------------------------------------------
 
 
-def _draw_panels(panels: list[list[TimelineRow]], make: Callable[..., Any], component: str | None) -> list[list[Any]]:
+def _draw_panels(agents: list[TimelineRow], make: Callable[..., Any], component: str | None) -> list[list[Any]]:
     """Draw a row for each agent, coloured by its actions and by its rewards; return the axes in two columns."""
+    keys = list(dict.fromkeys(row.key for row in agents))
+    kinds = {tuple((name, own.labels is None) for name, own in row.actions.items()) for row in agents}
+    panels = [[row for row in agents if row.key == key] for key in keys]
+    if len(keys) > CHARTED and len(kinds) == 1:  # many policies with like actions share a panel
+        panels = [sorted(agents, key=lambda row: row.times[0])]
     every = dict.fromkeys(name for rows in panels for name in rows[0].actions)
     if component is not None and component not in every:
         raise OptionValueError(
@@ -360,9 +347,10 @@ def _colour(axes: Axes, cells: NDArray[np.float64], **colours: Any) -> Any:
     return axes.add_collection(PolyCollection(list(cells), linewidths=0, rasterized=len(cells) > 4000, **colours))
 
 
-def _colour_bar(axes: Axes, scale: Any, extend: str) -> None:
-    """Draw the scale of colours beside axes."""
-    bar = axes.figure.colorbar(scale, ax=axes, extend=extend, fraction=0.04, pad=0.01, aspect=30)
+def _colour_by_scale(axes: Axes, cells: Any, values: Any, scale: Any, limits: tuple[float, float], extend: str) -> None:
+    """Draw cells in the colours of their values, and the scale beside the axes."""
+    drawn = _colour(axes, cells, array=values, cmap=scale, clim=limits)
+    bar = axes.figure.colorbar(drawn, ax=axes, extend=extend, fraction=0.04, pad=0.01, aspect=30)
     bar.outline.set_visible(False)
 
 
@@ -380,8 +368,7 @@ def _colour_actions(axes: Axes, rows: Sequence[TimelineRow], name: str) -> None:
     labels = {value: label for own in components for value, label in (own.labels or {}).items()}
     if not 0 < len(labels) <= NAMED:
         limits = min(own.limits[0] for own in components), max(own.limits[1] for own in components)
-        scale = _colour(axes, cells[known], array=values[known].astype(float), cmap="viridis", clim=limits)
-        _colour_bar(axes, scale, "neither")
+        _colour_by_scale(axes, cells[known], values[known].astype(float), "viridis", limits, "neither")
         return
     inside = all(0 <= action < len(COLOURS) for action in labels)
     colours = {action: COLOURS[action if inside else rank] for rank, action in enumerate(sorted(labels))}
@@ -398,6 +385,5 @@ def _colour_rewards(axes: Axes, rows: Sequence[TimelineRow]) -> None:
     # So that a few large rewards do not make all others pale.
     most = float(np.quantile(np.abs(rewards), 0.99)) or float(np.abs(rewards).max()) or 1.0
     extend = ("neither", "min", "max", "both")[int(rewards.min() < -most) + 2 * int(rewards.max() > most)]
-    colours = LinearSegmentedColormap.from_list("reward", REWARDS)
-    scale = _colour(axes, _cells(rows, slim=False), array=rewards, cmap=colours, clim=(-most, most))
-    _colour_bar(axes, scale, extend)
+    colours = LinearSegmentedColormap.from_list("reward", ["#7F3B08", "#E08214", "#FFFFFF", "#8073AC", "#2D004B"])
+    _colour_by_scale(axes, _cells(rows, slim=False), rewards, colours, (-most, most), extend)

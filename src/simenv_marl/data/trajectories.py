@@ -4,7 +4,7 @@ While the episodes run, a ``Recorder`` keeps a log for each group of decisions, 
 get the same rows sorted by policy, episode, agent and step, independent of that order.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from math import nan
@@ -118,12 +118,9 @@ class Trajectories:
     @cached_property
     def next_observations(self) -> Any:
         """``(N, *shape)``: the agent's next observation, at its next decision or its end."""
-        if not len(self):
-            return self.observations
-        number = len(self)
-        following = np.arange(1, number + 1)
-        following[self.starts[1:] - 1] = number + np.arange(len(self.starts) - 1)
-        following[-1] = number + len(self.starts) - 1
+        ends = self.starts + self.lengths - 1
+        following = np.arange(1, len(self) + 1)
+        following[ends] = len(self) + np.arange(len(ends))  # the last observations lie behind all others
         return taken(joined([self.observations, self.last_observations]), following)
 
 
@@ -197,12 +194,14 @@ class _DecisionLog:
     """
 
     def __init__(self, point: Point | None) -> None:
-        self.name = "" if point is None else point.point.name
-        self.observation_space = None if point is None else point.definition.observation_space
-        self.action_space = None if point is None else point.definition.action_space
-        self.stack_observations = _stacker(self.observation_space)
-        self.stack_actions = _stacker(self.action_space)
-        self.unknown_action = None if self.action_space is None else blank(self.action_space)
+        self.observation_space = self.action_space = None
+        self.stack_observations: Stacker = np.array
+        self.stack_actions: Stacker = np.array
+        if point is not None:
+            self.name, definition = point.point.name, point.definition
+            self.observation_space, self.action_space = definition.observation_space, definition.action_space
+            self.stack_observations, self.stack_actions = stacker(self.observation_space), stacker(self.action_space)
+            self.unknown_action = blank(self.action_space)
         # One entry for each batch.
         self.observations: list[Any] = []
         self.actions: list[Any] = []
@@ -313,17 +312,23 @@ class Recorder:
         """Record the reward when an episode reaches its next decision or its end: see ``Watcher``."""
         if episode.pending is not None:
             _reward(episode.pending)
-        for agent in episode.just_ended:
-            _end(agent, episode.turns, terminated=True, truncated=False)
+        if not (episode.over or episode.just_ended):
+            return
+        ended = [(agent, True, False) for agent in episode.just_ended]
         episode.just_ended = []
         if episode.over:
-            for agent in episode.agents.values():
-                _end(agent, episode.turns, terminated=episode.terminated, truncated=episode.truncated)
+            ended += [(agent, episode.terminated, episode.truncated) for agent in episode.agents.values()]
+        for agent, terminated, truncated in ended:
+            _reward(agent)
+            trajectory: _TrajectoryLog | None = agent.notes
+            if trajectory is not None:
+                trajectory.last_observation, trajectory.last_turn = agent.observation, episode.turns
+                trajectory.terminated, trajectory.truncated = terminated, truncated
 
-    def records(self, plan: Plan, keys: Mapping[Any, int]) -> dict[int, Records]:
-        """Return the records by the place of their policy, from the places by key."""
-        records = {}
-        for key, place in keys.items():
+    def records(self, plan: Plan, keys: Iterable[Any]) -> list[Records]:
+        """Return the records of each policy, in the order of the policies, which have these keys."""
+        records = []
+        for place, key in enumerate(keys):
             logs = [log for log in self._logs.values() if place in log.trajectories]
             if len(logs) > 1:
                 raise AgentError(
@@ -333,7 +338,7 @@ class Recorder:
             if not logs:
                 point = next((point for point in plan.points if is_answered_by(plan, point, place)), None)
                 logs = [_DecisionLog(point)]
-            records[place] = logs[0].records(place)
+            records.append(logs[0].records(place))
         return records
 
 
@@ -353,20 +358,6 @@ def _reward(agent: Agent) -> None:
     log.elapsed[row] = agent.info.get("elapsed", nan)
     if agent.rule_action is not None:
         log.rule_actions[row], agent.rule_action = agent.rule_action, None
-
-
-def _end(agent: Agent, turns: int, *, terminated: bool, truncated: bool) -> None:
-    """Record the agent's last reward and its end."""
-    _reward(agent)
-    trajectory: _TrajectoryLog | None = agent.notes
-    if trajectory is not None:
-        trajectory.last_observation, trajectory.last_turn = agent.observation, turns
-        trajectory.terminated, trajectory.truncated = terminated, truncated
-
-
-def _stacker(space: spaces.Space[Any] | None) -> Stacker:
-    """Return the function that stacks elements of a space; of an unknown space there are none."""
-    return np.array if space is None else stacker(space)
 
 
 def _check_extras(batches: Sequence[Mapping[str, Any]]) -> None:

@@ -4,8 +4,7 @@ from ..core.provenance import provenance
 from .designs import design
 from .effects import Effects, effects, sobol_indices
 from .evaluation import Evaluation, evaluate
-from .runs import run_experiment
-from .variants import Variant
+from .runs import Variant, run_experiment
 
 __all__ = [
     "Effects",

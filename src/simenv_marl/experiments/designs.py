@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from ..core.rng import is_seed
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
+from .runner import dtype_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-__all__ = ["design"]
 
 MOST_ROWS: Final = 10_000_000
 """The largest number of rows. A larger design is considered a mistake."""
@@ -52,11 +51,13 @@ class Factor:
         values = [float(min(max(value, self.low), self.high)) for value in values]
         return [round(value) for value in values] if self.is_whole else values
 
-    def steps(self, number: int) -> list[Any]:
-        """Return ``number`` values of a range from bound to bound, or all levels of a list."""
+    def steps(self, number: int | None) -> list[Any]:
+        """Return ``number`` values (default 2) of a range from bound to bound, or all levels of a list."""
+        if number == 1:
+            raise OptionValueError("this method takes n values of each range; n must be at least 2")
         if self.levels is not None:
             return list(self.levels)
-        return list(dict.fromkeys(self.scale(np.linspace(0.0, 1.0, number))))
+        return list(dict.fromkeys(self.scale(np.linspace(0.0, 1.0, number or 2))))
 
     def ends(self) -> tuple[Any, ...]:
         """Return the two values for a two-level design."""
@@ -101,7 +102,11 @@ def design(
         MissingExtraError: pandas, pyDOE or SALib is missing.
     """
     pandas = import_extra("pandas", "design")
-    parsed = _checked(factors)
+    if not isinstance(factors, Mapping) or not factors:
+        raise OptionValueError(
+            f"factors must be a dict from names to ranges or lists of levels, not {short_repr(factors)}"
+        )
+    parsed = [_factor(name, values) for name, values in factors.items()]
     if method not in list(METHODS):
         raise OptionValueError(
             f"method must be one of {', '.join(METHODS)}, not {short_repr(method)}{did_you_mean(method, METHODS)}"
@@ -111,19 +116,15 @@ def design(
     if seed is not None and not is_seed(seed):
         raise OptionValueError(f"seed must be a non-negative integer or None, not {short_repr(seed)}")
     columns = METHODS[method](parsed, None if n is None else int(n), int(seed or 0))
-    series = {
-        factor.name: pandas.Series(values, dtype=_dtype(factor)) for factor, values in zip(parsed, columns, strict=True)
-    }
-    table: DataFrame = pandas.DataFrame(series)
+    table: DataFrame = pandas.DataFrame(
+        {
+            factor.name: pandas.Series(
+                values, dtype=dtype_of(factor.levels or (factor.low, factor.high), missing=False)
+            )
+            for factor, values in zip(parsed, columns, strict=True)
+        }
+    )
     return table
-
-
-def _checked(factors: Any) -> list[Factor]:
-    if not isinstance(factors, Mapping) or not factors:
-        raise OptionValueError(
-            f"factors must be a dict from names to ranges or lists of levels, not {short_repr(factors)}"
-        )
-    return [_factor(name, values) for name, values in factors.items()]
 
 
 def _factor(name: Any, values: Any) -> Factor:
@@ -167,25 +168,14 @@ def _is_same(one: Any, other: Any) -> bool:
         return False
 
 
-def _dtype(factor: Factor) -> Any:
-    """Return the dtype of a factor's column."""
-    values = factor.levels or (factor.low, factor.high)
-    kinds = set(map(type, values))
-    if kinds == {int}:
-        return np.int64 if all(-(2**63) <= value < 2**63 for value in values) else object
-    return {str: "str", float: np.float64, bool: np.bool_}.get(kinds.pop(), object) if len(kinds) == 1 else object
-
-
 # -- methods: the columns of a design -------------------------------------------------------------
 
 Columns = Sequence[Sequence[Any]]
 
 
 def _full_factorial(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    if n == 1:
-        raise OptionValueError("a full factorial design takes n values of each range; n must be at least 2")
-    steps = [factor.steps(n or 2) for factor in factors]
-    _checked_rows(prod(map(len, steps)))
+    steps = [factor.steps(n) for factor in factors]
+    _rows(prod(map(len, steps)))
     return list(zip(*product(*steps), strict=True))
 
 
@@ -220,25 +210,18 @@ def _generators(basic: int, number: int) -> str:
     """
     columns: list[int] = []
     for resolution in range(min(basic + 1, 8), 2, -1):
-        columns = [1 << place for place in range(basic)]
+        columns = []
         sums: list[set[int]] = [{0}, *(set() for _ in range(resolution - 2))]  # the sums of 0, 1, 2, ... columns
-        for column in columns:
-            _extend(sums, column)
-        for word in range(3, 2**basic):  # greedily in this order: a lexicographic code, which is large
-            if len(columns) == number:
-                break
-            if not any(word in own for own in sums):
+        # First the basic factors; then greedily in this order: a lexicographic code, which is large.
+        for word in [*(1 << place for place in range(basic)), *range(3, 2**basic)]:
+            if len(columns) < number and not any(word in own for own in sums):
                 columns.append(word)
-                _extend(sums, word)
+                for fewer, own in zip(sums[-2::-1], sums[:0:-1], strict=True):
+                    own |= {other ^ word for other in fewer}
         if len(columns) == number:
             break
     letters = ascii_lowercase
     return " ".join("".join(letters[place] for place in range(basic) if column >> place & 1) for column in columns)
-
-
-def _extend(sums: list[set[int]], column: int) -> None:
-    for fewer, own in zip(sums[-2::-1], sums[:0:-1], strict=True):
-        own |= {other ^ column for other in fewer}
 
 
 def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
@@ -257,23 +240,19 @@ def _plackett_burman(factors: Sequence[Factor], n: int | None, seed: int) -> Col
 def _central_composite(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     pydoe = import_extra("pydoe", "design")
     ranges = [factor for factor in factors if factor.levels is None]
+    lists = [factor for factor in factors if factor.levels is not None]
     if len(ranges) < 2:
         raise OptionValueError(f"a central composite design needs at least two ranges (low, high), not {len(ranges)}")
-    number = 2 ** len(ranges) + 2 * len(ranges) + 1
-    sizes = [len(factor.levels or "-") for factor in factors]  # once for each combination of levels
-    rows = _checked_rows(number * prod(sizes))
-    if n is not None and n != rows:
-        raise OptionValueError(f"a central composite design of these {len(factors)} factors has {rows} runs, not {n}")
+    levels = [factor.steps(None) for factor in lists]
+    number = _rows((2 ** len(ranges) + 2 * len(ranges) + 1) * prod(map(len, levels)))
+    if n is not None and n != number:
+        raise OptionValueError(f"a central composite design of these {len(factors)} factors has {number} runs, not {n}")
     # The centre occurs once: a simulation with the same seed would have the same result.
-    matrix = iter(pydoe.ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T)
-    columns = []
-    for place, factor in enumerate(factors):
-        if factor.levels is None:
-            columns.append(factor.scale((next(matrix) + 1) / 2) * (rows // number))
-        else:
-            each = [level for level in factor.levels for _ in range(number * prod(sizes[place + 1 :]))]
-            columns.append(each * prod(sizes[:place]))
-    return columns
+    matrix = (pydoe.ccdesign(len(ranges), center=(0, 1), alpha="rotatable", face="inscribed").T + 1) / 2
+    surface = list(zip(*map(Factor.scale, ranges, matrix), strict=True))
+    names = [factor.name for factor in (*lists, *ranges)]
+    rows = [dict(zip(names, (*own, *values), strict=True)) for own in product(*levels) for values in surface]
+    return [[row[factor.name] for row in rows] for factor in factors]
 
 
 def _latin_hypercube(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
@@ -295,35 +274,30 @@ def _saltelli(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
     rows, names = _rows(n), [factor.name for factor in factors]
     if rows & (rows - 1):
         raise OptionValueError(f"the number of samples of a Saltelli design must be a power of two, not {rows}")
-    _checked_rows(rows * (2 * len(names) + 2))
+    _rows(rows * (2 * len(names) + 2))
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     return _spread(factors, import_extra("SALib.sample.sobol", "design").sample(problem, rows, seed=seed))
 
 
 def _one_at_a_time(factors: Sequence[Factor], n: int | None, seed: int) -> Columns:
-    if n == 1:
-        raise OptionValueError("a design of one factor at a time takes n values of each range; n must be at least 2")
     middle = [f.levels[0] if f.levels is not None else f.scale(np.array([0.5]))[0] for f in factors]
     rows = [middle]
     for place, factor in enumerate(factors):
-        for value in factor.steps(n or 2):
+        for value in factor.steps(n):
             if not _is_same(value, middle[place]):
                 rows.append([*middle[:place], value, *middle[place + 1 :]])
     return [list(column) for column in zip(*rows, strict=True)]
 
 
-def _rows(n: int | None) -> int:
-    if n is None:
+def _rows(number: int | None) -> int:
+    """Return the number of rows, which must be known and not too large."""
+    if number is None:
         raise OptionValueError("this method needs n, the number of rows")
-    return _checked_rows(n)
-
-
-def _checked_rows(rows: int) -> int:
-    if rows > MOST_ROWS:
+    if number > MOST_ROWS:
         raise OptionValueError(
-            f"the design would have {rows:,} rows, more than {MOST_ROWS:,}; choose another method or a smaller n"
+            f"the design would have {number:,} rows, more than {MOST_ROWS:,}; choose another method or a smaller n"
         )
-    return rows
+    return number
 
 
 def _spread(factors: Sequence[Factor], points: Any) -> Columns:

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from itertools import combinations
-from math import nan
-from typing import TYPE_CHECKING, Any, Final
+from math import ceil, nan
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.plots import COLOURS, label_below, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra
 from .evaluation import check_metric, check_probability, interval, is_proportion, numbers
@@ -16,13 +17,6 @@ from .runner import RUN_COLUMNS, TEAM
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from pandas import DataFrame
-
-__all__ = ["Effects", "effects", "sobol_indices"]
-
-MANY: Final = 8
-"""Numeric factors with more levels than this are grouped into ``GROUPS``."""
-
-GROUPS: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,10 +55,50 @@ class Effects:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        from .figures import draw_effects
+        factors = list(self.levels)
+        pairs = [pair for pair, strength in self.interactions["strength"].items() if strength > 0][:4]
+        columns = min(max(len(factors), len(pairs)), 5)  # more would be too small to read
+        above = ceil(len(factors) / columns)
+        with style("plot") as new_figure:
+            if figure is None:
+                figure = new_figure(max(3.2, 2.3 * columns), 2.8 * (above + bool(pairs)))
+            rows = figure.subplots(above + bool(pairs), columns, squeeze=False)
+            main = rows[:above].ravel()
+            for axes, factor in zip(main, factors, strict=False):
+                if axes is not main[0]:
+                    axes.sharey(main[0])
+                own = self.main.loc[factor]
+                bars = [(own["mean"] - own["low"]).clip(lower=0), (own["high"] - own["mean"]).clip(lower=0)]
+                axes.errorbar(
+                    range(len(own)), own["mean"], yerr=bars, fmt="o-", color=COLOURS[0], linewidth=1, markersize=4
+                )
+                _label_levels(axes, self.levels[factor], factor)
+            for axes in rows[:above, 0]:
+                axes.set_ylabel(f"{self.metric}, mean")
+            for axes, (one, other) in zip(rows[-1], pairs, strict=False):
+                table = self.cells(one, other)
+                for place, level in enumerate(self.levels[other]):
+                    colour = COLOURS[place % len(COLOURS)]
+                    axes.plot(
+                        range(len(table)), table.iloc[:, place], "o-", color=colour, markersize=4, label=_short(level)
+                    )
+                _label_levels(axes, self.levels[one], one)
+                axes.legend(title=other, fontsize=7, title_fontsize=8, frameon=True, framealpha=0.8, edgecolor="none")
+            for axes in [*main[len(factors) :], *(rows[-1][len(pairs) :] if pairs else ())]:
+                axes.set_visible(False)
+        return figure
 
-        result: Figure | SubFigure = draw_effects(self, figure)
-        return result
+
+def _label_levels(axes: Any, levels: list[Any], factor: str) -> None:
+    axes.set_xlim(-0.4, len(levels) - 0.6)
+    axes.set_xlabel(factor)
+    label_below(axes, [_short(level) for level in levels])
+
+
+def _short(level: Any) -> str:
+    if hasattr(level, "left"):
+        return f"{level.left:.3g} to {level.right:.3g}"
+    return f"{level:.4g}" if isinstance(level, float) else str(level)
 
 
 def effects(
@@ -105,19 +139,19 @@ def effects(
         raise OptionValueError("no factor has more than one level")
     levels = {name: own for name, (_, own) in coded.items()}
     values = pandas.Series(numbers(table[metric], metric).to_numpy())
-    main, zero_or_one = [], is_proportion(table[metric])
-    for codes, own in coded.values():
-        for code in range(len(own)):
+    main: dict[tuple[str, Any], list[float]] = {}
+    zero_or_one = is_proportion(table[metric])
+    for name, (codes, own) in coded.items():
+        for code, level in enumerate(own):
             here = values[codes == code]
             by_seed = here.groupby(table["seed"].to_numpy()[codes == code]).mean()
             sample = by_seed if len(by_seed) > 1 else here
             proportion = zero_or_one and len(sample) == len(here)  # not means of several runs
             low, high, _ = interval(sample.to_numpy(), confidence, proportion=proportion)
-            main.append([here.mean(), low, high, here.mean() - values.mean(), len(here)])
-    index = pandas.MultiIndex.from_tuples(
-        [(name, level) for name, own in levels.items() for level in own], names=["factor", "level"]
-    )
-    rows = pandas.DataFrame(main, index, columns=["mean", "low", "high", "effect", "count"]).astype({"count": int})
+            main[name, level] = [here.mean(), low, high, here.mean() - values.mean(), len(here)]
+    index = pandas.MultiIndex.from_tuples(main, names=["factor", "level"])
+    columns = ["mean", "low", "high", "effect", "count"]
+    rows = pandas.DataFrame(list(main.values()), index, columns).astype({"count": int})
     cells: dict[tuple[str, str], DataFrame] = {}
     strengths = []
     for one, other in combinations(levels, 2):
@@ -125,7 +159,9 @@ def effects(
         means = means.reindex(index=range(len(levels[one])), columns=range(len(levels[other])))
         means.index, means.columns = pandas.Index(levels[one], name=one), pandas.Index(levels[other], name=other)
         cells |= {(one, other): means, (other, one): means.T}
-        strengths.append([one, other, _strength(means.to_numpy(np.float64))])
+        grid = means.to_numpy(np.float64)
+        rest = grid - grid.mean(axis=1, keepdims=True) - grid.mean(axis=0, keepdims=True) + grid.mean()
+        strengths.append([one, other, float(np.sqrt((rest**2).mean()))])  # nan if a combination is missing
     interactions = pandas.DataFrame(strengths, columns=["factor", "other", "strength"]).set_index(["factor", "other"])
     return Effects(rows, interactions.sort_values("strength", ascending=False), metric, levels, cells)
 
@@ -155,11 +191,11 @@ def _select(frame: "DataFrame", metric: str, contender: str | None, agent: str) 
 def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     """Return the place of each row's level, and the levels: numbers sorted, others as they appear, missing ones last.
 
-    Numeric factors with many values are grouped into quarters.
+    Numeric factors with more than eight values are grouped into quarters.
     """
     pandas = import_extra("pandas", "effects")
-    if column.nunique() > MANY and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
-        column = pandas.qcut(column, GROUPS, duplicates="drop")
+    if column.nunique() > 8 and pandas.api.types.is_numeric_dtype(column) and column.dtype != bool:
+        column = pandas.qcut(column, 4, duplicates="drop")
     values = column.tolist()
     levels = [level for level in dict.fromkeys(values) if level == level]
     if all(type(level) in (int, float, pandas.Interval) for level in levels):
@@ -168,12 +204,6 @@ def _codes(column: Any) -> tuple[NDArray[np.intp], list[Any]]:
     if any(level != level for level in values):  # nan
         levels.append(nan)
     return np.array([places.get(level, len(levels) - 1) for level in values]), levels
-
-
-def _strength(means: NDArray[np.float64]) -> float:
-    """Return how far the means of combinations are from the sum of both main effects; nan if some are missing."""
-    rest = means - means.mean(axis=1, keepdims=True) - means.mean(axis=0, keepdims=True) + means.mean()
-    return float(np.sqrt((rest**2).mean()))
 
 
 # -- shares of the variance -----------------------------------------------------------------------

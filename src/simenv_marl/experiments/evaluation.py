@@ -1,10 +1,13 @@
 """Compares contenders on the same seeds, with confidence intervals."""
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby, product
 from math import inf, isfinite, nan
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 
 import numpy as np
@@ -15,34 +18,23 @@ from ..core.packing import pack
 from ..core.plan import Plan
 from ..core.points import Points
 from ..core.reuse import reuse_resources
+from ..data.plots import COLOURS, INK, PALE, label_below, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
-from .runner import (
-    RUN_COLUMNS,
-    STATUS_COLUMNS,
-    TEAM,
-    Outcome,
-    Policies,
-    Returns,
-    Runner,
-    checked_contenders,
-    distinct_seeds,
-    make_runner,
-    make_table,
-    noting,
-)
+from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Outcome, Returns, Runner, distinct_seeds, make_table, noting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
     from pandas import DataFrame, Series
-
-__all__ = ["Evaluation", "evaluate"]
 
 FIRST: Final = 16
 """The number of seeds before the first check of the intervals' width: intervals of fewer seeds are unreliable."""
 
 MOST_SEEDS: Final = 10_000_000
 """A difference that needs more seeds than this counts as none."""
+
+LINES: Final = 200
+"""The largest number of seeds that are drawn as lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,12 +145,29 @@ class Evaluation:
 
         ``figure`` and the result are as in ``plot_timeline``.
         """
-        from .figures import draw_evaluation
-
-        result: Figure | SubFigure = draw_evaluation(
-            numbers(self.values(metric), metric), self.summary(metric), self.baseline, metric, figure
-        )
-        return result
+        values, summary, baseline = numbers(self.values(metric), metric), self.summary(metric), self.baseline
+        names = list(values.columns)
+        others = [] if baseline is None else [name for name in names if name != baseline]
+        sizes = [len(names), len(others)] if others else [len(names)]
+        with style("plot") as new_figure:
+            if figure is None:
+                figure = new_figure(min(sum(1.1 * size + 1.2 for size in sizes) + 1.0, 14.0), 4.2)
+            axes = figure.subplots(1, len(sizes), squeeze=False, width_ratios=sizes)[0]
+            for row in values.to_numpy()[:LINES]:
+                axes[0].plot(range(len(names)), row, color=PALE, linewidth=0.7, alpha=0.7, zorder=1)
+            _draw_dots(axes[0], values, names, summary[["mean", "low", "high"]], 0.0)
+            axes[0].set_ylabel(f"{metric} of the team" if metric in ("return", "length") else metric)
+            each = "each a line" if len(values) <= LINES else f"lines for {LINES} of them"
+            each = "each a dot" if len(names) == 1 else each
+            axes[0].set_title(f"{len(values)} seeds, {each}" if len(values) > 1 else "1 seed")
+            if others:
+                axes[1].axhline(0.0, color=INK, linewidth=0.8, zorder=1)
+                differences = values.sub(values[baseline], axis=0)[others]
+                marks = summary.loc[others, ["difference", "difference_low", "difference_high"]]
+                _draw_dots(axes[1], differences, names, marks, 0.24)
+                axes[1].set_ylabel(f"difference from {baseline}, same seed")
+                axes[1].set_title("differences")
+        return figure
 
     def _differences(self, metric: str) -> dict[str, NDArray[np.float64]]:
         """Return the differences from the baseline, by other contender, in the order of the seeds."""
@@ -174,6 +183,23 @@ class Evaluation:
         return float((summary[f"{prefix}high"] - summary[f"{prefix}low"]).max(skipna=False))
 
 
+def _draw_dots(axes: Any, values: "DataFrame", names: list[str], marks: "DataFrame", spread: float) -> None:
+    """Draw a column of dots for each contender, one for each seed, and the mean with its interval from ``marks``.
+
+    The dots are at most ``spread`` from the middle of their column. All ``names`` together determine the colours.
+    """
+    for place, name in enumerate(values.columns):
+        across = place + spread * (2 * (np.arange(len(values)) * 0.618034 % 1) - 1)  # even, in irregular order
+        colour = COLOURS[names.index(name) % len(COLOURS)]
+        axes.scatter(across, values[name], 14, color=colour, alpha=0.5, linewidths=0, zorder=2)
+        mean, low, high = marks.loc[name]
+        bars = None if np.isnan(low) else [[max(0.0, mean - low)], [max(0.0, high - mean)]]
+        axes.errorbar([place], [mean], yerr=bars, fmt="o", color=INK, markersize=5, elinewidth=2, zorder=5)
+        axes.annotate(f"{mean:.4g}", (place, mean), (8, 0), textcoords="offset points", va="center", fontsize=8.5)
+    axes.set_xlim(-0.5, len(values.columns) - 0.5)
+    label_below(axes, list(values.columns))
+
+
 def _by_contender(rows: Mapping[str, Iterable[float]], columns: list[str]) -> "DataFrame":
     pandas = import_extra("pandas", "a table")
     table: DataFrame = pandas.DataFrame.from_dict(rows, "index", columns=columns, dtype=float)
@@ -182,7 +208,7 @@ def _by_contender(rows: Mapping[str, Iterable[float]], columns: list[str]) -> "D
 
 def evaluate(
     simulation: Any,
-    contenders: Mapping[str, Policies],
+    contenders: Mapping[str, Mapping[Any, Any]],
     *,
     seeds: Iterable[int],
     points: Points = None,
@@ -232,61 +258,9 @@ def evaluate(
             contender and the seed.
     """
     import_extra("pandas", "evaluate"), import_extra("scipy.stats", "evaluate")
-    by_name = checked_contenders(contenders, batched=bool(batched))
-    _check(by_name, baseline, confidence, width)
-    all_seeds = distinct_seeds(seeds)
-    runner = make_runner(
-        by_name, points, options, metric, team, batch_size=batch_size, batched=bool(batched), workers=workers
+    runner = Runner(
+        contenders, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers
     )
-    # Plans are made and pickled here even if workers do the work, so that errors come first.
-    plans = {name: runner.plan(simulation, name) for name in by_name}
-    if workers:
-        pack((simulation, runner))
-    columns, rows = (*RUN_COLUMNS, *runner.metrics), {name: list[Any]() for name in by_name}
-    done = 0
-    with progress_bar(len(plans) * len(all_seeds), "episode") if progress else nullcontext() as bar, reuse_resources():
-        while True:
-            batch = all_seeds[done : _next_check(done, len(all_seeds), width)]
-            for name, plan in plans.items():
-                with noting(f"of the contender {name!r}"):
-                    rows[name] += _run(simulation, runner, name, plan, batch, int(workers))
-                if bar is not None:
-                    bar.update(len(batch))
-            done += len(batch)
-            table = make_table(columns, [row for own in rows.values() for row in own])
-            evaluation = Evaluation(table, baseline, float(confidence))
-            if done == len(all_seeds) or (width is not None and done >= FIRST and evaluation._widest() <= width):
-                return evaluation
-
-
-def _next_check(done: int, number: int, width: float | None) -> int:
-    """Return the number of seeds before the next check of the intervals; each check takes time, too."""
-    return number if width is None else min(number, max(FIRST, done + max(4, done // 8)))
-
-
-def _run(simulation: Any, runner: Runner, name: str, plan: Plan, seeds: list[int], workers: int) -> list[Any]:
-    """Run a contender's episodes, here or in workers, and return the rows of the table."""
-    if not workers:
-        return _run_part(simulation, runner, name, seeds, plan)
-    only = replace(runner, contenders={name: runner.contenders[name]})
-    parts = spread(_run_part, (simulation, only, name), seeds, workers, runner.batch_size)
-    return [row for _, part in parts for row in part]
-
-
-def _run_part(simulation: Any, runner: Runner, name: str, seeds: list[int], plan: Plan | None = None) -> list[Any]:
-    """Run a part of a contender's episodes. Without a plan, in a worker, one is made."""
-    rows: dict[int, list[Any]] = {}
-
-    def report(seed: int, outcome: Outcome) -> None:
-        rows[seed] = [(name, seed, *row) for row in runner.rows(outcome)]
-
-    with reuse_resources():
-        runner.run(plan or runner.plan(simulation, name), seeds, report)
-    return [row for seed in seeds for row in rows[seed]]
-
-
-def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
-    """Check the arguments that ``run_experiment`` does not have."""
     if not contenders:
         raise OptionValueError("contenders must be a dict, such as {'rule': {}}, but there are none")
     if baseline is not None and baseline not in list(contenders):
@@ -299,6 +273,53 @@ def _check(contenders: Any, baseline: Any, confidence: Any, width: Any) -> None:
         _check_number("width", width)
         if width <= 0:
             raise OptionValueError(f"width must be positive, not {short_repr(width)}")
+    all_seeds = distinct_seeds(seeds)
+    # Plans are made and pickled here even if workers do the work, so that errors come first.
+    plans = {name: runner.plan(simulation, name) for name in runner.contenders}
+    if workers:
+        pack((simulation, runner))
+    rows: list[Any] = []
+    names, done, number = list(plans), 0, len(all_seeds)
+    with progress_bar(len(names) * number, "episode") if progress else nullcontext() as bar, reuse_resources():
+        while True:
+            # The intervals' width is checked at growing distances, since each check takes time, too.
+            end = number if width is None else min(number, max(FIRST, done + max(4, done // 8)))
+            runs = list(product(names, all_seeds[done:end]))
+            if workers:
+                for size, part in spread(_run, (simulation, runner), runs, int(workers), runner.batch_size):
+                    rows += part
+                    if bar is not None:
+                        bar.update(size)
+            else:
+                rows += _run(simulation, runner, runs, plans, bar)
+            rows.sort(key=lambda row: names.index(row[0]))
+            evaluation = Evaluation(make_table((*RUN_COLUMNS, *runner.metrics), rows), baseline, float(confidence))
+            done = end
+            if done == number or (width is not None and done >= FIRST and evaluation._widest() <= width):
+                return evaluation
+
+
+def _run(
+    simulation: Any,
+    runner: Runner,
+    runs: Sequence[tuple[str, int]],
+    plans: Mapping[str, Plan] | None = None,
+    bar: Any = None,
+) -> list[Any]:
+    """Run pairs of contender and seed, and return the rows of the table. Without plans, in a worker, it makes them."""
+    rows: dict[tuple[str, int], list[Any]] = {}
+
+    def report(name: str, seed: int, outcome: Outcome) -> None:
+        rows[name, seed] = [(name, seed, *row) for row in runner.rows(outcome)]
+        if bar is not None:
+            bar.update()
+
+    with reuse_resources():
+        for name, own in groupby(runs, itemgetter(0)):
+            with noting(f"of the contender {name!r}"):
+                plan = runner.plan(simulation, name) if plans is None else plans[name]
+                runner.run(plan, [seed for _, seed in own], partial(report, name))
+    return [row for run in runs for row in rows[run]]
 
 
 # -- statistics -----------------------------------------------------------------------------------

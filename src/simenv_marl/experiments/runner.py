@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -35,8 +34,6 @@ RUN_COLUMNS: Final = ("contender", "seed", "agent", "return", "length")
 
 STATUS_COLUMNS: Final = ("status", "error")
 """The last columns of the table of an experiment, after the metrics."""
-
-Policies = Mapping[Any, Any]
 
 
 class Outcome(NamedTuple):
@@ -85,184 +82,148 @@ def noting(note: str) -> Iterator[None]:
         raise
 
 
-# -- arguments that evaluate and run_experiment share ---------------------------------------------
-
-
-def checked_contenders(contenders: Any, *, batched: bool) -> dict[str, Policies]:
-    """Return contenders by name. Policies that answer many decisions at once need ``batched``."""
-    if not isinstance(contenders, Mapping):
-        raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
-    for name, policies in contenders.items():
-        if not isinstance(name, str) or not name:
-            raise OptionValueError(f"the name of a contender must be a string, not {short_repr(name)}")
-        if not isinstance(policies, Mapping):
-            raise OptionValueError(
-                f"the contender {name!r} must be a dict from agents or points to policies, {{}} for the model as it is,"
-                f" not {short_repr(policies)}"
-            )
-        for key, policy in policies.items():
-            if policy is RULE:
-                continue
-            if not callable(policy):
-                raise OptionValueError(
-                    f"the policy of {short_repr(key)} in {name!r} must be callable, not {short_repr(policy)}"
-                )
-            if not batched and takes_identities(policy):
-                raise OptionValueError(
-                    f"the policy of {short_repr(key)} in {name!r}, {short_repr(policy)}, answers many decisions at"
-                    " once, as mixtures do; pass batched=True, and only policies as simulate_many takes them"
-                )
-    return dict(contenders)
-
-
-def distinct_seeds(seeds: Iterable[int]) -> list[int]:
-    """Return the seeds as a list: at least one, and all different."""
-    checked = checked_seeds(seeds)
-    if not checked:
-        raise OptionValueError("seeds must be integers, such as range(32), but there are none")
-    seed, number = Counter(checked).most_common(1)[0]
-    if number > 1:
-        raise OptionValueError(f"the seed {seed} occurs twice: its result would be counted twice")
-    return checked
-
-
-def _checked_metrics(metric: Any, factors: Sequence[str]) -> dict[str, Callable[[Any], Any]]:
-    """Return metrics by name; a single one is called ``metric``."""
-    if metric is None:
-        return {}
-    metrics = dict(metric) if isinstance(metric, Mapping) else {"metric": metric}
-    for name, function in metrics.items():
-        if not isinstance(name, str) or not callable(function):
-            raise OptionValueError(
-                f"metric must be a callable of the simulation, or a dict of them, not {short_repr(metric)}"
-            )
-        if name in (*RUN_COLUMNS, *STATUS_COLUMNS, *factors):
-            raise OptionValueError(f"the metric {name!r} has the name of another column; rename it")
-    return metrics
-
-
-def make_runner(
-    contenders: dict[str, Policies],
-    points: Any,
-    options: Mapping[str, Any],
-    metric: Any,
-    team: Any,
-    *,
-    batch_size: int,
-    batched: bool,
-    workers: int,
-    factors: Sequence[str] = (),
-) -> Runner:
-    """Make a runner from arguments of ``evaluate`` and ``run_experiment``, and check them."""
-    check_numbers(batch_size, workers)
-    if team is not None and not callable(team):
-        raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
-    if "policies" in options:
-        raise OptionValueError("there is no option policies here; pass the policies of each contender in contenders=")
-    keys = [key for policies in contenders.values() for key in policies]
-    return Runner(
-        contenders,
-        list(points) if isinstance(points, Iterator) else points,
-        list(dict.fromkeys(key for key in keys if not isinstance(key, str) or "." in key)),
-        {name: list(value) if isinstance(value, Iterator) else value for name, value in options.items()},
-        _checked_metrics(metric, factors),
-        team,
-        int(batch_size) if batched else 0,
-    )
-
-
-# -- episodes -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
 class Runner:
-    """Runs episodes of contenders, with arguments of ``evaluate``. Workers get a copy."""
+    """Runs episodes of contenders, with the arguments that ``evaluate`` and ``run_experiment`` share.
 
-    contenders: Mapping[str, Policies]
-    points: Any
-    policy_points: Sequence[Any]  # the points that policies name; they are used if the points are not known otherwise
-    options: Mapping[str, Any]
-    metrics: Mapping[str, Callable[[Any], Any]]
-    team: Callable[[Returns], Any] | None
-    batch_size: int  # 0 if policies answer one decision at a time
+    Workers get a copy.
+
+    Attributes:
+        contenders: By name, the policies of each.
+        metrics: By column, the callables of an ended simulation.
+        batch_size: The number of simulations that policies answer together. 0: they answer one decision at a time.
+    """
+
+    def __init__(
+        self,
+        contenders: Any,
+        points: Any,
+        options: Mapping[str, Any],
+        metric: Any,
+        team: Any,
+        *,
+        batched: bool,
+        batch_size: int,
+        workers: int,
+        factors: Sequence[str] = (),
+    ) -> None:
+        """Check the arguments. ``factors`` are the columns of the design, whose names metrics must not have."""
+        check_numbers(batch_size, workers)
+        if not isinstance(contenders, Mapping):
+            raise OptionValueError(f"contenders must be a dict from a name to policies, not {short_repr(contenders)}")
+        for name, policies in contenders.items():
+            if not isinstance(name, str) or not name:
+                raise OptionValueError(f"the name of a contender must be a string, not {short_repr(name)}")
+            if not isinstance(policies, Mapping):
+                raise OptionValueError(
+                    f"the contender {name!r} must be a dict from agents or points to policies, {{}} for the model as"
+                    f" it is, not {short_repr(policies)}"
+                )
+            for key, policy in policies.items():
+                whose = f"the policy of {short_repr(key)} in {name!r}"
+                if policy is RULE:
+                    continue
+                if not callable(policy):
+                    raise OptionValueError(f"{whose} must be callable, not {short_repr(policy)}")
+                if not batched and takes_identities(policy):
+                    raise OptionValueError(
+                        f"{whose}, {short_repr(policy)}, answers many decisions at once, as mixtures do; pass"
+                        " batched=True, and only policies as simulate_many takes them"
+                    )
+        if team is not None and not callable(team):
+            raise OptionValueError(f"team must be a callable of the returns, or None, not {short_repr(team)}")
+        if "policies" in options:
+            raise OptionValueError(
+                "there is no option policies here; pass the policies of each contender in contenders="
+            )
+        self.contenders: dict[str, Mapping[Any, Any]] = dict(contenders)
+        self.metrics: dict[str, Callable[[Any], Any]] = {"metric": metric}
+        if metric is None or isinstance(metric, Mapping):
+            self.metrics = dict(metric or {})
+        for name, function in self.metrics.items():
+            if not isinstance(name, str) or not callable(function):
+                raise OptionValueError(
+                    f"metric must be a callable of the simulation, or a dict of them, not {short_repr(metric)}"
+                )
+            if name in (*RUN_COLUMNS, *STATUS_COLUMNS, *factors):
+                raise OptionValueError(f"the metric {name!r} has the name of another column; rename it")
+        self.batch_size = int(batch_size) if batched else 0
+        self._team = team
+        # They may be iterators, and every plan reads them.
+        self._points = list(points) if isinstance(points, Iterator) else points
+        self._options = {n: list(value) if isinstance(value, Iterator) else value for n, value in options.items()}
 
     def plan(self, simulation: Any, contender: str) -> Plan:
         """Return the plan of a contender's episodes. All agents whose rewards count decide in it."""
+        policies, points, options = self.contenders[contender], self._points, self._options
         with noting(f"of the contender {contender!r}"):
             try:
-                return self._plan(simulation, contender, self.points, all_points=True)
+                return learners_plan(simulation, policies, points, options, all_points=True)
             except (AgentError, UnknownPointError) as error:
-                if self.points is not None:
+                if points is not None:
                     raise
-                first = error
-            try:
-                named = bool(self.policy_points)
-                plan = self._plan(simulation, contender, self.policy_points or None, all_points=named)
-            except (AgentError, UnknownPointError):
-                raise first from None
-        if not named and decision_points():
-            warn_user(f"returns are not counted, because the decision points are not known: {first}")
-        return plan
-
-    def _plan(self, simulation: Any, contender: str, points: Any, *, all_points: bool) -> Plan:
-        return learners_plan(simulation, self.contenders[contender], points, self.options, all_points=all_points)[0]
+                # The points are not known: those that the contenders name are used, if there are any.
+                keys = dict.fromkeys(key for own in self.contenders.values() for key in own)
+                points = [key for key in keys if not isinstance(key, str) or "." in key] or None
+                with suppress(AgentError, UnknownPointError):
+                    plan = learners_plan(simulation, policies, points, options, all_points=points is not None)
+                    if points is None and decision_points():
+                        warn_user(f"returns are not counted, because the decision points are not known: {error}")
+                    return plan
+                raise
 
     def run(self, plan: Plan, seeds: Sequence[int], report: Callable[[int, Outcome], None]) -> None:
         """Run one episode for each seed. ``report`` gets the seed and its results when the simulation is closed."""
+        if not self.batch_size:
+            for seed in seeds:
+                self._run_alone(plan, seed, report)
+            return
         tally = Tally()
 
         def finish(place: int, simulation: Any) -> Callable[[], None]:
             return partial(report, seeds[place], tally.outcome(place, simulation, self.metrics))
 
-        if self.batch_size:
-            run(plan, seeds, self.batch_size, finish, tally)
-            return
-        for place, seed in enumerate(seeds):
-            _run_alone(plan, seed, place, finish, tally)
+        run(plan, seeds, self.batch_size, finish, tally)
+
+    def _run_alone(self, plan: Plan, seed: int, report: Callable[[int, Outcome], None]) -> None:
+        """Run an episode whose policies answer one decision at a time."""
+        tally = Tally()
+        with noting(f"while the simulation was made; seed {seed}"):
+            session = Session(plan)
+        try:
+            with outside_simulation():
+                episode = session.start(seed, None)
+                context = episode.context if plan.options.global_rng else nullcontext
+                tally.moved(episode)
+                while (agent := episode.pending) is not None:
+                    tally.count(0, agent)
+                    if agent.is_planner:
+                        agent.consultations += 1
+                    try:
+                        with context():
+                            action = agent.policy(agent.observation, agent.info)
+                    except BaseException as error:
+                        episode.fail(error)
+                        raise
+                    episode.step(action)
+                    tally.moved(episode)
+                session.end()
+                with noting(f"after the simulation's end; seed {seed}"):
+                    outcome = tally.outcome(0, session.simulation, self.metrics)
+                    session.close()
+                    report(seed, outcome)
+        except BaseException as error:
+            close_after(error, session.close, "the simulation")
+            raise
 
     def rows(self, outcome: Outcome) -> list[tuple[Any, ...]]:
         """Return agent, return, length and metrics for each agent and for the team."""
         metrics = [outcome.metrics.get(name) for name in self.metrics]
         rows = [(agent, value, outcome.lengths[agent], *metrics) for agent, value in outcome.returns.items()]
-        value: Any = sum(outcome.returns.values()) if self.team is None else self.team(Returns(outcome.returns))
+        value: Any = sum(outcome.returns.values()) if self._team is None else self._team(Returns(outcome.returns))
         try:
             return [*rows, (TEAM, float(value), sum(outcome.lengths.values()), *metrics)]
         except (TypeError, ValueError):
             raise OptionValueError(f"team must return a number, not {short_repr(value)}") from None
-
-
-def _run_alone(plan: Plan, seed: int, place: int, finish: Callable[..., Callable[[], None]], tally: Tally) -> None:
-    """Run an episode whose policies answer one decision at a time."""
-    with noting(f"while the simulation was made; seed {seed}"):
-        session = Session(plan)
-    try:
-        with outside_simulation():
-            episode = session.start(seed, None)
-            tally.moved(episode)
-            while episode.pending is not None:
-                tally.count(place, episode.pending)
-                episode.step(_ask(episode, episode.pending))
-                tally.moved(episode)
-            session.end()
-            with noting(f"after the simulation's end; seed {seed}"):
-                report = finish(place, session.simulation)
-                session.close()
-                report()
-    except BaseException as error:
-        close_after(error, session.close, "the simulation")
-        raise
-
-
-def _ask(episode: Episode, agent: Agent) -> Any:
-    """Return the action of the policy of the agent that the episode waits for."""
-    if agent.is_planner:
-        agent.consultations += 1
-    try:
-        with episode.context() if episode.plan.options.global_rng else nullcontext():
-            return agent.policy(agent.observation, agent.info)
-    except BaseException as error:
-        episode.fail(error)
-        raise
 
 
 class Tally:
@@ -308,7 +269,18 @@ class Tally:
         return Outcome(returns, lengths, values)
 
 
-# -- values and tables ----------------------------------------------------------------------------
+# -- seeds, values and tables ---------------------------------------------------------------------
+
+
+def distinct_seeds(seeds: Iterable[int]) -> list[int]:
+    """Return the seeds as a list: at least one, and all different."""
+    checked = checked_seeds(seeds)
+    if not checked:
+        raise OptionValueError("seeds must be integers, such as range(32), but there are none")
+    seed, number = Counter(checked).most_common(1)[0]
+    if number > 1:
+        raise OptionValueError(f"the seed {seed} occurs twice: its result would be counted twice")
+    return checked
 
 
 def plain_value(what: str, value: Any, advice: str = "") -> Any:
@@ -325,18 +297,21 @@ def make_table(names: Sequence[str], rows: Iterable[Sequence[Any]]) -> DataFrame
     pandas = import_extra("pandas", "a table")
     columns = dict(zip(names, zip(*rows, strict=True), strict=True))
     table: DataFrame = pandas.DataFrame(
-        {name: pandas.Series(values, dtype=_dtype(values)) for name, values in columns.items()}
+        {name: pandas.Series(values, dtype=dtype_of(values, missing=True)) for name, values in columns.items()}
     )
     return table
 
 
-def _dtype(values: Sequence[Any]) -> Any:
-    kinds = {type(value) for value in values}
+def dtype_of(values: Iterable[Any], *, missing: bool) -> Any:
+    """Return the dtype of a column that keeps the types of its values.
+
+    With ``missing``, None is a missing number, and numbers of both types become floats where that is exact.
+    """
+    values = list(values)
+    kinds = set(map(type, values))
     if kinds == {int} and all(-(2**63) <= value < 2**63 for value in values):
         return np.int64
-    if kinds == {bool}:
-        return np.bool_
-    if kinds <= {int, float, type(None)} and kinds & {int, float}:
+    if missing and kinds & {int, float} and kinds <= {int, float, type(None)}:
         exact = all(type(value) is not int or abs(value) <= 2**53 for value in values)
         return np.float64 if exact else object
-    return object if kinds != {str} else "str"
+    return {str: "str", float: np.float64, bool: np.bool_}.get(kinds.pop(), object) if len(kinds) == 1 else object

@@ -1,65 +1,47 @@
-"""Experiments: every row of a design with every contender on every seed; stored as they run, and resumed."""
+"""Experiments: every row of a design with every contender on every seed; stored as they run, and resumed.
 
+A variant has a name for all changes of an experiment on a model: parameters of the model, plugins, definitions of
+decision points, and policies that decide instead of agents. A variant can be given wherever a simulation is expected.
+Further arguments there add to those of the variant.
+"""
+
+import inspect
 import json
 import os
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial, wraps
 from itertools import groupby, product
 from math import nan
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from ..core.options import EpisodeOptions
 from ..core.packing import pack
 from ..core.plan import Plan
-from ..core.points import Points
+from ..core.points import Points, portable
 from ..core.provenance import as_json, describe, source_name
 from ..core.reuse import reuse_resources
-from ..errors import OptionValueError, SimEnvError, StoreError, describe_error, short_repr
+from ..errors import OptionValueError, SimEnvError, SimulationError, StoreError, describe_error, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
-from .runner import (
-    RUN_COLUMNS,
-    STATUS_COLUMNS,
-    TEAM,
-    Policies,
-    Returns,
-    Runner,
-    checked_contenders,
-    distinct_seeds,
-    make_runner,
-    make_table,
-    plain_value,
-)
-from .store import Provenance, Result, Run, Store, Writer, check_rows, new_session, to_json, warn_of_changes
-from .variants import Variant, check_call
+from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Returns, Runner, distinct_seeds, make_table, plain_value
+from .store import Provenance, Result, Run, Store, Writer, new_session, to_json
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["run_experiment"]
-
 BY_RULE: Final = "rule"
 """The contender that is always present: the model as it is."""
-
-SHARE: Final = 16
-"""The number of parts of the work per process: few enough to cost nothing, enough for all to end together."""
-
-TRIED: Final = 10
-"""The largest number of rows on which contenders are checked, if making the simulations of rows fails."""
-
-LONGEST_TRACE: Final = 4000
-
-LOST: Final = "it did not come to its end: the worker process that ran it has ended"
 
 
 def run_experiment(
     make: Any,
     design: Any,
     *,
-    contenders: Mapping[str, Policies] | None = None,
+    contenders: Mapping[str, Mapping[Any, Any]] | None = None,
     seeds: Iterable[int],
     points: Points = None,
     metric: Any = None,
@@ -107,39 +89,49 @@ def run_experiment(
         SimEnvError: Something else cannot work. The subclass tells what.
     """
     import_extra("pandas", "run_experiment")
-    by_name = checked_contenders(contenders or {}, batched=bool(batched))
-    if by_name.pop(BY_RULE, {}):
+    table, rows = _checked_design(design)
+    keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
+    runner = Runner(
+        contenders or {}, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
+        factors=list(table.columns),
+    )  # fmt: skip
+    if runner.contenders.pop(BY_RULE, {}):
         raise OptionValueError(
             f"the contender {BY_RULE!r} is always the model as it is; give your policies another name"
         )
-    by_name = {BY_RULE: {}, **by_name}
-    table, rows = _checked_design(design)
-    keys, all_seeds = [to_json(row) for row in rows], distinct_seeds(seeds)
-    runner = make_runner(
-        by_name, points, options, metric, team, batched=bool(batched), batch_size=batch_size, workers=workers,
-        factors=list(table.columns),
-    )  # fmt: skip
-    _check_make(make, rows[0])
-    storage = Store(_checked_folder(store), list(table.columns), list(runner.metrics))
-    stored = storage.read(keys)
-    check_rows(storage, stored, keys)
-    work = make, runner, storage.folder, new_session()
+    runner.contenders = {BY_RULE: {}, **runner.contenders}
+    if isinstance(make, Variant):
+        _source(make, rows[0])  # a variant checks its parameters
+    else:
+        what = "make must be a callable of the factors, such as a class, or a Variant"
+        check_call(make, rows[0], OptionValueError, what, f"the factors {', '.join(rows[0]) or '(none)'}")
+    try:
+        folder = Path(store).absolute()  # other processes may have another working directory
+    except TypeError as error:
+        raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
+    storage = Store(folder, list(table.columns), list(runner.metrics))
+    storage.read(keys)
+    storage.check_rows(keys)
+    work = make, runner, folder, new_session()
     if workers:
         pack(work)  # errors of pickling come before any run, and so do those of contenders
-    row, provenances = _try_contenders(make, runner, sorted(keys, key=lambda key: key != stored.sample))
+    row, provenances = _try_contenders(make, runner, sorted(keys, key=lambda key: key != storage.sample))
     storage.create()
-    warn_of_changes(storage, stored, row, provenances)
-    finished = {run for run, result in stored.runs.items() if not (retry_errors and isinstance(result, str))}
-    runs = list(product(dict.fromkeys(keys), by_name, all_seeds))  # a row that occurs twice has the same results
+    storage.warn_of_changes(row, provenances)
+    finished = {run for run, result in storage.runs.items() if not (retry_errors and isinstance(result, str))}
+    # A row that occurs twice has the same results.
+    runs = list(product(dict.fromkeys(keys), runner.contenders, all_seeds))
     missing = [run for run in runs if run not in finished]
     with progress_bar(len(runs), "run", len(runs) - len(missing)) if progress else nullcontext() as bar:
         if workers and missing:
-            for number, _ in spread(_run_part, work, missing, int(workers), len(all_seeds) if batched else 1, SHARE):
+            least, share = len(all_seeds) if batched else 1, 16  # few parts cost nothing, many end together
+            for number, _ in spread(_run_part, work, missing, int(workers), least, share):
                 if bar is not None:
                     bar.update(number)
         elif missing:
             _run_part(*work, missing, bar)
-    return _make_frame(table, keys, all_seeds, storage.read(keys).runs, runner)
+    storage.read(keys)
+    return _make_frame(table, keys, all_seeds, storage.runs, runner)
 
 
 # -- checks before anything runs ------------------------------------------------------------------
@@ -169,28 +161,12 @@ def _checked_design(design: Any) -> "tuple[DataFrame, list[dict[str, Any]]]":
     return table, [{name: levels[name][place] for name in names} for place in range(len(table))]
 
 
-def _checked_folder(store: Any) -> Path:
-    try:
-        return Path(store).absolute()  # other processes may have another working directory
-    except TypeError as error:
-        raise OptionValueError(f"store must be the path of a folder, not {short_repr(store)}") from error
-
-
-def _check_make(make: Any, row: Mapping[str, Any]) -> None:
-    """Check that ``make`` takes the factors."""
-    if isinstance(make, Variant):
-        _source(make, row)  # a variant checks its parameters
-    else:
-        what = "make must be a callable of the factors, such as a class, or a Variant"
-        check_call(make, row, OptionValueError, what, f"the factors {', '.join(row) or '(none)'}")
-
-
 def _try_contenders(make: Any, runner: Runner, keys: Sequence[str]) -> tuple[str, dict[str, Provenance]]:
     """Check that all contenders can be set up; return a row, as JSON, and the provenance of its runs by contender.
 
-    Both are empty if no row's simulation can be made.
+    Both are empty if the simulations of the first ten rows cannot be made: the runs of all rows tell why.
     """
-    for key in keys[:TRIED]:
+    for key in keys[:10]:
         try:
             return key, {contender: _prepare(make, runner, key, contender)[1] for contender in runner.contenders}
         except SimEnvError:
@@ -261,7 +237,7 @@ def _run_seeds(
                 for seed in list(remaining):
                     _run_seeds(make, runner, writer, key, contender, [seed], bar)
                 return
-            trace = "".join(traceback.format_exception(error))[-LONGEST_TRACE:]
+            trace = "".join(traceback.format_exception(error))[-4000:]
             report(next(iter(remaining)), describe_error(error), trace)
 
 
@@ -274,20 +250,116 @@ def _make_frame(
     """Return the table of all runs, in the order of the design, the contenders and the seeds."""
     places: list[int] = []
     rows: list[tuple[Any, ...]] = []
-    for place, key in enumerate(keys):
-        for contender, seed in product(runner.contenders, seeds):
-            for row in _rows(runner, results.get((key, contender, seed), LOST)):
-                places.append(place)
-                rows.append((contender, seed, *row))
+    for (place, key), contender, seed in product(enumerate(keys), runner.contenders, seeds):
+        result = results.get((key, contender, seed), "its result is no longer stored")
+        own: list[tuple[Any, ...]] = []
+        if not isinstance(result, str):
+            try:
+                own = [(*row, "ok", None) for row in runner.rows(result)]
+            except Exception as error:  # raised by team=, which is called for stored runs, too
+                result = describe_error(error)
+        for row in own or [(TEAM, nan, 0, *[None] * len(runner.metrics), "error", result)]:
+            places.append(place)
+            rows.append((contender, seed, *row))
     factors = table.iloc[places].reset_index(drop=True)
     return factors.join(make_table((*RUN_COLUMNS, *runner.metrics, *STATUS_COLUMNS), rows))
 
 
-def _rows(runner: Runner, result: Result) -> list[tuple[Any, ...]]:
-    """Return agent, return, length, metrics, status and error for each agent and for the team."""
-    if not isinstance(result, str):
-        try:
-            return [(*row, "ok", None) for row in runner.rows(result)]
-        except Exception as error:  # raised by team=, which is called for stored runs, too
-            result = describe_error(error)
-    return [(TEAM, nan, 0, *[None] * len(runner.metrics), "error", result)]
+# -- variants -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A simulation with all changes of an experiment, under one name. Immutable.
+
+    Use ``dataclasses.replace`` to derive another variant.
+
+    Attributes:
+        name: Its name in results.
+        simulation: A simulation (which is copied), its class, or a factory.
+        parameters: The keyword arguments of the class or factory.
+        points: The decision points and their definitions, as ``generate_env`` takes them.
+        plugins: Handlers for its simulations alone, as the option ``plugins`` takes them. Handlers that are given where
+            the variant is used run after these.
+        policies: Policies that decide without being agents, as the option ``policies`` takes them.
+        options: All other options of its environments.
+    """
+
+    name: str
+    simulation: Any
+    _: KW_ONLY
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    points: Points = None
+    plugins: Iterable[Any] = ()
+    policies: Mapping[Any, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise OptionValueError(f"a variant needs a name, not {short_repr(self.name)}")
+        source = self.simulation
+        if isinstance(source, Variant):
+            raise SimulationError(
+                f"the variant {self.name!r} needs a simulation, not the variant {source.name!r}; derive one"
+                " variant from another with dataclasses.replace"
+            )
+        for name in ("parameters", "policies", "options"):
+            value = getattr(self, name)
+            if not isinstance(value, Mapping):
+                raise OptionValueError(f"{name} of the variant {self.name!r} must be a dict, not {short_repr(value)}")
+            # Copied, so that later changes of the arguments do not change the variant.
+            object.__setattr__(self, name, MappingProxyType(dict(value)))
+        object.__setattr__(self, "plugins", tuple(self.plugins))
+        twice = [name for name in ("plugins", "policies") if name in self.options]
+        if twice:
+            raise OptionValueError(
+                f"{' and '.join(twice)} must be arguments of the variant {self.name!r} itself, not among its options"
+            )
+        if self.parameters:
+            what = f"the variant {self.name!r} has parameters, so its simulation must be a class or a factory"
+            check_call(source, self.parameters, SimulationError, what, f"the parameters of the variant {self.name!r}")
+
+    def __reduce__(self) -> Any:
+        # Functions are pickled by name: while environments are in use, hooks may stand in their places.
+        points = self.points
+        if isinstance(points, Mapping):
+            points = {portable(key): definition for key, definition in points.items()}
+        elif points is not None and not isinstance(points, str):
+            points = [portable(key) for key in (points if isinstance(points, Iterable) else [points])]
+        return partial(
+            Variant,
+            self.name,
+            self.simulation,
+            parameters=dict(self.parameters),
+            points=points,
+            plugins=[(handler, portable(target), *rest) for handler, target, *rest in self.plugins],
+            policies={portable(key): policy for key, policy in self.policies.items()},
+            options=dict(self.options),
+        ), ()
+
+    def environment_arguments(self, points: Any, options: Mapping[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
+        """Return simulation, points and options of an environment of this variant, with those that are given to it."""
+        source = partial(self.simulation, **self.parameters) if self.parameters else self.simulation
+        merged = {**self.options, **options}
+        policies = {**self.policies, **(options.get("policies") or {})}
+        plugins = (*self.plugins, *options.get("plugins", ()))
+        if policies:
+            merged["policies"] = policies
+        if plugins:
+            merged["plugins"] = plugins
+        return source, self.points if points is None else points, merged
+
+
+def check_call(
+    source: Any, arguments: Mapping[str, Any], error: type[SimEnvError], requirement: str, described: str
+) -> None:
+    """Check that something is a class or a factory, as ``requirement`` says, and takes the described arguments."""
+    if not callable(source) or (hasattr(source, "run") and not isinstance(source, type)):
+        raise error(f"{requirement}, not {short_repr(source)}")
+    try:
+        inspect.signature(source).bind(**arguments)
+    except TypeError as problem:
+        name = getattr(source, "__qualname__", None) or short_repr(source)
+        raise error(f"{name} cannot be called with {described}: {problem}") from problem
+    except ValueError:  # a builtin without a signature
+        pass

@@ -18,10 +18,10 @@ import os
 import re
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from uuid import uuid4
 
 from ..errors import LONGEST, OptionValueError, StoreError, warn_user
@@ -50,29 +50,28 @@ def to_json(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"))
 
 
-class Stored(NamedTuple):
-    """The contents of a store.
+@contextmanager
+def _explain(what: str) -> Iterator[None]:
+    """Turn errors of the file system into errors that say what cannot be done."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"{what}: {error.strerror or error}") from error
+
+
+class Store:
+    """The folder of an experiment, and its contents when they were read last.
 
     Attributes:
         runs: The result of each run. If a run is stored more than once, a success counts, else the latest error.
-        versions: Pairs of a package and a version with which runs were done.
         sample: A row of the design, as JSON, of which a run has succeeded; empty if there is none.
-        provenances: By contender, the provenance of the first of these runs.
     """
 
-    runs: dict[Run, Result]
-    versions: set[tuple[str, Any]]
-    sample: str
-    provenances: dict[str, Provenance]
-
-
-@dataclass(frozen=True)
-class Store:
-    """The folder of an experiment, whose runs all have these factors (in the order of the design) and metrics."""
-
-    folder: Path
-    factors: Sequence[str]
-    metrics: Sequence[str]
+    def __init__(self, folder: Path, factors: Sequence[str], metrics: Sequence[str]) -> None:
+        """All runs have these factors, in the order of the design, and these metrics."""
+        self.folder, self._factors = folder, factors
+        self._header = {"simenv_marl": VERSION, "factors": sorted(factors), "metrics": sorted(metrics)}
+        self._unusable = f"{folder} cannot be made or read as the folder of an experiment"
 
     def exists(self) -> bool:
         """Return whether the folder is the store of this experiment; False if it is empty or missing.
@@ -82,87 +81,119 @@ class Store:
             StoreError: The folder cannot be read.
         """
         header = self.folder / HEADER
-        try:
+        with _explain(self._unusable):
             found = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
             if not header.exists():  # checked after the others were listed: another process may be writing both
                 if any(not name.startswith((HEADER, ".")) for name in found):
                     raise OptionValueError(f"the folder {self.folder} is not empty, and not the store of an experiment")
                 return False
-            content = json.loads(header.read_bytes())
-        except OSError as error:
-            raise self._unusable(error) from error
+            text = header.read_bytes()
+        try:
+            content = json.loads(text)
         except json.JSONDecodeError as error:
             raise StoreError(f"{header} cannot be read: {error}") from error
         if not isinstance(content, dict) or content.get("simenv_marl") != VERSION:
             raise OptionValueError(f"{header} was not written by this version of simenv_marl")
-        for what, names in (("factors", self.factors), ("metrics", self.metrics)):
-            if content.get(what) != sorted(names):
+        for what in ("factors", "metrics"):
+            if content.get(what) != self._header[what]:
                 raise OptionValueError(
                     f"the store {self.folder} belongs to another experiment: its {what} are {content.get(what)}, not"
-                    f" {sorted(names)}; pass another folder"
+                    f" {self._header[what]}; pass another folder"
                 )
         return True
 
     def create(self) -> None:
         """Make the store, unless it exists. Errors are those of ``exists``."""
-        if self.exists():
-            return
-        header = {"simenv_marl": VERSION, "factors": sorted(self.factors), "metrics": sorted(self.metrics)}
-        fresh = self.folder / f"{HEADER}.{uuid4().hex}"  # renamed as a whole: readers never see half of it
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            try:
-                fresh.write_text(json.dumps(header) + "\n", encoding="ascii")
+        if not self.exists():
+            fresh = self.folder / f"{HEADER}.{uuid4().hex}"  # renamed as a whole: readers never see half of it
+            with _explain(self._unusable):
+                self.folder.mkdir(parents=True, exist_ok=True)
+                fresh.write_text(json.dumps(self._header) + "\n", encoding="ascii")
                 os.replace(fresh, self.folder / HEADER)
-            finally:
-                fresh.unlink(missing_ok=True)
-        except OSError as error:
-            raise self._unusable(error) from error
 
-    def _unusable(self, error: OSError) -> StoreError:
-        reason = error.strerror or error
-        return StoreError(f"{self.folder} cannot be made or read as the folder of an experiment: {reason}")
-
-    def read(self, keys: Sequence[str]) -> Stored:
+    def read(self, keys: Iterable[str]) -> None:
         """Read all runs, after a check with ``exists``. ``keys`` are the rows of the design, as JSON."""
         self.exists()
-        runs: dict[Run, Result] = {}
-        versions: set[tuple[str, Any]] = set()
-        provenances: dict[str, Provenance] = {}
-        sample, texts = "", {key: key for key in keys}  # each text is in memory once, for all runs of its row
-        for (row, contender, seed), result, provenance in self._lines():
-            if not sample and row in texts and not isinstance(result, str):
-                sample = row
-            if row == sample and not isinstance(result, str):
-                provenances.setdefault(contender, provenance)
-            run = texts.setdefault(row, row), contender, seed
-            if isinstance(runs.get(run, ""), str):
-                runs[run] = result
-            versions.update(_versions_in(provenance).items())
-        return Stored(runs, versions, sample, provenances)
+        self.runs: dict[Run, Result] = {}
+        self.sample = ""
+        self._versions: set[tuple[str, Any]] = set()
+        self._provenances: dict[str, Provenance] = {}  # by contender, of the first success of the sample
+        texts = {key: key for key in keys}
+        for path in sorted(self.folder.glob("runs-*.jsonl")):  # in the order in which they were begun
+            with _explain(f"{path} cannot be read"), path.open("rb") as file:
+                for number, line in enumerate(file, 1):
+                    if not line.endswith(b"\n"):
+                        break  # its process was killed, or is still writing
+                    try:
+                        self._add(json.loads(line), texts)
+                    except (ValueError, TypeError, LookupError, AttributeError):  # not JSON, or not a run
+                        warn_user(f"line {number} of {path} cannot be read, so its run counts as missing")
 
-    def _lines(self) -> Iterator[tuple[Run, Result, Provenance]]:
-        """Yield all runs, in the order in which their files were begun."""
-        for path in sorted(self.folder.glob("runs-*.jsonl")):
-            try:
-                with path.open("rb") as file:
-                    for number, line in enumerate(file, 1):
-                        if not line.endswith(b"\n"):
-                            break  # its process was killed, or is still writing
-                        try:
-                            yield self._parsed(json.loads(line))
-                        except (ValueError, TypeError, LookupError, AttributeError):  # not JSON, or not a run
-                            warn_user(f"line {number} of {path} cannot be read, so its run counts as missing")
-            except OSError as error:
-                raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
-
-    def _parsed(self, entry: Any) -> tuple[Run, Result, Provenance]:
-        """Return the contents of a line. If that is not a run, it raises TypeError, LookupError or AttributeError."""
-        run = to_json({name: entry["factors"][name] for name in self.factors}), entry["contender"], entry["seed"]
+    def _add(self, entry: Any, texts: dict[str, str]) -> None:
+        """Add the run of a line. If that is not a run, it raises TypeError, LookupError or AttributeError."""
+        row = to_json({name: entry["factors"][name] for name in self._factors})
+        run = texts.get(row, row), entry["contender"], entry["seed"]  # so that a text is in memory once, for all runs
         result: Result = str(entry["error"])
         if entry["status"] == "ok":
             result = Outcome(*(dict(entry[part].items()) for part in Outcome._fields))
-        return run, result, dict(entry["provenance"].items())
+        self._versions.update(_versions_in(entry["provenance"]).items())
+        if isinstance(self.runs.get(run, ""), str):
+            self.runs[run] = result
+        if not isinstance(result, str) and row in texts and self.sample in ("", row):
+            self.sample = row
+            self._provenances.setdefault(entry["contender"], entry["provenance"])
+
+    # -- what has changed since the runs were stored ----------------------------------------------
+
+    def check_rows(self, keys: Sequence[str]) -> None:
+        """Warn of stored rows that are not in the design. If none is, the store belongs to another experiment."""
+        rows = {row for row, *_ in self.runs}
+        strange = rows - set(keys)
+        if strange and strange == rows:
+            raise OptionValueError(
+                f"the store {self.folder} holds runs of {len(strange)} rows, such as {min(strange)}, but this design"
+                f" has none of them: its first is {keys[0]}; pass another folder, or a design that includes them"
+            )
+        if strange:
+            warn_user(
+                f"the store {self.folder} holds runs of {len(strange)} rows that this design does not have, such as"
+                f" {min(strange)}; they stay in the store, but are not in the table"
+            )
+
+    def warn_of_changes(self, row: str, provenances: Mapping[str, Provenance]) -> None:
+        """Warn if runs are now made of something else than the stored ones. ``provenances`` tell of what, for a row."""
+        now = _versions_in(next(iter(provenances.values()), {}))
+        changes = _changes(sorted(self._versions, key=str), now)
+        if changes:
+            warn_user(f"the store {self.folder} holds runs that were made with other versions: {changes}")
+        for contender, provenance in provenances.items() if row == self.sample else ():
+            then = self._provenances.get(contender, {})
+            changes = _changes(_parts_of(then).items(), _parts_of(provenance))
+            if changes:
+                warn_user(
+                    f"the store {self.folder} holds runs of {contender!r} that were made differently: {changes}; they"
+                    " are kept, so pass another folder if all must be made alike"
+                )
+                return
+
+
+def _versions_in(provenance: Provenance) -> dict[str, Any]:
+    """Return the versions of packages in a provenance."""
+    python = {"python": provenance["python"]} if provenance.get("python") else {}
+    return {**python, **(provenance.get("packages") or {}), **(provenance.get("dependencies") or {})}
+
+
+def _parts_of(provenance: Provenance) -> dict[str, str]:
+    """Return the parts of a provenance that affect results, as text without addresses in memory."""
+    options = {name: value for name, value in (provenance.get("options") or {}).items() if name != "driver"}
+    parts = {**provenance, "options": options}
+    return {part: ADDRESS.sub("", json.dumps(parts[part], sort_keys=True)) for part in MADE_OF if part in parts}
+
+
+def _changes(then: Iterable[tuple[str, Any]], now: Mapping[str, Any]) -> str:
+    """Describe the changes of versions or parts since then."""
+    changes = [(name, str(old), str(now[name])) for name, old in then if old != now.get(name, old)]
+    return "; ".join(f"{name} {old[:LONGEST]} then, {new[:LONGEST]} now" for name, old, new in changes)
 
 
 # -- writing --------------------------------------------------------------------------------------
@@ -188,12 +219,11 @@ class Writer:
                 " share"
             )
         process = _processes.setdefault((os.getpid(), threading.get_ident()), uuid4().hex[:12])
-        self._path = folder / f"runs-{session}-{process}.jsonl"
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
-        try:
-            self._file = os.open(self._path, flags, 0o666)
-        except OSError as error:
-            raise self._unwritable(error) from error
+        path = folder / f"runs-{session}-{process}.jsonl"
+        self._unwritable = f"cannot write to {path}, but what was stored before is still there"
+        with _explain(self._unwritable):
+            self._file = path.open("ab", buffering=0)
+        self.close = self._file.close
 
     def write(self, run: Run, result: Result, provenance: Provenance, trace: str | None = None) -> None:
         """Append the line of a run. ``trace`` is the traceback of an error, for people who read the file."""
@@ -204,79 +234,6 @@ class Writer:
         else:
             entry |= {"status": "ok", "error": None, **result._asdict()}
         left = to_json(entry | {"provenance": provenance}).encode("ascii") + b"\n"
-        before = os.fstat(self._file).st_size
-        try:
+        with _explain(self._unwritable):
             while left:
-                left = left[os.write(self._file, left) :]
-        except BaseException as error:
-            os.ftruncate(self._file, before)
-            if isinstance(error, OSError):
-                raise self._unwritable(error) from error
-            raise
-
-    def close(self) -> None:
-        """Close the file."""
-        os.close(self._file)
-
-    def _unwritable(self, error: OSError) -> StoreError:
-        reason = error.strerror or error
-        return StoreError(f"cannot write to {self._path}: {reason}; what was stored before is still there")
-
-
-# -- what has changed since the runs were stored --------------------------------------------------
-
-
-def _versions_in(provenance: Provenance) -> dict[str, Any]:
-    """Return the versions of packages in a provenance."""
-    python = {"python": provenance["python"]} if provenance.get("python") else {}
-    return {**python, **(provenance.get("packages") or {}), **(provenance.get("dependencies") or {})}
-
-
-def check_rows(store: Store, stored: Stored, keys: Sequence[str]) -> None:
-    """Warn of stored rows that are not in the design. If none is, the store belongs to another experiment."""
-    rows = {row for row, *_ in stored.runs}
-    strange = rows - set(keys)
-    if strange and strange == rows:
-        raise OptionValueError(
-            f"the store {store.folder} holds runs of {len(strange)} rows, such as {min(strange)}, but this design has"
-            f" none of them: its first is {keys[0]}; pass another folder, or a design that includes them"
-        )
-    if strange:
-        warn_user(
-            f"the store {store.folder} holds runs of {len(strange)} rows that this design does not have, such as"
-            f" {min(strange)}; they stay in the store, but are not in the table"
-        )
-
-
-def warn_of_changes(store: Store, stored: Stored, row: str, provenances: Mapping[str, Provenance]) -> None:
-    """Warn if runs are now made of something else than the stored ones. ``provenances`` tell of what, for a row."""
-    now = _versions_in(next(iter(provenances.values()), {}))
-    changes = [
-        f"{name} {version} then, {now[name]} now"
-        for name, version in sorted(stored.versions, key=str)
-        if version != now.get(name, version)
-    ]
-    if changes:
-        warn_user(f"the store {store.folder} holds runs that were made with other versions: {'; '.join(changes)}")
-    if row != stored.sample:
-        return
-    for contender, provenance in provenances.items():
-        parts, then = _parts_of(provenance), _parts_of(stored.provenances.get(contender, {}))
-        changes = [
-            f"{part} {then[part][:LONGEST]} then, {text[:LONGEST]} now"
-            for part, text in parts.items()
-            if text != then.get(part, text)
-        ]
-        if changes:
-            warn_user(
-                f"the store {store.folder} holds runs of {contender!r} that were made differently:"
-                f" {'; '.join(changes)}; they are kept, so pass another folder if all must be made alike"
-            )
-            return
-
-
-def _parts_of(provenance: Provenance) -> dict[str, str]:
-    """Return the parts of a provenance that affect results, as text without addresses in memory."""
-    options = {name: value for name, value in (provenance.get("options") or {}).items() if name != "driver"}
-    parts = {**provenance, "options": options}
-    return {part: ADDRESS.sub("", json.dumps(parts[part], sort_keys=True)) for part in MADE_OF if part in parts}
+                left = left[os.write(self._file.fileno(), left) :]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable
 from contextlib import suppress
-from contextvars import copy_context
+from functools import partial
 from os import getpid
 from sys import modules
 from threading import local
@@ -17,23 +18,17 @@ from ..errors import WrongThreadError
 from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import RULE
-from .driver import FINISHED, NO_EVENTS, Driver, Event, SimulationExit, reporting_rule
-from .loops import ASYNCIO, Loops, silence_unwound_tasks
+from .driver import FINISHED, Driver, Event, SimulationExit, is_exit, reporting_rule
 
 
-class _Home:
-    """The identity of a thread. Unlike the thread's number, it is never reused for another thread."""
+class _Home(local):
+    """What identifies a thread. Unlike the thread's number, it is never reused for another thread."""
+
+    def __init__(self) -> None:
+        self.identity: Any = type("Thread", (), {})()
 
 
-_homes = local()
-
-
-def _home() -> _Home:
-    try:
-        home: _Home = _homes.home
-    except AttributeError:
-        home = _homes.home = _Home()
-    return home
+_home: Final = _Home()
 
 
 class GreenletDriver(Driver):
@@ -51,21 +46,14 @@ class GreenletDriver(Driver):
         """
         super().__init__(plugins, opened)
         self._direct = direct
-        self._home, self._process = ref(_home()), getpid()
-        self._loops = Loops()
+        self._home, self._process = ref(_home.identity), getpid()
+        self._loops = _Loops()
         self._body: Any = greenlet(self._serve)
         self._asker: greenlet | None = None  # the model's own greenlet that waits for an answer
         self._leave: Any = None
         self.resume: Any = self._body.switch
 
     # -- on the user's side -----------------------------------------------------------------------
-
-    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job. The next ``resume`` starts it on the stack."""
-        self.enter()
-        self._job, self._events, self._refused = job, events, None
-        # A new greenlet has an empty context, but the model expects the user's context variables.
-        self._body.gr_context = copy_context() if context is None else context
 
     def enter(self) -> None:
         """Prepare to resume the simulation from the current greenlet.
@@ -96,7 +84,9 @@ class GreenletDriver(Driver):
     @property
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from the current thread."""
-        return self._home() is _home()
+        return self._home() is _home.identity
+
+    at_home = reachable
 
     @property
     def lost(self) -> bool:
@@ -130,6 +120,8 @@ class GreenletDriver(Driver):
         with suppress(GreenletExit):
             self._register()
             while not self.ended:
+                # A new greenlet has an empty context, but the model expects the user's context variables.
+                self._body.gr_context, self._context = self._context, None
                 self._loops.begin()
                 try:
                     event = self._work()
@@ -146,15 +138,15 @@ class GreenletDriver(Driver):
         deliver, driver, loops = event.deliver, self, self._loops
         rule: Any = hook.rule
         if event.report is not None:
-            rule = reporting_rule(hook, event, lambda report: self._decider(hook, report, away))
+            rule = reporting_rule(hook, self._decider(hook, event.report, away))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             if away:
                 driver._ask_from(getcurrent())
             leave, running = driver._leave, loops.running
-            if running is None and ASYNCIO in modules:
-                running = loops.running = modules[ASYNCIO]._get_running_loop
-            looped = running is not None and (running() is not None or loops.users is not None)
+            if running is None and _ASYNCIO in modules:
+                running = loops.running = modules[_ASYNCIO]._get_running_loop
+            looped = running is not None and (running() is not None or loops.swapped)
             if looped:
                 loops.leave()
             try:
@@ -184,3 +176,75 @@ class GreenletDriver(Driver):
 
 _abandoned: Final[list[GreenletDriver]] = []
 """Drivers of simulations that did not unwind. Freeing a greenlet would resume it, at an arbitrary moment."""
+
+
+# -- asyncio --------------------------------------------------------------------------------------
+
+_ASYNCIO: Final = "asyncio.events"
+"""The module that knows a thread's running event loop, whatever its stack. If it is not imported, no loop runs."""
+
+_NO_LOOP: Final = (None, (None, None), 0)
+"""The state of a thread without a loop: the loop, the hooks of asynchronous generators, and the depth of coroutine
+origin tracking."""
+
+
+class _Loops:
+    """The asyncio event loops of a simulation and of its user, which share a thread.
+
+    Attributes:
+        running: Returns the loop that runs in this thread. None until it is known that asyncio is imported.
+        swapped: Whether the simulation's state has replaced the user's while the simulation runs.
+    """
+
+    __slots__ = ("_simulations", "_users", "running", "swapped")
+
+    def __init__(self) -> None:
+        self.running: Callable[[], Any] | None = None
+
+    def begin(self) -> None:
+        """Switch to the simulation for a new job, which begins without a loop."""
+        self._simulations = _NO_LOOP
+        self.enter()
+
+    def enter(self) -> None:
+        """Switch to the simulation's loop, if it or the user has one."""
+        self._users = _present_loop()
+        self.swapped = self._users[0] is not None or self._simulations[0] is not None
+        if self.swapped:
+            _set_loop(self._simulations)
+
+    def leave(self) -> None:
+        """Switch to the user's loop, if the user or the simulation has one."""
+        present = _present_loop()
+        if self.swapped or present[0] is not None:
+            self._simulations = present
+            _set_loop(self._users)
+
+
+def _present_loop() -> Any:
+    events = modules.get(_ASYNCIO)
+    loop = None if events is None else events._get_running_loop()
+    return loop, sys.get_asyncgen_hooks(), sys.get_coroutine_origin_tracking_depth()
+
+
+def _set_loop(state: Any) -> None:
+    loop, hooks, depth = state
+    modules[_ASYNCIO]._set_running_loop(loop)
+    sys.set_asyncgen_hooks(*hooks)
+    sys.set_coroutine_origin_tracking_depth(depth)
+
+
+def silence_unwound_tasks() -> None:
+    """Stop the running loop from reporting tasks that are unwound, because no code can await them any more."""
+    loop = _present_loop()[0]
+    before = None if loop is None else loop.get_exception_handler()
+    if loop is None or isinstance(before, partial):  # it was silenced in an earlier episode
+        return
+    loop.set_exception_handler(partial(_report_task, before or type(loop).default_exception_handler))
+
+
+def _report_task(report: Callable[..., Any], loop: Any, context: dict[str, Any]) -> None:
+    """Handle an exception of a loop, unless its task was unwound, or left over when the loop was closed."""
+    error = context.get("exception")
+    if not is_exit(error) and (error is not None or not loop.is_closed()):
+        report(loop, context)

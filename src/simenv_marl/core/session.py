@@ -22,11 +22,10 @@ from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_u
 from ..hooks.patches import Installation
 from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, environment_context
-from .driver import Driver
+from .driver import Driver, open_resources
 from .episode import LONGEST_TAPE, LOST, Episode
 from .plan import Plan
 from .prototype import DRIVERS
-from .resources import open_resources
 from .rng import GlobalRandom, draws_check, is_seed
 from .run import refusal
 from .spaces import same

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextvars import Context, copy_context
 from os import getpid
 from threading import Lock, Thread, current_thread
 from time import monotonic
@@ -14,7 +13,7 @@ from ..hooks.hook import Hook
 from ..hooks.stacks import SIMULATION, Interceptor
 from ..simulation import RULE, Sentinel
 from .driver import FAILED, FINISHED, NO_EVENTS, SECONDS_TO_UNWIND, Driver, Event, SimulationExit, reporting_rule
-from .loops import silence_unwound_tasks
+from .greenlets import silence_unwound_tasks
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
@@ -33,7 +32,7 @@ class ThreadDriver(Driver):
     interrupted anywhere (by Ctrl-C, for instance), and the threads stay in step.
     """
 
-    __slots__ = ("_arrived", "_context", "_event", "_outcome_event", "_process", "_reply", "_resumed", "_thread")
+    __slots__ = ("_arrived", "_event", "_outcome_event", "_process", "_reply", "_resumed", "_thread")
 
     own_thread = True
 
@@ -46,30 +45,20 @@ class ThreadDriver(Driver):
         self._outcome_event: Event | None = None
         self._reply: Any = _NOTHING
         self._thread: Thread | None = None
-        self._context: Context | None = None
 
     # -- in the user's thread ---------------------------------------------------------------------
 
     def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job. The next ``resume`` starts it on the stack."""
-        self.enter()
-        self._job, self._events, self._refused = job, events, None
-        self._context = copy_context() if context is None else context
+        """Prepare a job, and start the thread if there is none."""
+        super().begin(job, events, context)
         self._event = self._outcome_event = None
         if self._thread is None:
-            self._start()
-
-    def _start(self) -> None:
-        self._resumed.acquire()
-        self._arrived.acquire()
-        self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
-        try:
-            thread.start()
-        except Exception:  # there are too many threads
-            self._thread = None
-            self._resumed.release()
-            self._arrived.release()
-            raise
+            self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
+            try:
+                thread.start()
+            except Exception:  # there are too many threads
+                self._thread = None
+                raise
 
     def enter(self) -> None:
         """Check that the simulation can be resumed from the current process.
@@ -117,14 +106,19 @@ class ThreadDriver(Driver):
         return event
 
     @property
+    def lost(self) -> bool:
+        """Whether this process is a fork, in which the simulation's thread does not exist."""
+        return getpid() != self._process
+
+    @property
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from the current process."""
         return not self.lost
 
     @property
-    def lost(self) -> bool:
-        """Whether this process is a fork, in which the simulation's thread does not exist."""
-        return getpid() != self._process
+    def at_home(self) -> bool:
+        """Whether this code runs in the simulation's thread."""
+        return current_thread() is self._thread
 
     def end(self) -> None:
         """End the stack, whose job has ended or is lost, and wait for the end of its thread.
@@ -165,8 +159,7 @@ class ThreadDriver(Driver):
             self._forget_stack()
 
     def _do(self) -> None:
-        context: Any = self._context
-        self._context = None
+        context, self._context = self._context, None
         try:
             event: Event = context.run(self._work)
         except BaseException as error:  # raised from another thread; without an event the user would wait for ever
@@ -196,7 +189,7 @@ class ThreadDriver(Driver):
         deliver = event.deliver
         rule: Any = hook.rule
         if event.report is not None:
-            rule = reporting_rule(hook, event, lambda report: self._decider(hook, report))
+            rule = reporting_rule(hook, self._decider(hook, event.report))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             self._event = (event, args, kwargs)

@@ -27,10 +27,11 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
+from .context import preserve_generators
 from .forking import end_with, loops_on, separator, sockets_of
 from .packing import pack_error, pack_plainly, unpack, unpack_error
 from .reuse import reuse_resources
-from .rng import is_seed, process_kept, seed_process
+from .rng import is_seed, seed_process
 
 Result = TypeVar("Result")
 
@@ -165,7 +166,7 @@ def _check(n: Any, method: Any, seeds: Any, time_limit: Any, *, can_fork: bool) 
 
 def _call_in_replay(env: Any, view: Any, function: Callable[[Any, int], Result], number: int) -> Result:
     """Call a function on a copy of an environment whose simulation repeats the episode."""
-    with process_kept():  # the model may draw from the process's generators, then and now
+    with preserve_generators():  # the model may draw from the process's generators, then and now
         twin = view.replayed()
         try:
             result = function(copy.deepcopy(env, {id(view): twin}), number)  # copies each wrapper with its state

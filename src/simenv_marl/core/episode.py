@@ -42,12 +42,11 @@ from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
-from .context import ExclusiveLock
+from .context import ExclusiveLock, GlobalRandom
 from .delegation import consult, decide_too_late, decide_unless_forced, decides_after_end
 from .driver import WAIT, Driver
 from .plan import Plan
 from .point import Point
-from .rng import GlobalRandom
 from .rounds import Rounds
 from .run import Run
 from .spaces import duplicate

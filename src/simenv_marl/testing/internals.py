@@ -9,10 +9,9 @@ from typing import Any, Final
 from greenlet import getcurrent
 
 from ..core.actions import MASK
-from ..core.context import environment_context
+from ..core.context import GlobalRandom, environment_context
 from ..core.driver import SimulationExit
 from ..core.plan import Plan
-from ..core.rng import GlobalRandom
 from ..decision import DecisionPoint
 from ..envs.make import VIEWS, view_class
 from ..hooks.patches import Installation

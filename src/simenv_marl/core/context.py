@@ -1,4 +1,4 @@
-"""The context in which an environment's code runs on the user's side, with its own global random generators.
+"""Contexts: an environment's code on the user's side, with its own global generators; reused resources.
 
 Models that draw from ``random`` and ``numpy.random`` share one state with the whole process. With ``global_rng=True``
 an environment has a state of its own, which is in place while the environment runs; afterwards the state of whatever
@@ -10,7 +10,9 @@ from __future__ import annotations
 import random
 import sys
 from _random import Random as Twister
+from collections.abc import Hashable
 from contextlib import suppress
+from contextvars import ContextVar
 from copy import deepcopy
 from ctypes import memmove, string_at
 from os import getpid
@@ -87,14 +89,17 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
             self._lock.__enter__()
         try:
             super().__enter__()
-            if self._enters is not None:
-                self._enters.enter()
-            if self._rng is not None:
-                self._rng.enter()
+            try:
+                if self._enters is not None:
+                    self._enters.enter()
+                if self._rng is not None:
+                    self._rng.enter()
+            except BaseException:
+                super().__exit__()
+                raise
         except BaseException:
             if self._lock is not None:
                 self._lock.__exit__()
-            super().__exit__()
             raise
 
     def __exit__(self, *error: object) -> None:
@@ -240,3 +245,49 @@ class preserve_generators:  # noqa: N801 - it is used like a function; not a gen
         load_generators(self._state)
         if self._torch is not None:
             generator_of_torch().set_state(self._torch)
+
+
+# -- resources that several simulations use -------------------------------------------------------
+
+_FREE: Final[ContextVar[dict[Hashable, list[Any]] | None]] = ContextVar("simenv_marl.free", default=None)
+"""The free resources of the current block, by the arguments that made them. None outside of a block."""
+
+
+class reuse_resources:  # noqa: N801 - as above
+    """Reuse the resources of closed simulations for new ones, until the end of the block.
+
+    Starting a process often takes longer than an episode. A resource has ``usable``, ``close_input()``, which asks it
+    to end, and ``close()``, which waits for its end. Within another such block this does nothing.
+    """
+
+    def __enter__(self) -> None:
+        self._token = _FREE.set({}) if _FREE.get() is None else None
+
+    def __exit__(self, *error: object) -> None:
+        if self._token is None:
+            return
+        resources = [resource for alike in (_FREE.get() or {}).values() for resource in alike]
+        _FREE.reset(self._token)
+        for resource in resources:  # first for all of them, so that they end at the same time
+            resource.close_input()
+        for resource in resources:
+            resource.close()
+
+
+def release(key: Hashable, resource: Any) -> bool:
+    """Leave a resource to later simulations; return False if it is not usable, or if there is no block."""
+    free = _FREE.get()
+    if free is None or not resource.usable:
+        return False
+    free.setdefault(key, []).append(resource)
+    return True
+
+
+def acquire(key: Hashable) -> Any:
+    """Return a usable resource that was released under an equal key; None if there is none."""
+    alike = (_FREE.get() or {}).get(key, [])
+    while alike:
+        resource = alike.pop()
+        if resource.usable:
+            return resource
+    return None

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from os import getpid
-from threading import Lock, Thread, current_thread
-from time import monotonic
+from queue import Empty, SimpleQueue
+from threading import Thread, current_thread
 from typing import Any, Final
 
 from ..errors import WrongThreadError, warn_user
@@ -18,7 +19,6 @@ from .greenlets import silence_unwound_tasks
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
 
-_NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
 _JOB: Final = Sentinel("JOB")
 _END: Final = Sentinel("END")
@@ -27,12 +27,11 @@ _END: Final = Sentinel("END")
 class ThreadDriver(Driver):
     """A driver that runs a simulation in a thread of its own. The first ``begin`` starts it, and ``end`` joins it.
 
-    Only one of the two threads runs at a time. They hand over values in ``_reply`` and ``_event``. Each of these has a
-    lock that wakes the waiting thread. Only the values count, and not how often a lock was released. So a wait may be
-    interrupted anywhere (by Ctrl-C, for instance), and the threads stay in step.
+    Only one of the two threads runs at a time. They hand over replies and events in two queues. An interrupt (Ctrl-C,
+    for instance) may leave a reply or an event in its queue, or lose an event; ``throw`` and ``begin`` empty both.
     """
 
-    __slots__ = ("_arrived", "_event", "_outcome_event", "_process", "_reply", "_resumed", "_thread")
+    __slots__ = ("_arrived", "_process", "_replies", "_thread")
 
     own_thread = True
 
@@ -40,10 +39,8 @@ class ThreadDriver(Driver):
         """Prepare a thread, as ``Driver`` does; ``caller`` is always None."""
         super().__init__(plugins, opened)
         self._process = getpid()
-        self._resumed, self._arrived = Lock(), Lock()
-        self._event: Event | None = None
-        self._outcome_event: Event | None = None
-        self._reply: Any = _NOTHING
+        self._replies: SimpleQueue[Any] = SimpleQueue()
+        self._arrived: SimpleQueue[Event] = SimpleQueue()
         self._thread: Thread | None = None
 
     # -- in the user's thread ---------------------------------------------------------------------
@@ -51,7 +48,8 @@ class ThreadDriver(Driver):
     def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
         """Prepare a job, and start the thread if there is none."""
         super().begin(job, events, context)
-        self._event = self._outcome_event = None
+        _empty(self._replies)
+        _empty(self._arrived)
         if self._thread is None:
             self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
             try:
@@ -74,13 +72,12 @@ class ThreadDriver(Driver):
 
     def resume(self, reply: Any) -> Event:
         """Resume the simulation with a reply; return its next event."""
-        self._reply = reply if self._job is None else _JOB
-        _wake(self._resumed)
-        arrived = self._arrived
-        while (event := self._event) is None:
-            arrived.acquire(True, _LONGEST_WAIT)
-        self._event = self._outcome_event = None
-        return event
+        self._replies.put(reply if self._job is None else _JOB)
+        while True:
+            try:
+                return self._arrived.get(True, _LONGEST_WAIT)
+            except Empty:
+                continue
 
     def throw(self) -> Event | None:
         """Raise ``SimulationExit`` in the suspended simulation; return its next event, or None if none comes in time.
@@ -88,22 +85,16 @@ class ThreadDriver(Driver):
         If the simulation still runs, because the user's wait was interrupted, the exit is raised at its next decision.
         """
         self.enter()
-        if self._thread is None or (self.idle and self._outcome_event is None and self._reply is not _JOB):
-            return FINISHED, [None], None
-        patience = monotonic() + SECONDS_TO_UNWIND
+        if self.idle or _JOB in _empty(self._replies):  # the job has ended, or was interrupted before it began
+            self._job = None
+            ends = [event for event in _empty(self._arrived) if event[0] is FINISHED or event[0] is FAILED]
+            return ends[-1] if ends else (FINISHED, [None], None)
         self._exiting = True
-        self._event = None
-        if not (self.idle and self._reply is _JOB):  # else the job begins, and gets the exit at its first decision
-            self._reply = _EXIT
-            _wake(self._resumed)
-        # ``_outcome_event`` keeps the end of the job, even if it came before this call.
-        while (event := self._outcome_event or self._event) is None:
-            left = patience - monotonic()
-            if left <= 0:
-                return None
-            self._arrived.acquire(timeout=left)
-        self._event = self._outcome_event = None
-        return event
+        self._replies.put(_EXIT)
+        try:
+            return self._arrived.get(True, SECONDS_TO_UNWIND)
+        except Empty:
+            return None
 
     @property
     def lost(self) -> bool:
@@ -128,10 +119,9 @@ class ThreadDriver(Driver):
         if self.ended and not self.idle:
             return
         thread = self._thread
-        self._event = self._outcome_event = None
+        _empty(self._arrived)
         if self.idle and thread is not None and thread is not current_thread() and not self.lost:
-            self._reply = _END
-            _wake(self._resumed)
+            self._replies.put(_END)
             if thread.ident is not None:  # otherwise an interrupt came before the thread started
                 thread.join(SECONDS_TO_UNWIND)
             if thread.is_alive():
@@ -151,7 +141,7 @@ class ThreadDriver(Driver):
     def _serve(self) -> None:
         self._register()
         try:
-            while not self.ended and (reply := self._wait()) is not _END:
+            while not self.ended and (reply := self._replies.get()) is not _END:
                 if reply is _JOB:
                     self._do()
                 reply = None
@@ -175,26 +165,17 @@ class ThreadDriver(Driver):
                 raise event[1].pop()  # the model has forked, and this process has no user to tell
             return
         self.idle = True
-        self._event = self._outcome_event = event
-        _wake(self._arrived)
-
-    def _wait(self) -> Any:
-        resumed = self._resumed
-        while self._reply is _NOTHING:
-            resumed.acquire()
-        reply, self._reply = self._reply, _NOTHING
-        return reply
+        self._arrived.put(event)
 
     def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
-        deliver = event.deliver
+        deliver, ask, answer = event.deliver, self._arrived.put, self._replies.get
         rule: Any = hook.rule
         if event.report is not None:
             rule = reporting_rule(hook, self._decider(hook, event.report))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-            self._event = (event, args, kwargs)
-            _wake(self._arrived)
-            reply = self._wait()
+            ask((event, args, kwargs))
+            reply = answer()
             if reply is RULE:
                 return rule(*args, **kwargs)
             if reply is _EXIT:
@@ -205,7 +186,10 @@ class ThreadDriver(Driver):
         return decide
 
 
-def _wake(lock: Any) -> None:
-    """Wake the thread that waits for a lock, or let its next wait return at once."""
-    if lock.locked():
-        lock.release()
+def _empty(queue: SimpleQueue[Any]) -> list[Any]:
+    """Take all values from a queue."""
+    values = []
+    with suppress(Empty):
+        while True:
+            values.append(queue.get_nowait())
+    return values

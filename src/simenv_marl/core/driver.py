@@ -15,7 +15,7 @@ opens: a decision in such a thread is refused, and none of them continues in a f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextvars import Context, copy_context
 from functools import partial, wraps
 from multiprocessing.process import BaseProcess
@@ -128,8 +128,8 @@ class Driver:
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_events", "_exiting", "_has_started_threads", "_job", "_process_refused",
-        "_refused", "caller", "ended", "given_up", "idle", "opened", "plugins", "stack",
+        "__weakref__", "_context", "_events", "_exiting", "_handled", "_has_started_threads", "_job",
+        "_process_refused", "_refused", "caller", "ended", "given_up", "idle", "opened", "plugins", "stack",
     )  # fmt: skip
 
     resume: Any
@@ -152,6 +152,7 @@ class Driver:
             opened: What the simulation has opened on an earlier stack.
         """
         self.plugins = plugins
+        self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.opened: list[Any] = [] if opened is None else opened
         self.stack: greenlet | None = None
         self.caller: greenlet | None = None
@@ -166,17 +167,13 @@ class Driver:
     # -- on the user's side -----------------------------------------------------------------------
 
     def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job. The next ``resume`` starts it on the stack.
+        """Prepare a job. After ``enter``, the next ``resume`` starts it on the stack.
 
         Args:
             job: The function to run.
             events: The events to send, by hook. All other functions run their rule.
             context: The context variables of the job. None: a copy of the user's.
-
-        Raises:
-            WrongThreadError: The stack cannot be resumed from here.
         """
-        self.enter()
         self._job, self._events, self._refused = job, events, None
         self._context = copy_context() if context is None else context
 
@@ -192,6 +189,7 @@ class Driver:
             BaseException: Any error that the job raises.
         """
         try:
+            self.enter()
             self.begin(job, context=context)
             kind, box, _ = self.resume(None)
         except BaseException:
@@ -242,16 +240,15 @@ class Driver:
         self.idle = self._exiting = False
         job, self._job = self._job, None
         try:
-            self._enter_hooks()
+            if self._events or self._handled:
+                self._enter_hooks()
             result = job()
         except BaseException as error:
             return FAILED, [self._explain(error)], None
         finally:
             job = None
-            events, self._events = self._events, NO_EVENTS
-            self._leave_hooks(events)
-            if self.plugins is not None and not self.ended:
-                self._enter_hooks()
+            self._leave_hooks()
+            self._events = NO_EVENTS
         return (FINISHED, [result], None) if self._refused is None else (FAILED, [self.refusal()], None)
 
     def _explain(self, error: BaseException) -> BaseException:
@@ -272,7 +269,7 @@ class Driver:
     def _forget_stack(self) -> None:
         """Unregister the stack. From now on it takes no part in decisions."""
         self.ended = True
-        self._leave_hooks(self._hooks())
+        self._leave_hooks()
         self._events = NO_EVENTS
         stack, self.stack = self.stack, None
         if stack is not None:
@@ -306,7 +303,7 @@ class Driver:
     def hide(self) -> None:
         """On the stack, leave all hooks, so that the driver takes no part in calls until ``show``."""
         if getcurrent() is self.stack:
-            self._leave_hooks(self._hooks())
+            self._leave_hooks()
 
     def show(self) -> None:
         """On the stack, enter all hooks, so that the driver takes part in calls."""
@@ -316,19 +313,17 @@ class Driver:
     def _enter_hooks(self) -> None:
         stack = self.stack
         if stack is not None:
-            for hook in self._hooks():
+            for hook in (*self._events, *self._handled):
                 hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
                 if self._has_started_threads:
                     hook.interceptors.others.add(self)
 
-    def _leave_hooks(self, hooks: Iterable[Hook]) -> None:
-        if self.stack is not None:
-            for hook in hooks:
-                hook.leave(self.stack)
+    def _leave_hooks(self) -> None:
+        stack = self.stack
+        if stack is not None:
+            for hook in (*self._events, *self._handled):
+                hook.leave(stack)
                 hook.interceptors.others.discard(self)
-
-    def _hooks(self) -> list[Hook]:
-        return [*self._events, *(() if self.plugins is None else self.plugins.hooks)]
 
     # -- refusals ---------------------------------------------------------------------------------
 
@@ -407,6 +402,7 @@ def _watch_resources() -> None:
     if bool(STACKS) == bool(_PATCHES):
         return
     with LOCK:
+        owner: type
         for owner, name in _OPENING if STACKS and not _PATCHES else ():
             before = vars(owner)[name]
             patch = _noting(before)

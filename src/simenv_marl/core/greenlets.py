@@ -61,7 +61,7 @@ class GreenletDriver(Driver):
         Raises:
             WrongThreadError: The simulation belongs to another thread.
         """
-        if self._body is None or not self.reachable:
+        if self._body is None or self._home() is not _home.identity:
             raise WrongThreadError(
                 "the simulation is suspended in another thread, the one that called reset(); step, reset and close the"
                 ' environment there, or make it with driver="thread", which allows any thread'
@@ -96,7 +96,7 @@ class GreenletDriver(Driver):
     @property
     def usable(self) -> bool:
         """Whether a job can begin in the current thread."""
-        return super().usable and not self._body.dead
+        return self.idle and not self.ended and self._home() is _home.identity and not self._body.dead
 
     def end(self) -> None:
         """End the stack."""
@@ -122,7 +122,8 @@ class GreenletDriver(Driver):
             while not self.ended:
                 # A new greenlet has an empty context, but the model expects the user's context variables.
                 self._body.gr_context, self._context = self._context, None
-                self._loops.begin()
+                self._loops.simulations = _NO_LOOP  # each job begins without a loop
+                self._loops.enter()
                 try:
                     event = self._work()
                 finally:
@@ -193,31 +194,28 @@ class _Loops:
 
     Attributes:
         running: Returns the loop that runs in this thread. None until it is known that asyncio is imported.
+        simulations: The simulation's state while the user runs.
         swapped: Whether the simulation's state has replaced the user's while the simulation runs.
     """
 
-    __slots__ = ("_simulations", "_users", "running", "swapped")
+    __slots__ = ("_users", "running", "simulations", "swapped")
 
     def __init__(self) -> None:
         self.running: Callable[[], Any] | None = None
-
-    def begin(self) -> None:
-        """Switch to the simulation for a new job, which begins without a loop."""
-        self._simulations = _NO_LOOP
-        self.enter()
+        self.simulations: Any = _NO_LOOP
 
     def enter(self) -> None:
         """Switch to the simulation's loop, if it or the user has one."""
         self._users = _present_loop()
-        self.swapped = self._users[0] is not None or self._simulations[0] is not None
+        self.swapped = self._users[0] is not None or self.simulations[0] is not None
         if self.swapped:
-            _set_loop(self._simulations)
+            _set_loop(self.simulations)
 
     def leave(self) -> None:
         """Switch to the user's loop, if the user or the simulation has one."""
         present = _present_loop()
         if self.swapped or present[0] is not None:
-            self._simulations = present
+            self.simulations = present
             _set_loop(self._users)
 
 

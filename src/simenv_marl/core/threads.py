@@ -28,7 +28,8 @@ class ThreadDriver(Driver):
     """A driver that runs a simulation in a thread of its own. The first ``begin`` starts it, and ``end`` joins it.
 
     Only one of the two threads runs at a time. They hand over replies and events in two queues. An interrupt (Ctrl-C,
-    for instance) may leave a reply or an event in its queue, or lose an event; ``throw`` and ``begin`` empty both.
+    for instance) may leave a reply or an event in its queue, or lose an event. So the simulation's thread ignores all
+    replies between two jobs, and each job has a queue of its own for events.
     """
 
     __slots__ = ("_arrived", "_process", "_replies", "_thread")
@@ -48,8 +49,7 @@ class ThreadDriver(Driver):
     def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
         """Prepare a job, and start the thread if there is none."""
         super().begin(job, events, context)
-        _empty(self._replies)
-        _empty(self._arrived)
+        self._arrived = SimpleQueue()
         if self._thread is None:
             self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
             try:
@@ -85,10 +85,12 @@ class ThreadDriver(Driver):
         If the simulation still runs, because the user's wait was interrupted, the exit is raised at its next decision.
         """
         self.enter()
-        if self.idle or _JOB in _empty(self._replies):  # the job has ended, or was interrupted before it began
+        if self.idle:  # the job has ended, or was interrupted before it began
+            with suppress(Empty):
+                while True:
+                    self._replies.get_nowait()
             self._job = None
-            ends = [event for event in _empty(self._arrived) if event[0] is FINISHED or event[0] is FAILED]
-            return ends[-1] if ends else (FINISHED, [None], None)
+            return (FINISHED, [None], None) if self._arrived.empty() else self._arrived.get()
         self._exiting = True
         self._replies.put(_EXIT)
         try:
@@ -119,8 +121,9 @@ class ThreadDriver(Driver):
         if self.ended and not self.idle:
             return
         thread = self._thread
-        _empty(self._arrived)
+        self._arrived = SimpleQueue()
         if self.idle and thread is not None and thread is not current_thread() and not self.lost:
+            self.ended = True  # first, because after an interrupt no job must begin that would come after ``_END``
             self._replies.put(_END)
             if thread.ident is not None:  # otherwise an interrupt came before the thread started
                 thread.join(SECONDS_TO_UNWIND)
@@ -184,12 +187,3 @@ class ThreadDriver(Driver):
             return reply if deliver is None else deliver(reply, *args, **kwargs)
 
         return decide
-
-
-def _empty(queue: SimpleQueue[Any]) -> list[Any]:
-    """Take all values from a queue."""
-    values = []
-    with suppress(Empty):
-        while True:
-            values.append(queue.get_nowait())
-    return values

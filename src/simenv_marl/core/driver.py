@@ -9,13 +9,13 @@ a job they are ``FINISHED`` or ``FAILED``, a list with the result or the error, 
 list, because the waiting stack still refers to it. The episode calls the event's ``handle``, which returns the reply.
 
 On the simulation's side a driver enters its stack into the hooks of the model's functions, each with the interceptor
-that sends an event and carries out the reply. It also notes the threads, processes and sockets that the simulation
-opens: a decision in such a thread is refused, and none of them continues in a forked process.
+that sends an event and carries out the reply. It also notes what the simulation opens: decisions in its threads are
+refused, and threads, processes and sockets do not continue in a forked process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextvars import Context, copy_context
 from functools import partial, wraps
 from multiprocessing.process import BaseProcess
@@ -24,7 +24,7 @@ from subprocess import Popen
 from threading import Thread
 from types import MappingProxyType
 from typing import Any, Final
-from weakref import ref
+from weakref import WeakSet
 
 from greenlet import getcurrent, greenlet
 
@@ -123,8 +123,8 @@ class Driver:
         reachable: Whether the simulation can be resumed from the current thread and process.
         lost: Whether no thread of this process can resume the simulation any more.
         at_home: Whether this code runs in the simulation's thread.
-        opened: Weak references to the sockets, processes and threads that the simulation has opened: see
-            ``open_resources``.
+        own_thread: Whether the simulation has a thread of its own.
+        opened: The sockets, processes and threads that the simulation has opened: see ``open_resources``.
     """
 
     __slots__ = (
@@ -140,11 +140,11 @@ class Driver:
     reachable: Any
     lost: Any
     at_home: Any
+    _decider: Any
 
     own_thread = False
-    """Whether the simulation has a thread of its own."""
 
-    def __init__(self, plugins: Any = None, opened: list[Any] | None = None) -> None:
+    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None) -> None:
         """Prepare a driver. The first job begins the stack.
 
         Args:
@@ -153,7 +153,7 @@ class Driver:
         """
         self.plugins = plugins
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
-        self.opened: list[Any] = [] if opened is None else opened
+        self.opened: WeakSet[Any] = WeakSet() if opened is None else opened
         self.stack: greenlet | None = None
         self.caller: greenlet | None = None
         self.given_up: str | None = None
@@ -294,11 +294,8 @@ class Driver:
             return self.refuse(hook, self._process_refused)
         if away and not self.at_home:
             return self.refuse(hook, "a thread that the simulation has started")
-        return self._decider(hook, event, away)
-
-    def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
-        """Make the function that sends an event for the calls of a hook, and carries out the replies."""
-        raise NotImplementedError
+        decide: Interceptor = self._decider(hook, event, away)
+        return decide
 
     def hide(self) -> None:
         """On the stack, leave all hooks, so that the driver takes no part in calls until ``show``."""
@@ -402,16 +399,15 @@ def _watch_resources() -> None:
     if bool(STACKS) == bool(_PATCHES):
         return
     with LOCK:
-        owner: type
         for owner, name in _OPENING if STACKS and not _PATCHES else ():
             before = vars(owner)[name]
             patch = _noting(before)
             setattr(owner, name, patch)
             _PATCHES.append((owner, name, before, patch))
         while _PATCHES and not STACKS:
-            owner, name, before, patch = _PATCHES.pop()
-            if vars(owner)[name] is patch:  # else other code has replaced the patch, and may still call it
-                setattr(owner, name, before)
+            patched, name, before, patch = _PATCHES.pop()
+            if vars(patched)[name] is patch:  # else other code has replaced the patch, and may still call it
+                setattr(patched, name, before)
 
 
 def _noting(method: Any) -> Any:
@@ -423,7 +419,7 @@ def _noting(method: Any) -> Any:
             driver.refuse_threads()
         method(self, *args, **kwargs)
         if driver is not None:
-            driver.opened.append(ref(self))
+            driver.opened.add(self)
 
     return note
 
@@ -438,25 +434,16 @@ def _run_registered(driver: Driver, run: Callable[[], None]) -> None:
         STACKS.pop(here, None)
 
 
-def open_resources(opened: list[Any]) -> dict[Any, str]:
-    """Describe each thing that is still alive or open, in a few words.
-
-    Args:
-        opened: Weak references to what a simulation has opened. Those of things that are gone are removed.
-
-    Returns:
-        The descriptions, by thing; by descriptor for sockets.
-    """
+def open_resources(opened: Iterable[Any]) -> dict[Any, str]:
+    """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
     found: dict[Any, str] = {}
-    opened[:] = [reference for reference in opened if reference() is not None]
-    for reference in opened:
-        thing = reference()
-        if isinstance(thing, socket):
-            if thing.fileno() >= 0:
-                found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
-        elif isinstance(thing, Thread):
-            if thing.is_alive():
-                found[thing] = "a thread"
-        elif thing is not None and (thing.returncode if isinstance(thing, Popen) else thing.exitcode) is None:
-            found[thing] = f"a child process ({thing.pid})"
+    for thing in list(opened):
+        if isinstance(thing, socket) and thing.fileno() >= 0:
+            found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
+        elif isinstance(thing, Thread) and thing.is_alive():
+            found[thing] = "a thread"
+        elif isinstance(thing, (Popen, BaseProcess)):
+            code = thing.returncode if isinstance(thing, Popen) else thing.exitcode
+            if code is None:
+                found[thing] = f"a child process ({thing.pid})"
     return found

@@ -10,7 +10,7 @@ from os import getpid
 from sys import modules
 from threading import local
 from typing import Any, Final
-from weakref import ref
+from weakref import WeakSet, ref
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -36,7 +36,7 @@ class GreenletDriver(Driver):
 
     __slots__ = ("_asker", "_body", "_direct", "_home", "_leave", "_loops", "_process", "resume")
 
-    def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
+    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None, *, direct: bool = True) -> None:
         """Prepare a greenlet, as ``Driver`` does.
 
         Args:
@@ -136,6 +136,7 @@ class GreenletDriver(Driver):
                 self._leave(*event)
 
     def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
+        """Make the function that sends an event for the calls of a hook, and carries out the replies."""
         deliver, driver, loops = event.deliver, self, self._loops
         rule: Any = hook.rule
         if event.report is not None:

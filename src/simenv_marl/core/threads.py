@@ -8,6 +8,7 @@ from os import getpid
 from queue import Empty, SimpleQueue
 from threading import Thread, current_thread
 from typing import Any, Final
+from weakref import WeakSet
 
 from ..errors import WrongThreadError, warn_user
 from ..hooks.hook import Hook
@@ -36,7 +37,7 @@ class ThreadDriver(Driver):
 
     own_thread = True
 
-    def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
+    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None, *, direct: bool = True) -> None:
         """Prepare a thread, as ``Driver`` does; ``caller`` is always None."""
         super().__init__(plugins, opened)
         self._process = getpid()
@@ -171,6 +172,7 @@ class ThreadDriver(Driver):
         self._arrived.put(event)
 
     def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
+        """Make the function that sends an event for the calls of a hook, and carries out the replies."""
         deliver, ask, answer = event.deliver, self._arrived.put, self._replies.get
         rule: Any = hook.rule
         if event.report is not None:

@@ -73,13 +73,9 @@ class environment_context(outside_simulation):  # noqa: N801 - it is used like a
         lock: ExclusiveLock | None = None,
         driver: Any = None,
     ) -> None:
-        """Prepare the context.
+        """Prepare the context of an environment's plugins, generators and lock, where it has these.
 
-        Args:
-            evaluation: The environment's plugins. None if it has none.
-            rng: The environment's own state of the global generators. None if it has none.
-            lock: The lock that lets one thread at a time use the environment. None if only one thread can use it.
-            driver: The driver to enter, if the simulation is going to be resumed. None if it is not.
+        The driver is entered; without one, the simulation cannot be resumed inside.
         """
         super().__init__(evaluation)
         self._rng, self._lock, self._enters = rng, lock, driver
@@ -150,8 +146,7 @@ generators' own functions copy them, which takes 150 microseconds."""
 def save_generators(*, copy: bool = False) -> tuple[Any, Any, Any]:
     """Return the state of the global generators: NumPy's bit generator, and what else the two hold.
 
-    Args:
-        copy: Whether to copy the bit generator, so that other code that draws from it does not change the saved state.
+    Other code that draws from a bit generator that is not copied changes the saved state.
     """
     generator = _legacy.get_bit_generator()
     if copy:
@@ -200,11 +195,7 @@ class GlobalRandom:
         seed_for_environment(seed)
 
     def enter(self) -> None:
-        """Put this state in place.
-
-        Raises:
-            WrongThreadError: The state of another environment, which runs in another thread, is in place.
-        """
+        """Put this state in place, unless another thread has put that of another environment in place."""
         thread = get_ident()
         nested = current_thread().name == SIMULATION  # its user waits in another thread meanwhile
         if self._entered and self._entered[-1]._thread != thread and not nested:

@@ -116,7 +116,7 @@ class Driver:
     Attributes:
         stack: The simulation's stack. None before the first job, and after the end.
         caller: The greenlet from which ``resume`` may be called directly. None: ``enter`` must be called before.
-        plugins: The plugins of the simulation's environment. None if it has none.
+        plugins: The plugins of the simulation's environment, which apply to all code on the stack. None if it has none.
         given_up: The reason why a job was given up. None if no job was.
         ended: Whether the stack has ended.
         idle: Whether no job is under way.
@@ -145,12 +145,7 @@ class Driver:
     own_thread = False
 
     def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None) -> None:
-        """Prepare a driver. The first job begins the stack.
-
-        Args:
-            plugins: The plugins of the simulation's environment. They apply to all code that runs on the stack.
-            opened: What the simulation has opened on an earlier stack.
-        """
+        """Prepare a driver. The first job begins the stack. ``opened``: what was opened on an earlier stack."""
         self.plugins = plugins
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
         self.opened: WeakSet[Any] = WeakSet() if opened is None else opened
@@ -167,12 +162,9 @@ class Driver:
     # -- on the user's side -----------------------------------------------------------------------
 
     def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job. After ``enter``, the next ``resume`` starts it on the stack.
+        """Prepare a job, with the events to send by hook. After ``enter``, the next ``resume`` starts it on the stack.
 
-        Args:
-            job: The function to run.
-            events: The events to send, by hook. All other functions run their rule.
-            context: The context variables of the job. None: a copy of the user's.
+        All other functions run their rule. Without a context, the job gets a copy of the user's context variables.
         """
         self._job, self._events, self._refused = job, events, None
         self._context = copy_context() if context is None else context
@@ -183,11 +175,7 @@ class Driver:
         return self.idle and not self.ended and bool(self.reachable)
 
     def run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
-        """Run a job to its end, during which decision functions run their rule; return its result.
-
-        Raises:
-            BaseException: Any error that the job raises.
-        """
+        """Run a job to its end, during which decision functions run their rule; return its result."""
         try:
             self.enter()
             self.begin(job, context=context)
@@ -283,9 +271,7 @@ class Driver:
     def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
         """Return the interceptor for calls of a hook; None if the rule decides.
 
-        Args:
-            hook: The hook.
-            away: Whether the calls come from the model's own greenlets or threads, and not from the stack itself.
+        Calls that are ``away`` come from the model's own greenlets or threads, and not from the stack itself.
         """
         event = self._events.get(hook)
         if event is None:

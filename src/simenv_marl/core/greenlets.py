@@ -37,13 +37,7 @@ class GreenletDriver(Driver):
     __slots__ = ("_asker", "_body", "_direct", "_home", "_leave", "_loops", "_process", "resume")
 
     def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None, *, direct: bool = True) -> None:
-        """Prepare a greenlet, as ``Driver`` does.
-
-        Args:
-            plugins: The plugins of the simulation's environment.
-            opened: What the simulation has opened on an earlier stack.
-            direct: Whether ``resume`` may be called without ``enter``. If False, ``caller`` stays None.
-        """
+        """Prepare a greenlet, as ``Driver`` does; unless ``direct``, ``caller`` stays None."""
         super().__init__(plugins, opened)
         self._direct = direct
         self._home, self._process = ref(_home.identity), getpid()
@@ -56,11 +50,7 @@ class GreenletDriver(Driver):
     # -- on the user's side -----------------------------------------------------------------------
 
     def enter(self) -> None:
-        """Prepare to resume the simulation from the current greenlet.
-
-        Raises:
-            WrongThreadError: The simulation belongs to another thread.
-        """
+        """Prepare to resume the simulation from the current greenlet."""
         if self._body is None or self._home() is not _home.identity:
             raise WrongThreadError(
                 "the simulation is suspended in another thread, the one that called reset(); step, reset and close the"

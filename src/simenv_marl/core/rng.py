@@ -42,14 +42,10 @@ TOO_SHORT: Final = 100_000
 
 
 def draws_check(simulation: Any, *, in_thread: bool) -> Callable[[], None] | None:
-    """Begin to check whether a simulation draws from the global generators.
+    """Begin to check whether a simulation draws from the global generators, unless its class was checked before.
 
-    Args:
-        simulation: The simulation.
-        in_thread: Whether it runs in a thread of its own, beside which other threads of the user may run.
-
-    Returns:
-        A function that ends the check, and warns if the simulation has drawn. None if its class was checked before.
+    Return a function that ends the check, and warns if the simulation has drawn. If it runs ``in_thread``, other
+    threads of the user may run beside it.
     """
     kind = type(simulation)
     if kind in _CHECKED:

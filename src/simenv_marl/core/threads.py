@@ -60,11 +60,7 @@ class ThreadDriver(Driver):
                 raise
 
     def enter(self) -> None:
-        """Check that the simulation can be resumed from the current process.
-
-        Raises:
-            WrongThreadError: This process was forked, and the simulation's thread stayed behind.
-        """
+        """Check that this process was not forked, because the simulation's thread stayed behind."""
         if self.lost:
             raise WrongThreadError(
                 "this process was forked in mid-episode, but the simulation is suspended in a thread of the parent"

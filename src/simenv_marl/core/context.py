@@ -23,7 +23,7 @@ import numpy as np
 
 from ..errors import ReentrancyError, WrongThreadError
 from ..hooks.stacks import SIMULATION, Evaluation, outside_simulation
-from .rng import NUMPY, PYTHON, generator_of_torch, seed_for_environment
+from .rng import ENVIRONMENT, NUMPY, PYTHON, generator_of_torch, seed_globals
 
 
 class ExclusiveLock:
@@ -192,7 +192,7 @@ class GlobalRandom:
 
     def begin_anew(self, seed: int) -> None:
         """Seed the generators, whose state must be in place, for another future."""
-        seed_for_environment(seed)
+        seed_globals(seed, ENVIRONMENT)
 
     def enter(self) -> None:
         """Put this state in place, unless another thread has put that of another environment in place."""

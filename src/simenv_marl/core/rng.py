@@ -77,7 +77,7 @@ def global_states() -> dict[str, Any]:
 _FUTURES: Final = 2**32 - 1
 """The spawn key of the seeds of futures. A model that uses the same seed, or spawns from it, never gets this key."""
 
-_ENVIRONMENT: Final = 0
+ENVIRONMENT: Final = 0
 _PROCESS: Final = 1
 _SIMULATION: Final = 2
 """Whose generators are seeded: the three have separate streams. A base policy that draws from the generators of the
@@ -89,14 +89,9 @@ _ELSEWHERE: Final = (type, ModuleType, CodeType, np.ndarray, str, int, float, ra
 """Classes that are not searched: they lead to everything in the process, or to nothing. Nor are functions."""
 
 
-def seed_for_environment(seed: int) -> None:
-    """Seed the generators that an environment has put in place for a future."""
-    _seed_globals(seed, _ENVIRONMENT)
-
-
 def seed_process(seed: int) -> None:
     """Seed the global generators of the process for a future: Python's, NumPy's, and torch's if it is imported."""
-    another, torchs = _seed_globals(seed, _PROCESS), generator_of_torch()
+    another, torchs = seed_globals(seed, _PROCESS), generator_of_torch()
     if torchs is not None:
         torchs.manual_seed(_integer(another))
 
@@ -187,7 +182,7 @@ def _integer(stream: np.random.SeedSequence) -> int:
     return int(stream.generate_state(1, np.uint64)[0])
 
 
-def _seed_globals(seed: int, whose: int) -> np.random.SeedSequence:
+def seed_globals(seed: int, whose: int) -> np.random.SeedSequence:
     """Seed Python's and NumPy's global generators for a future from separate streams; return a third stream."""
     python, numpy, another = _streams(seed, whose, 3)
     _reseed(PYTHON, python)

@@ -26,7 +26,7 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from simenv_marl import RULE, aec_env, branch, difference, joint_env, parallel_env, single_env
 from simenv_marl.core import episode
-from simenv_marl.core.forking import loops_on
+from simenv_marl.core.branching import loops_on
 from simenv_marl.errors import (
     BranchError,
     ClosedError,

@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .core.branching import branch
-    from .core.reseeding import reseed_generators
+    from .core.rng import reseed_generators
     from .decision import Definition, difference, make_step
     from .envs.make import aec_env, generate_env, joint_env, parallel_env, single_env, vector_env
     from .errors import SimEnvError
@@ -57,7 +57,7 @@ ROOMS = ("data", "envs", "errors", "experiments", "planning", "plugins", "remote
 
 _MODULES = {
     "core.branching": ("branch",),
-    "core.reseeding": ("reseed_generators",),
+    "core.rng": ("reseed_generators",),
     "decision": ("Definition", "difference", "make_step"),
     "envs.make": ("aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "vector_env"),
     "errors": ("SimEnvError",),

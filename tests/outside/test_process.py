@@ -31,7 +31,6 @@ from simenv_marl import (
     single_env,
     vector_env,
 )
-from simenv_marl.core.reuse import reuse_resources
 from simenv_marl.errors import (
     AgentError,
     BranchError,
@@ -459,18 +458,6 @@ def test_processes_that_are_kept_end_with_what_has_run(started):
     assert not runs(numbers[0])
     assert len(simulate_many(started[0], {}, seeds=range(3), collect=notice)) == 3
     assert not runs(numbers[-1])
-
-
-def test_a_block_that_was_interrupted_before_it_began_keeps_nothing(started):
-    reuse_resources().__enter__()  # and it is never left
-    simulate(started[0], seed=1)
-    simulation = simulate(started[0], seed=1)
-    assert simulation.result == by_its_rule(1)
-    simulation = reservoirs()
-    simulation.reset(1)
-    number = simulation._child.pid
-    simulation.close()
-    assert not runs(number)
 
 
 def test_a_process_that_exits_after_a_stop_is_started_anew(make_env, tmp_path):

@@ -29,7 +29,7 @@ from simenv_marl.errors import (
     ViewError,
 )
 from simenv_marl.planning import action_values
-from simenv_marl.planning.values import RolloutOptions, Rollouts
+from simenv_marl.planning.rollouts import RolloutOptions, Rollouts
 from tests.conftest import DRIVERS
 from tests.worlds.duels import LEFT, SPACE, Duel, Unseeded, points, worth
 from tests.worlds.models import define

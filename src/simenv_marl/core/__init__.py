@@ -8,16 +8,14 @@ Each module imports only from those below it::
     session                     the simulation of one environment, over all its episodes
     episode                     one episode, and the life cycle of a decision
     rounds, run                 rounds of the parallel and joint views; the run on the simulation's stack
-    delegation                  decisions that policies or the rule take
     plan                        the checked description of an environment
     agent, roster               one agent; who decides where
-    greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
-    planner                     policies that get the environment
-    point, loops                decision points and other events; asyncio's loops of two stacks
-    driver                      the switch between a simulation's stack and its user's
-    context, points, resources  the user's side; points by their names; what a simulation has opened
-    actions, reseeding          checks of actions; seeds for a simulation's own generators
+    threads                     the driver that runs a simulation in a thread
+    planner, greenlets          policies that get the environment; the driver that runs a simulation in a greenlet
+    point                       decision points and other events
+    driver                      the switch between a simulation's stack and its user's; what a simulation has opened
+    context, points             the user's side, with its global generators; points by their names
+    actions                     checks of actions
     spaces, stacking            casts and checks of single values; stacks of many
-    rng, options, packing       global generators; options; pickles for other processes
-    forking, reuse              what a forked process needs; processes that serve several simulations
+    rng, options, packing       seeds of generators; options; pickles for other processes
 """

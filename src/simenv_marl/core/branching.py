@@ -1,18 +1,24 @@
 """Exact continuations of an episode, for planning, counterfactuals and studies of variance."""
 
 import copy
+import ctypes
 import os
-import pickle
+import random
 import select
+import shutil
 import signal
+import socket
+import stat
 import sys
+import tempfile
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import nullcontext, suppress
 from contextvars import ContextVar
 from functools import partial
-from typing import Any, Final, NamedTuple, TypeVar
+from gc import get_objects
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -27,10 +33,12 @@ from ..errors import (
     did_you_mean,
     short_repr,
 )
-from .forking import end_with, loops_on, separator, sockets_of
-from .packing import pack_error, pack_plainly, unpack, unpack_error
-from .reuse import reuse_resources
-from .rng import is_seed, process_kept, seed_process
+from .context import preserve_generators, reuse_resources
+from .packing import pack_outcome, pack_plainly, unpack_outcome
+from .rng import is_seed, seed_process
+
+if hasattr(os, "fork"):
+    import fcntl
 
 Result = TypeVar("Result")
 
@@ -101,8 +109,9 @@ def branch(
     forks = can_fork and method != "replay"
     obstacles: dict[Any, str] = view.open_resources() if forks else {}
     loops = loops_on(obstacles) if obstacles else []
-    for number in [number for loop in loops for number in sockets_of(loop)]:
-        obstacles.pop(number, None)
+    for loop in loops:  # the pair of sockets that wakes an event loop is made anew
+        obstacles.pop(loop._ssock.fileno(), None)
+        obstacles.pop(loop._csock.fileno(), None)
     if obstacles and method == "fork":
         raise BranchError(
             f"a forked process cannot continue with {', '.join(obstacles.values())} that the simulation has opened; use"
@@ -165,7 +174,7 @@ def _check(n: Any, method: Any, seeds: Any, time_limit: Any, *, can_fork: bool) 
 
 def _call_in_replay(env: Any, view: Any, function: Callable[[Any, int], Result], number: int) -> Result:
     """Call a function on a copy of an environment whose simulation repeats the episode."""
-    with process_kept():  # the model may draw from the process's generators, then and now
+    with preserve_generators():  # the model may draw from the process's generators, then and now
         twin = view.replayed()
         try:
             result = function(copy.deepcopy(env, {id(view): twin}), number)  # copies each wrapper with its state
@@ -180,70 +189,38 @@ def _call_in_replay(env: Any, view: Any, function: Callable[[Any, int], Result],
 # -- by forking -----------------------------------------------------------------------------------
 
 
-class _Child(NamedTuple):
-    """A forked process with a continuation, as its parent sees it."""
-
-    number: int
-    process: int
-    pipe: int
-    deadline: float
-
-    def result(self) -> Any:
-        """Receive the result of the function, or raise its exception; wait for the process to end."""
-        message = b"".join(iter(partial(os.read, self.pipe, 1 << 16), b""))
-        os.close(self.pipe)
-        code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
-        if not message:
-            how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
-            raise BranchError(f"branch {self.number} has died without a result, {how}")
-        returned, parcel = pickle.loads(message)
-        try:
-            if returned:
-                return unpack(parcel)
-            error = unpack_error(parcel)
-        except Exception as problem:  # not everything that can be pickled can be unpickled
-            error = _unpicklable(problem)
-            error.__cause__ = problem
-        if not isinstance(error, Exception):  # an exit or an interrupt must not be raised here
-            raise BranchError(f"branch {self.number} has raised {describe_error(error)}") from error
-        if type(error) is WorkerError:
-            raise BranchError(f"branch {self.number}: {error}") from error.__cause__ or error.__context__
-        annotate(error, f"simenv_marl: in branch {self.number}")
-        raise error
-
-
 def _call_in_forks(function: Callable[[int], Any], n: int, time_limit: float) -> list[Any]:
     """Call a function in forked processes, as many at a time as there are cores."""
     results: list[Any] = [None] * n
-    children: dict[int, _Child] = {}  # by their pipes
+    children: dict[int, tuple[int, int, float]] = {}  # by their pipes: the number of the branch, the process, its end
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     started, waiting = 0, select.poll()
     try:
         while started < n or children:
             while started < n and len(children) < cores:
-                child = _fork(function, started, list(children), time.monotonic() + time_limit)
-                children[child.pipe] = child
-                waiting.register(child.pipe, select.POLLIN)
+                process, pipe = _fork(function, started, list(children))
+                children[pipe] = started, process, time.monotonic() + time_limit
+                waiting.register(pipe, select.POLLIN)
                 started += 1
-            oldest = next(iter(children.values()))  # whose time limit comes first
-            left = max(oldest.deadline - time.monotonic(), 0.0)
+            oldest, _, deadline = next(iter(children.values()))  # whose time limit comes first
+            left = max(deadline - time.monotonic(), 0.0)
             ready = waiting.poll(min(left, 3600.0) * 1000)  # in parts, because the time limit may be infinite
             if not ready and left <= 3600.0:
-                raise BranchError(f"branch {oldest.number} was stopped: it took longer than {time_limit} s")
+                raise BranchError(f"branch {oldest} was stopped: it took longer than {time_limit} s")
             for pipe, _ in ready:
                 waiting.unregister(pipe)
-                child = children.pop(pipe)
-                results[child.number] = child.result()
+                number, process, _ = children.pop(pipe)
+                results[number] = _result(number, process, pipe)
     finally:
-        for child in children.values():
-            os.close(child.pipe)
-            os.kill(child.process, signal.SIGKILL)
-            os.waitpid(child.process, 0)
+        for pipe, (_, process, _) in children.items():
+            os.close(pipe)
+            os.kill(process, signal.SIGKILL)
+            os.waitpid(process, 0)
     return results
 
 
-def _fork(function: Callable[[int], Any], number: int, others: list[int], deadline: float) -> _Child:
-    """Fork a process that calls the function and sends the result."""
+def _fork(function: Callable[[int], Any], number: int, others: list[int]) -> tuple[int, int]:
+    """Fork a process that calls the function and sends the outcome. Return the process, and the pipe to read from."""
     _flush()  # else both processes would write what is buffered
     parent = os.getpid()
     reading, writing = os.pipe()
@@ -252,31 +229,51 @@ def _fork(function: Callable[[int], Any], number: int, others: list[int], deadli
         process = os.fork()
     if process == 0:
         try:
-            end_with(parent)
+            if _prctl is not None:  # let this process end when its parent ends, for whatever reason
+                _prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
+                if os.getppid() != parent:  # the parent has already ended
+                    os._exit(1)
             for pipe in (reading, *others):
                 os.close(pipe)
-            message = _message(function, number)
+            message = pack_outcome(_pack_result, function, number)
+            _flush()
             while message:
                 message = message[os.write(writing, message) :]
         finally:
             os._exit(0)  # without any of the parent's exit handlers
     os.close(writing)
-    return _Child(number, process, reading, deadline)
+    return process, reading
 
 
-def _message(function: Callable[[int], Any], number: int) -> bytes:
-    """In the forked process, call the function; pickle its result or its error."""
+def _result(number: int, process: int, pipe: int) -> Any:
+    """Receive the result of a branch, or raise its exception; wait for its process to end."""
+    message = b"".join(iter(partial(os.read, pipe, 1 << 16), b""))
+    os.close(pipe)
+    code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    if not message:
+        how = f"killed by signal {-code}" if code < 0 else f"with exit code {code}"
+        raise BranchError(f"branch {number} has died without a result, {how}")
+    error: BaseException | None
     try:
-        result = function(number)
-        try:
-            parcel = pack_plainly(result)
-        except Exception as error:
-            raise _unpicklable(error) from error
-        return pickle.dumps((True, parcel))
-    except BaseException as error:
-        return pickle.dumps((False, pack_error(error)))
-    finally:
-        _flush()
+        result, error = unpack_outcome(message)
+    except Exception as problem:  # not everything that can be pickled can be unpickled
+        error = _unpicklable(problem)
+        error.__cause__ = problem
+    if error is None:
+        return result
+    if not isinstance(error, Exception):  # an exit or an interrupt must not be raised here
+        raise BranchError(f"branch {number} has raised {describe_error(error)}") from error
+    if type(error) is WorkerError:
+        raise BranchError(f"branch {number}: {error}") from error.__cause__ or error.__context__
+    annotate(error, f"simenv_marl: in branch {number}")
+    raise error
+
+
+def _pack_result(result: Any) -> bytes:
+    try:
+        return pack_plainly(result)
+    except Exception as error:
+        raise _unpicklable(error) from error
 
 
 def _unpicklable(error: Exception) -> BranchError:
@@ -288,3 +285,126 @@ def _flush() -> None:
     for stream in (sys.stdout, sys.stderr):
         with suppress(Exception):
             stream.flush()
+
+
+_prctl: Final[Any] = getattr(ctypes.CDLL(None), "prctl", None) if sys.platform == "linux" else None
+
+
+# -- what makes a forked process continue as its parent would -------------------------------------
+
+_DESCRIPTORS: Final = "/proc/self/fd" if os.path.isdir("/proc/self/fd") else "/dev/fd"
+
+_FLAGS: Final = os.O_WRONLY | os.O_RDWR | os.O_APPEND
+"""The flags with which a file is opened again. The others say how it was made, or matter for other kinds of files."""
+
+Files = dict[tuple[int, int], list[tuple[int, int, list[int]]]]
+"""Open regular files by what identifies them. For each time that one was opened: the flags, the offset, and the
+descriptors that share the offset."""
+
+
+def separator(loops: Iterable[Any] = ()) -> Callable[[], None]:
+    """Return a function that separates forked children, in which the event loops continue, from this process.
+
+    ``fork`` copies the memory, but parent and child share the offsets and contents of open files and the sockets of
+    event loops, and Python reseeds its global generator in the child.
+    """
+    python, files = random.getstate(), _open_files()
+
+    def separate() -> None:
+        random.setstate(python)  # Python reseeds it after a fork
+        for inode, openings in files.items():
+            # A file may have been closed since: by the garbage collector, or in a thread that does not exist here.
+            if all(_inode(number) == inode for _, _, numbers in openings for number in numbers):
+                _reopen(openings)
+        for loop in loops:
+            _separate_loop(loop)
+        torch = sys.modules.get("torch")
+        if torch is not None:
+            torch.set_num_threads(1)  # its threads do not exist here, and torch would wait for them
+
+    return separate
+
+
+def loops_on(descriptors: Container[int]) -> list[Any]:
+    """Return the open asyncio event loops whose wake-up sockets are among the given descriptors."""
+    events = sys.modules.get("asyncio.selector_events")
+    if events is None:
+        return []
+    loops = [thing for thing in get_objects() if isinstance(thing, events.BaseSelectorEventLoop)]
+    return [loop for loop in loops if not loop.is_closed() and loop._ssock.fileno() in descriptors]
+
+
+def _separate_loop(loop: Any) -> None:
+    """Give an event loop a selector, and sockets behind the same descriptors, that belong to this process only."""
+    for old, new in zip((loop._ssock, loop._csock), socket.socketpair(), strict=True):
+        with new:
+            new.setblocking(False)
+            os.dup2(new.fileno(), old.fileno(), inheritable=False)
+    shared = loop._selector
+    loop._selector = type(shared)()
+    for key in shared.get_map().values():
+        loop._selector.register(key.fileobj, key.events, key.data)
+    shared.close()
+
+
+def _open_files() -> Files:
+    """Return the open regular files of this process, except for files that are also standard streams."""
+    files: Files = {}
+    standard = [_inode(number) for number in range(3)]  # which branches share with their parent
+    for number in sorted(map(int, os.listdir(_DESCRIPTORS))):
+        inode = _inode(number)
+        if inode is None or inode in standard or not stat.S_ISREG(os.fstat(number).st_mode):
+            continue
+        with suppress(OSError):  # a descriptor that only stands for a path
+            flags, offset = fcntl.fcntl(number, fcntl.F_GETFL) & _FLAGS, os.lseek(number, 0, os.SEEK_CUR)
+            openings = files.setdefault(inode, [])
+            for *opening, numbers in openings:
+                if opening == [flags, offset] and _share_offset(numbers[0], number):
+                    numbers.append(number)
+                    break
+            else:
+                openings.append((flags, offset, [number]))
+    return files
+
+
+def _inode(number: int) -> tuple[int, int] | None:
+    """Return what identifies the file behind a descriptor; None if the descriptor is closed."""
+    try:
+        status = os.fstat(number)
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _share_offset(one: int, other: int) -> bool:
+    """Return whether two descriptors with the same offset share it, because one is a duplicate of the other."""
+    offset = os.lseek(one, 1, os.SEEK_CUR)
+    try:
+        return os.lseek(other, 0, os.SEEK_CUR) == offset
+    finally:
+        os.lseek(one, -1, os.SEEK_CUR)
+
+
+def _reopen(openings: list[tuple[int, int, list[int]]]) -> None:
+    """Open a file again: the same one if it is only read, else a copy that is deleted when it is closed."""
+    path = _path(openings[0][2][0])
+    modes = {flags & os.O_ACCMODE for flags, _, _ in openings}
+    copied: Any
+    with nullcontext() if modes == {os.O_RDONLY} else tempfile.TemporaryFile() as copied:
+        if modes == {os.O_WRONLY}:  # the contents are never read
+            copied.truncate(os.stat(path).st_size)
+        elif copied is not None:
+            shutil.copyfile(path, _path(copied.fileno()))
+        for flags, offset, numbers in openings:
+            again = os.open(path if copied is None else _path(copied.fileno()), flags)
+            os.lseek(again, offset, os.SEEK_SET)
+            for number in numbers:
+                os.dup2(again, number, inheritable=os.get_inheritable(number))
+            os.close(again)
+
+
+def _path(number: int) -> str:
+    """Return a path by which an open file can be opened again, even if it was deleted."""
+    if hasattr(fcntl, "F_GETPATH"):  # on macOS, where opening /dev/fd would share the offset
+        return os.fsdecode(fcntl.fcntl(number, fcntl.F_GETPATH, bytes(1024)).partition(b"\0")[0])
+    return f"{_DESCRIPTORS}/{number}"

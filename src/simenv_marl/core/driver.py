@@ -9,23 +9,29 @@ a job they are ``FINISHED`` or ``FAILED``, a list with the result or the error, 
 list, because the waiting stack still refers to it. The episode calls the event's ``handle``, which returns the reply.
 
 On the simulation's side a driver enters its stack into the hooks of the model's functions, each with the interceptor
-that sends an event and carries out the reply.
+that sends an event and carries out the reply. It also notes what the simulation opens: decisions in its threads are
+refused, and threads, processes and sockets do not continue in a forked process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextvars import Context
+from collections.abc import Callable, Iterable, Mapping
+from contextvars import Context, copy_context
+from functools import partial, wraps
+from multiprocessing.process import BaseProcess
+from socket import socket
+from subprocess import Popen
+from threading import Thread
 from types import MappingProxyType
 from typing import Any, Final
+from weakref import WeakSet
 
 from greenlet import getcurrent, greenlet
 
 from ..errors import SimulationError, WrongThreadError, annotate
 from ..hooks.hook import Hook
-from ..hooks.stacks import STACKS, Interceptor
+from ..hooks.stacks import LOCK, STACKS, Interceptor, stack_of
 from ..simulation import TRUNCATED, Sentinel
-from .resources import watch_resources
 
 Event = tuple[Any, Any, Any]
 
@@ -102,43 +108,53 @@ _REFUSED: Final[Any] = _Refused()
 class Driver:
     """The base class of drivers.
 
+    Besides the methods here, a driver has ``resume(reply)``, which returns the simulation's next event; ``throw()``,
+    which raises ``SimulationExit`` in the suspended simulation and returns its next event, or None if none comes in
+    time; ``enter()``, which prepares to resume the simulation from the current thread and greenlet, or raises a
+    ``WrongThreadError``; ``end()``, which ends the stack; and ``abandon()``, which gives up a job that does not unwind.
+
     Attributes:
         stack: The simulation's stack. None before the first job, and after the end.
         caller: The greenlet from which ``resume`` may be called directly. None: ``enter`` must be called before.
-        plugins: The plugins of the simulation's environment. None if it has none.
+        plugins: The plugins of the simulation's environment, which apply to all code on the stack. None if it has none.
         given_up: The reason why a job was given up. None if no job was.
         ended: Whether the stack has ended.
         idle: Whether no job is under way.
-        has_started_threads: Whether the simulation has started threads.
-        opened: Weak references to the sockets, processes and threads that the simulation has opened: see
-            ``open_resources``.
+        reachable: Whether the simulation can be resumed from the current thread and process.
+        lost: Whether no thread of this process can resume the simulation any more.
+        at_home: Whether this code runs in the simulation's thread.
+        own_thread: Whether the simulation has a thread of its own.
+        opened: The sockets, processes and threads that the simulation has opened: see ``open_resources``.
     """
 
     __slots__ = (
-        "__weakref__", "_events", "_exiting", "_job", "_process_refused", "_refused", "caller", "ended", "given_up",
-        "has_started_threads",
-        "idle", "opened", "plugins", "stack",
+        "__weakref__", "_context", "_events", "_exiting", "_handled", "_has_started_threads", "_job",
+        "_process_refused", "_refused", "caller", "ended", "given_up", "idle", "opened", "plugins", "stack",
     )  # fmt: skip
 
     resume: Any
+    throw: Any
+    enter: Any
+    end: Any
+    abandon: Any
+    reachable: Any
+    lost: Any
+    at_home: Any
+    _decider: Any
 
     own_thread = False
-    """Whether the simulation has a thread of its own."""
 
-    def __init__(self, plugins: Any = None, opened: list[Any] | None = None) -> None:
-        """Prepare a driver. The first job begins the stack.
-
-        Args:
-            plugins: The plugins of the simulation's environment. They apply to all code that runs on the stack.
-            opened: What the simulation has opened on an earlier stack.
-        """
+    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None) -> None:
+        """Prepare a driver. The first job begins the stack. ``opened``: what was opened on an earlier stack."""
         self.plugins = plugins
-        self.opened: list[Any] = [] if opened is None else opened
+        self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
+        self.opened: WeakSet[Any] = WeakSet() if opened is None else opened
         self.stack: greenlet | None = None
         self.caller: greenlet | None = None
         self.given_up: str | None = None
-        self.ended, self.idle, self._exiting, self.has_started_threads = False, True, False, False
+        self.ended, self.idle, self._exiting, self._has_started_threads = False, True, False, False
         self._job: Any = None
+        self._context: Any = None
         self._events = NO_EVENTS
         self._refused: WrongThreadError | None = None
         self._process_refused: str | None = None
@@ -146,60 +162,22 @@ class Driver:
     # -- on the user's side -----------------------------------------------------------------------
 
     def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job. The next ``resume`` starts it on the stack.
+        """Prepare a job, with the events to send by hook. After ``enter``, the next ``resume`` starts it on the stack.
 
-        Args:
-            job: The function to run.
-            events: The events to send, by hook. All other functions run their rule.
-            context: The context variables of the job. None: a copy of the user's.
-
-        Raises:
-            WrongThreadError: The stack cannot be resumed from here.
+        All other functions run their rule. Without a context, the job gets a copy of the user's context variables.
         """
-        raise NotImplementedError
-
-    def enter(self) -> None:
-        """Prepare to resume the simulation from the current thread and greenlet.
-
-        Raises:
-            WrongThreadError: The simulation cannot be resumed from here.
-        """
-        raise NotImplementedError
-
-    def throw(self) -> Event | None:
-        """Raise ``SimulationExit`` in the suspended simulation; return its next event, or None if none comes."""
-        raise NotImplementedError
-
-    def end(self) -> None:
-        """End the stack. A job that cannot be reached from here unwinds by itself."""
-        raise NotImplementedError
-
-    def abandon(self) -> None:
-        """Give up a job that does not unwind. The driver can start no other job."""
-        raise NotImplementedError
-
-    @property
-    def reachable(self) -> bool:
-        """Whether the simulation can be resumed from here."""
-        raise NotImplementedError
-
-    @property
-    def lost(self) -> bool:
-        """Whether no thread of this process can resume the simulation any more."""
-        raise NotImplementedError
+        self._job, self._events, self._refused = job, events, None
+        self._context = copy_context() if context is None else context
 
     @property
     def usable(self) -> bool:
         """Whether a job can begin here."""
-        return self.idle and not self.ended and self.reachable
+        return self.idle and not self.ended and bool(self.reachable)
 
     def run(self, job: Callable[[], Any], context: Context | None = None) -> Any:
-        """Run a job to its end, during which decision functions run their rule; return its result.
-
-        Raises:
-            BaseException: Any error that the job raises.
-        """
+        """Run a job to its end, during which decision functions run their rule; return its result."""
         try:
+            self.enter()
             self.begin(job, context=context)
             kind, box, _ = self.resume(None)
         except BaseException:
@@ -242,8 +220,7 @@ class Driver:
         """On the stack: register it as a simulation's stack."""
         self.stack = stack = getcurrent()
         STACKS[stack] = self
-        watch_resources(True)
-        self.show()
+        _watch_resources()
 
     def _work(self) -> Event:
         """On the stack: run a job; return the event for its end."""
@@ -251,88 +228,85 @@ class Driver:
         self.idle = self._exiting = False
         job, self._job = self._job, None
         try:
-            self.show()
-            return self._outcome(job)
-        finally:
-            job = None
-            events, self._events = self._events, NO_EVENTS
-            for hook in events:
-                hook.enter(getcurrent(), None, None if self.ended else self.plugins)
-
-    def _outcome(self, job: Any) -> Event:
-        try:
+            if self._events or self._handled:
+                self._enter_hooks()
             result = job()
         except BaseException as error:
-            if self._refused is not None and self._refused is not error:
-                if isinstance(error, SimulationExit):
-                    return FAILED, [self.refusal()], None
-                annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
-            if type(error) is SimulationExit and not self._exiting:
-                stray = SimulationError(
-                    "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread"
-                    " of that episode has kept; end all of these with their episode (cancel them in stop or in a"
-                    " finally)"
-                )
-                stray.__cause__ = error
-                return FAILED, [stray], None
-            return FAILED, [error], None
+            return FAILED, [self._explain(error)], None
+        finally:
+            job = None
+            self._leave_hooks()
+            self._events = NO_EVENTS
         return (FINISHED, [result], None) if self._refused is None else (FAILED, [self.refusal()], None)
+
+    def _explain(self, error: BaseException) -> BaseException:
+        """Return the error to raise on the user's side for an error of the simulation."""
+        if self._refused is not None and self._refused is not error:
+            if isinstance(error, SimulationExit):
+                return self.refusal()
+            annotate(error, f"simenv_marl: before that, a decision was refused: {self._refused}")
+        if type(error) is not SimulationExit or self._exiting:
+            return error
+        stray = SimulationError(
+            "the simulation raised a SimulationExit of an earlier episode, which a task, a greenlet or a thread of that"
+            " episode has kept; end all of these with their episode (cancel them in stop or in a finally)"
+        )
+        stray.__cause__ = error
+        return stray
 
     def _forget_stack(self) -> None:
         """Unregister the stack. From now on it takes no part in decisions."""
         self.ended = True
-        self.hide()
+        self._leave_hooks()
         self._events = NO_EVENTS
         stack, self.stack = self.stack, None
         if stack is not None:
             STACKS.pop(stack, None)
-        if not STACKS:
-            watch_resources(False)
+        _watch_resources()
 
     def decides(self, hook: Hook) -> bool:
         """Whether the current job sends events for the calls of a hook."""
         return hook in self._events
 
-    def interceptor(self, hook: Hook) -> Interceptor | None:
-        """The interceptor for calls of a hook in the simulation's own greenlets. None: the rule decides."""
-        return self._interceptor(hook, away=True)
+    def interceptor(self, hook: Hook, away: bool = True) -> Interceptor | None:
+        """Return the interceptor for calls of a hook; None if the rule decides.
 
-    def _interceptor(self, hook: Hook, away: bool = False) -> Interceptor | None:
+        Calls that are ``away`` come from the model's own greenlets or threads, and not from the stack itself.
+        """
         event = self._events.get(hook)
         if event is None:
             return None
         if self._process_refused is not None:
             return self.refuse(hook, self._process_refused)
-        return self._decider(hook, event, away)
-
-    def _decider(self, hook: Hook, event: Any, away: bool) -> Interceptor:
-        """Make the function that sends an event for the calls of a hook, and carries out the replies.
-
-        Args:
-            hook: The hook.
-            event: The event.
-            away: Whether the calls come from the model's own greenlets, and not from the stack itself.
-        """
-        raise NotImplementedError
+        if away and not self.at_home:
+            return self.refuse(hook, "a thread that the simulation has started")
+        decide: Interceptor = self._decider(hook, event, away)
+        return decide
 
     def hide(self) -> None:
-        """Leave all hooks, so that the driver takes no part in calls on the stack until ``show``."""
-        if self.stack is not None:
-            for hook in self._hooks():
-                hook.leave(self.stack)
-                hook.interceptors.others.discard(self)
+        """On the stack, leave all hooks, so that the driver takes no part in calls until ``show``."""
+        if getcurrent() is self.stack:
+            self._leave_hooks()
 
     def show(self) -> None:
-        """Enter all hooks, so that the driver takes part in calls on the stack."""
+        """On the stack, enter all hooks, so that the driver takes part in calls."""
+        if getcurrent() is self.stack:
+            self._enter_hooks()
+
+    def _enter_hooks(self) -> None:
         stack = self.stack
         if stack is not None:
-            for hook in self._hooks():
-                hook.enter(stack, self._interceptor(hook), self.plugins)
-                if self.has_started_threads:
+            for hook in (*self._events, *self._handled):
+                hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
+                if self._has_started_threads:
                     hook.interceptors.others.add(self)
 
-    def _hooks(self) -> list[Hook]:
-        return [*self._events, *(() if self.plugins is None else self.plugins.hooks)]
+    def _leave_hooks(self) -> None:
+        stack = self.stack
+        if stack is not None:
+            for hook in (*self._events, *self._handled):
+                hook.leave(stack)
+                hook.interceptors.others.discard(self)
 
     # -- refusals ---------------------------------------------------------------------------------
 
@@ -350,7 +324,7 @@ class Driver:
             if self._refused is None and self._process_refused is None:
                 self._refused = error
                 self._events = dict.fromkeys(self._events, _REFUSED)
-                self.show()
+                self._enter_hooks()
             raise error
 
         return refuse
@@ -358,7 +332,12 @@ class Driver:
     def refuse_all(self, where: str) -> None:
         """Refuse all decisions in this process. Only the model gets the errors."""
         self._process_refused = where
-        self.show()
+        self._enter_hooks()
+
+    def refuse_threads(self) -> None:
+        """Refuse the decisions of the first thread that the simulation starts, and of all later ones."""
+        self._has_started_threads = True
+        self._enter_hooks()
 
     def refusal(self) -> WrongThreadError:
         """Make the error that tells the user of a refused decision."""
@@ -371,16 +350,9 @@ class Driver:
 # -- the rule's decisions -------------------------------------------------------------------------
 
 
-def reporting_rule(hook: Hook, event: Any, send: Callable[[Any], Interceptor]) -> Callable[..., Any]:
-    """Return the rule of a hook, which sends the event's ``report`` with each decision.
-
-    Args:
-        hook: The hook.
-        event: The event of the hook.
-        send: Makes the interceptor that sends an event.
-    """
+def reporting_rule(hook: Hook, report: Interceptor) -> Callable[..., Any]:
+    """Return the rule of a hook, which passes each decision to the interceptor ``report``."""
     rule: Callable[..., Any] = hook.rule
-    report = send(event.report)
 
     def call(*args: Any, **kwargs: Any) -> Any:
         decision = rule(*args, **kwargs)
@@ -398,3 +370,66 @@ def reporting_rule(hook: Hook, event: Any, send: Callable[[Any], Interceptor]) -
         return decision
 
     return {"function": call, "generator": generate, "coroutine": wait}[hook.kind]
+
+
+# -- what simulations open ------------------------------------------------------------------------
+
+_OPENING: Final = ((Thread, "start"), (socket, "__init__"), (Popen, "__init__"), (BaseProcess, "start"))
+
+_PATCHES: Final[list[tuple[type, str, Any, Any]]] = []
+"""The patched methods: what was there before, and the patch. Empty while no simulation lives."""
+
+
+def _watch_resources() -> None:
+    """Note what simulations open, while there are simulations."""
+    if bool(STACKS) == bool(_PATCHES):
+        return
+    with LOCK:
+        for owner, name in _OPENING if STACKS and not _PATCHES else ():
+            before = vars(owner)[name]
+            patch = _noting(before)
+            setattr(owner, name, patch)
+            _PATCHES.append((owner, name, before, patch))
+        while _PATCHES and not STACKS:
+            patched, name, before, patch = _PATCHES.pop()
+            if vars(patched)[name] is patch:  # else other code has replaced the patch, and may still call it
+                setattr(patched, name, before)
+
+
+def _noting(method: Any) -> Any:
+    @wraps(method)
+    def note(self: Any, *args: Any, **kwargs: Any) -> None:
+        driver = stack_of(getcurrent()) if STACKS else None
+        if driver is not None and isinstance(self, Thread):
+            self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
+            driver.refuse_threads()
+        method(self, *args, **kwargs)
+        if driver is not None:
+            driver.opened.add(self)
+
+    return note
+
+
+def _run_registered(driver: Driver, run: Callable[[], None]) -> None:
+    """Run a thread that a simulation has started, as a stack of that simulation's driver."""
+    here = getcurrent()
+    STACKS[here] = driver
+    try:
+        run()
+    finally:
+        STACKS.pop(here, None)
+
+
+def open_resources(opened: Iterable[Any]) -> dict[Any, str]:
+    """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
+    found: dict[Any, str] = {}
+    for thing in list(opened):
+        if isinstance(thing, socket) and thing.fileno() >= 0:
+            found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
+        elif isinstance(thing, Thread) and thing.is_alive():
+            found[thing] = "a thread"
+        elif isinstance(thing, (Popen, BaseProcess)):
+            code = thing.returncode if isinstance(thing, Popen) else thing.exitcode
+            if code is None:
+                found[thing] = f"a child process ({thing.pid})"
+    return found

@@ -42,11 +42,10 @@ from ..hooks.stacks import EVALUATING
 from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
-from .context import ExclusiveLock
+from .context import ExclusiveLock, GlobalRandom
 from .driver import WAIT, Driver
 from .plan import Plan
 from .point import Point
-from .rng import GlobalRandom
 from .roster import declared_agents, two_arguments
 from .rounds import Rounds
 from .run import Run

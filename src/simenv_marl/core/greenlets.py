@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable
 from contextlib import suppress
-from contextvars import copy_context
+from functools import partial
 from os import getpid
 from sys import modules
 from threading import local
 from typing import Any, Final
-from weakref import ref
+from weakref import WeakSet, ref
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -17,23 +18,17 @@ from ..errors import WrongThreadError
 from ..hooks.hook import Hook
 from ..hooks.stacks import STACKS, Interceptor
 from ..simulation import RULE
-from .driver import FINISHED, NO_EVENTS, Driver, Event, SimulationExit, reporting_rule
-from .loops import ASYNCIO, Loops, silence_unwound_tasks
+from .driver import FINISHED, Driver, Event, SimulationExit, is_exit, reporting_rule
 
 
-class _Home:
-    """The identity of a thread. Unlike the thread's number, it is never reused for another thread."""
+class _Home(local):
+    """What identifies a thread. Unlike the thread's number, it is never reused for another thread."""
+
+    def __init__(self) -> None:
+        self.identity: Any = type("Thread", (), {})()
 
 
-_homes = local()
-
-
-def _home() -> _Home:
-    try:
-        home: _Home = _homes.home
-    except AttributeError:
-        home = _homes.home = _Home()
-    return home
+_home: Final = _Home()
 
 
 class GreenletDriver(Driver):
@@ -41,18 +36,12 @@ class GreenletDriver(Driver):
 
     __slots__ = ("_asker", "_body", "_direct", "_home", "_leave", "_loops", "_process", "resume")
 
-    def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
-        """Prepare a greenlet, as ``Driver`` does.
-
-        Args:
-            plugins: The plugins of the simulation's environment.
-            opened: What the simulation has opened on an earlier stack.
-            direct: Whether ``resume`` may be called without ``enter``. If False, ``caller`` stays None.
-        """
+    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None, *, direct: bool = True) -> None:
+        """Prepare a greenlet, as ``Driver`` does; unless ``direct``, ``caller`` stays None."""
         super().__init__(plugins, opened)
         self._direct = direct
-        self._home, self._process = ref(_home()), getpid()
-        self._loops = Loops()
+        self._home, self._process = ref(_home.identity), getpid()
+        self._loops = _Loops()
         self._body: Any = greenlet(self._serve)
         self._asker: greenlet | None = None  # the model's own greenlet that waits for an answer
         self._leave: Any = None
@@ -60,20 +49,9 @@ class GreenletDriver(Driver):
 
     # -- on the user's side -----------------------------------------------------------------------
 
-    def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job. The next ``resume`` starts it on the stack."""
-        self.enter()
-        self._job, self._events, self._refused = job, events, None
-        # A new greenlet has an empty context, but the model expects the user's context variables.
-        self._body.gr_context = copy_context() if context is None else context
-
     def enter(self) -> None:
-        """Prepare to resume the simulation from the current greenlet.
-
-        Raises:
-            WrongThreadError: The simulation belongs to another thread.
-        """
-        if self._body is None or not self.reachable:
+        """Prepare to resume the simulation from the current greenlet."""
+        if self._body is None or self._home() is not _home.identity:
             raise WrongThreadError(
                 "the simulation is suspended in another thread, the one that called reset(); step, reset and close the"
                 ' environment there, or make it with driver="thread", which allows any thread'
@@ -96,7 +74,9 @@ class GreenletDriver(Driver):
     @property
     def reachable(self) -> bool:
         """Whether the simulation can be resumed from the current thread."""
-        return self._home() is _home()
+        return self._home() is _home.identity
+
+    at_home = reachable
 
     @property
     def lost(self) -> bool:
@@ -106,7 +86,7 @@ class GreenletDriver(Driver):
     @property
     def usable(self) -> bool:
         """Whether a job can begin in the current thread."""
-        return super().usable and not self._body.dead
+        return self.idle and not self.ended and self._home() is _home.identity and not self._body.dead
 
     def end(self) -> None:
         """End the stack."""
@@ -130,7 +110,10 @@ class GreenletDriver(Driver):
         with suppress(GreenletExit):
             self._register()
             while not self.ended:
-                self._loops.begin()
+                # A new greenlet has an empty context, but the model expects the user's context variables.
+                self._body.gr_context, self._context = self._context, None
+                self._loops.simulations = _NO_LOOP  # each job begins without a loop
+                self._loops.enter()
                 try:
                     event = self._work()
                 finally:
@@ -143,18 +126,19 @@ class GreenletDriver(Driver):
                 self._leave(*event)
 
     def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
+        """Make the function that sends an event for the calls of a hook, and carries out the replies."""
         deliver, driver, loops = event.deliver, self, self._loops
         rule: Any = hook.rule
         if event.report is not None:
-            rule = reporting_rule(hook, event, lambda report: self._decider(hook, report, away))
+            rule = reporting_rule(hook, self._decider(hook, event.report, away))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
             if away:
                 driver._ask_from(getcurrent())
             leave, running = driver._leave, loops.running
-            if running is None and ASYNCIO in modules:
-                running = loops.running = modules[ASYNCIO]._get_running_loop
-            looped = running is not None and (running() is not None or loops.users is not None)
+            if running is None and _ASYNCIO in modules:
+                running = loops.running = modules[_ASYNCIO]._get_running_loop
+            looped = running is not None and (running() is not None or loops.swapped)
             if looped:
                 loops.leave()
             try:
@@ -184,3 +168,72 @@ class GreenletDriver(Driver):
 
 _abandoned: Final[list[GreenletDriver]] = []
 """Drivers of simulations that did not unwind. Freeing a greenlet would resume it, at an arbitrary moment."""
+
+
+# -- asyncio --------------------------------------------------------------------------------------
+
+_ASYNCIO: Final = "asyncio.events"
+"""The module that knows a thread's running event loop, whatever its stack. If it is not imported, no loop runs."""
+
+_NO_LOOP: Final = (None, (None, None), 0)
+"""The state of a thread without a loop: the loop, the hooks of asynchronous generators, and the depth of coroutine
+origin tracking."""
+
+
+class _Loops:
+    """The asyncio event loops of a simulation and of its user, which share a thread.
+
+    Attributes:
+        running: Returns the loop that runs in this thread. None until it is known that asyncio is imported.
+        simulations: The simulation's state while the user runs.
+        swapped: Whether the simulation's state has replaced the user's while the simulation runs.
+    """
+
+    __slots__ = ("_users", "running", "simulations", "swapped")
+
+    def __init__(self) -> None:
+        self.running: Callable[[], Any] | None = None
+        self.simulations: Any = _NO_LOOP
+
+    def enter(self) -> None:
+        """Switch to the simulation's loop, if it or the user has one."""
+        self._users = _present_loop()
+        self.swapped = self._users[0] is not None or self.simulations[0] is not None
+        if self.swapped:
+            _set_loop(self.simulations)
+
+    def leave(self) -> None:
+        """Switch to the user's loop, if the user or the simulation has one."""
+        present = _present_loop()
+        if self.swapped or present[0] is not None:
+            self.simulations = present
+            _set_loop(self._users)
+
+
+def _present_loop() -> Any:
+    events = modules.get(_ASYNCIO)
+    loop = None if events is None else events._get_running_loop()
+    return loop, sys.get_asyncgen_hooks(), sys.get_coroutine_origin_tracking_depth()
+
+
+def _set_loop(state: Any) -> None:
+    loop, hooks, depth = state
+    modules[_ASYNCIO]._set_running_loop(loop)
+    sys.set_asyncgen_hooks(*hooks)
+    sys.set_coroutine_origin_tracking_depth(depth)
+
+
+def silence_unwound_tasks() -> None:
+    """Stop the running loop from reporting tasks that are unwound, because no code can await them any more."""
+    loop = _present_loop()[0]
+    before = None if loop is None else loop.get_exception_handler()
+    if loop is None or isinstance(before, partial):  # it was silenced in an earlier episode
+        return
+    loop.set_exception_handler(partial(_report_task, before or type(loop).default_exception_handler))
+
+
+def _report_task(report: Callable[..., Any], loop: Any, context: dict[str, Any]) -> None:
+    """Handle an exception of a loop, unless its task was unwound, or left over when the loop was closed."""
+    error = context.get("exception")
+    if not is_exit(error) and (error is not None or not loop.is_closed()):
+        report(loop, context)

@@ -59,12 +59,6 @@ class PlannerPolicy:
         self._takes_info = takes_info(policy)
         self._session: ref[Any] | None = None
 
-    def bind(self, session: Any) -> PlannerPolicy:
-        """Copy the wrapper for the episodes of a session, which it holds by a weak reference."""
-        bound = copy.copy(self)
-        bound._session = ref(session)
-        return bound
-
     def __call__(self, observation: Any, info: Any) -> Any:
         """Ask the planner; in a branch, ask its base."""
         session = None if self._session is None else self._session()
@@ -89,5 +83,9 @@ class PlannerPolicy:
 
 
 def bind_session(policy: Any, session: Any) -> Any:
-    """Bind a session to a wrapped planner; return any other policy unchanged."""
-    return policy.bind(session) if isinstance(policy, PlannerPolicy) else policy
+    """Copy a wrapped planner for the episodes of a session, held weakly; return any other policy unchanged."""
+    if not isinstance(policy, PlannerPolicy):
+        return policy
+    bound = copy.copy(policy)
+    bound._session = ref(session)
+    return bound

@@ -82,11 +82,8 @@ def source_name(source: Any) -> str:
     """Return the dotted name of a class or factory, or of the class of an object."""
     while isinstance(source, partial):
         source = source.func
-    return _dotted_name(source if hasattr(source, "__qualname__") else type(source))
-
-
-def _dotted_name(thing: Any) -> str:
-    return f"{thing.__module__}.{thing.__qualname__}"
+    named = source if hasattr(source, "__qualname__") else type(source)
+    return f"{named.__module__}.{named.__qualname__}"
 
 
 def as_json(value: Any) -> Any:
@@ -104,7 +101,7 @@ def as_json(value: Any) -> Any:
         return sorted(map(repr, value))
     if isinstance(value, partial):
         return {"partial": as_json(value.func), "args": as_json(value.args), "keywords": as_json(value.keywords)}
-    return _dotted_name(value) if hasattr(value, "__qualname__") else repr(value)
+    return f"{value.__module__}.{value.__qualname__}" if hasattr(value, "__qualname__") else repr(value)
 
 
 def _version(package: str) -> str | None:

@@ -17,10 +17,9 @@ from ..errors import (
     warn_user,
 )
 from .agent import Agent
-from .context import ExclusiveLock, environment_context
+from .context import ExclusiveLock, GlobalRandom, environment_context
 from .driver import Driver
 from .plan import Plan
-from .rng import GlobalRandom
 
 
 class Run:

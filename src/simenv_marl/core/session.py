@@ -21,12 +21,11 @@ from gymnasium.utils import seeding
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
 from ..hooks.patches import Installation
 from ..simulation import closer, make_simulation, resetter
-from .context import ExclusiveLock, environment_context
-from .driver import Driver
+from .context import ExclusiveLock, GlobalRandom, environment_context
+from .driver import Driver, open_resources
 from .episode import LONGEST_TAPE, LOST, Episode
 from .plan import DRIVERS, Plan
-from .resources import open_resources
-from .rng import GlobalRandom, draws_check, is_seed
+from .rng import draws_check, is_seed
 from .run import refusal
 from .spaces import same
 

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextvars import Context, copy_context
+from contextlib import suppress
 from os import getpid
-from threading import Lock, Thread, current_thread
-from time import monotonic
+from queue import Empty, SimpleQueue
+from threading import Thread, current_thread
 from typing import Any, Final
+from weakref import WeakSet
 
 from ..errors import WrongThreadError, warn_user
 from ..hooks.hook import Hook
 from ..hooks.stacks import SIMULATION, Interceptor
 from ..simulation import RULE, Sentinel
 from .driver import FAILED, FINISHED, NO_EVENTS, SECONDS_TO_UNWIND, Driver, Event, SimulationExit, reporting_rule
-from .loops import silence_unwound_tasks
+from .greenlets import silence_unwound_tasks
 
 _LONGEST_WAIT: Final = 1.0
 """The longest single wait of the user's thread, in seconds. A Ctrl-C just before a wait does not end that wait."""
 
-_NOTHING: Final = Sentinel("NOTHING")
 _EXIT: Final = Sentinel("EXIT")
 _JOB: Final = Sentinel("JOB")
 _END: Final = Sentinel("END")
@@ -28,55 +28,39 @@ _END: Final = Sentinel("END")
 class ThreadDriver(Driver):
     """A driver that runs a simulation in a thread of its own. The first ``begin`` starts it, and ``end`` joins it.
 
-    Only one of the two threads runs at a time. They hand over values in ``_reply`` and ``_event``. Each of these has a
-    lock that wakes the waiting thread. Only the values count, and not how often a lock was released. So a wait may be
-    interrupted anywhere (by Ctrl-C, for instance), and the threads stay in step.
+    Only one of the two threads runs at a time. They hand over replies and events in two queues. An interrupt (Ctrl-C,
+    for instance) may leave a reply or an event in its queue, or lose an event. So the simulation's thread ignores all
+    replies between two jobs, and each job has a queue of its own for events.
     """
 
-    __slots__ = ("_arrived", "_context", "_event", "_outcome_event", "_process", "_reply", "_resumed", "_thread")
+    __slots__ = ("_arrived", "_process", "_replies", "_thread")
 
     own_thread = True
 
-    def __init__(self, plugins: Any = None, opened: list[Any] | None = None, *, direct: bool = True) -> None:
+    def __init__(self, plugins: Any = None, opened: WeakSet[Any] | None = None, *, direct: bool = True) -> None:
         """Prepare a thread, as ``Driver`` does; ``caller`` is always None."""
         super().__init__(plugins, opened)
         self._process = getpid()
-        self._resumed, self._arrived = Lock(), Lock()
-        self._event: Event | None = None
-        self._outcome_event: Event | None = None
-        self._reply: Any = _NOTHING
+        self._replies: SimpleQueue[Any] = SimpleQueue()
+        self._arrived: SimpleQueue[Event] = SimpleQueue()
         self._thread: Thread | None = None
-        self._context: Context | None = None
 
     # -- in the user's thread ---------------------------------------------------------------------
 
     def begin(self, job: Callable[[], Any], events: Mapping[Hook, Any] = NO_EVENTS, context: Any = None) -> None:
-        """Prepare a job. The next ``resume`` starts it on the stack."""
-        self.enter()
-        self._job, self._events, self._refused = job, events, None
-        self._context = copy_context() if context is None else context
-        self._event = self._outcome_event = None
+        """Prepare a job, and start the thread if there is none."""
+        super().begin(job, events, context)
+        self._arrived = SimpleQueue()
         if self._thread is None:
-            self._start()
-
-    def _start(self) -> None:
-        self._resumed.acquire()
-        self._arrived.acquire()
-        self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
-        try:
-            thread.start()
-        except Exception:  # there are too many threads
-            self._thread = None
-            self._resumed.release()
-            self._arrived.release()
-            raise
+            self._thread = thread = Thread(target=self._serve, name=SIMULATION, daemon=True)
+            try:
+                thread.start()
+            except Exception:  # there are too many threads
+                self._thread = None
+                raise
 
     def enter(self) -> None:
-        """Check that the simulation can be resumed from the current process.
-
-        Raises:
-            WrongThreadError: This process was forked, and the simulation's thread stayed behind.
-        """
+        """Check that this process was not forked, because the simulation's thread stayed behind."""
         if self.lost:
             raise WrongThreadError(
                 "this process was forked in mid-episode, but the simulation is suspended in a thread of the parent"
@@ -85,13 +69,12 @@ class ThreadDriver(Driver):
 
     def resume(self, reply: Any) -> Event:
         """Resume the simulation with a reply; return its next event."""
-        self._reply = reply if self._job is None else _JOB
-        _wake(self._resumed)
-        arrived = self._arrived
-        while (event := self._event) is None:
-            arrived.acquire(True, _LONGEST_WAIT)
-        self._event = self._outcome_event = None
-        return event
+        self._replies.put(reply if self._job is None else _JOB)
+        while True:
+            try:
+                return self._arrived.get(True, _LONGEST_WAIT)
+            except Empty:
+                continue
 
     def throw(self) -> Event | None:
         """Raise ``SimulationExit`` in the suspended simulation; return its next event, or None if none comes in time.
@@ -99,22 +82,23 @@ class ThreadDriver(Driver):
         If the simulation still runs, because the user's wait was interrupted, the exit is raised at its next decision.
         """
         self.enter()
-        if self._thread is None or (self.idle and self._outcome_event is None and self._reply is not _JOB):
-            return FINISHED, [None], None
-        patience = monotonic() + SECONDS_TO_UNWIND
+        if self.idle:  # the job has ended, or was interrupted before it began
+            with suppress(Empty):
+                while True:
+                    self._replies.get_nowait()
+            self._job = None
+            return (FINISHED, [None], None) if self._arrived.empty() else self._arrived.get()
         self._exiting = True
-        self._event = None
-        if not (self.idle and self._reply is _JOB):  # else the job begins, and gets the exit at its first decision
-            self._reply = _EXIT
-            _wake(self._resumed)
-        # ``_outcome_event`` keeps the end of the job, even if it came before this call.
-        while (event := self._outcome_event or self._event) is None:
-            left = patience - monotonic()
-            if left <= 0:
-                return None
-            self._arrived.acquire(timeout=left)
-        self._event = self._outcome_event = None
-        return event
+        self._replies.put(_EXIT)
+        try:
+            return self._arrived.get(True, SECONDS_TO_UNWIND)
+        except Empty:
+            return None
+
+    @property
+    def lost(self) -> bool:
+        """Whether this process is a fork, in which the simulation's thread does not exist."""
+        return getpid() != self._process
 
     @property
     def reachable(self) -> bool:
@@ -122,9 +106,9 @@ class ThreadDriver(Driver):
         return not self.lost
 
     @property
-    def lost(self) -> bool:
-        """Whether this process is a fork, in which the simulation's thread does not exist."""
-        return getpid() != self._process
+    def at_home(self) -> bool:
+        """Whether this code runs in the simulation's thread."""
+        return current_thread() is self._thread
 
     def end(self) -> None:
         """End the stack, whose job has ended or is lost, and wait for the end of its thread.
@@ -134,10 +118,10 @@ class ThreadDriver(Driver):
         if self.ended and not self.idle:
             return
         thread = self._thread
-        self._event = self._outcome_event = None
+        self._arrived = SimpleQueue()
         if self.idle and thread is not None and thread is not current_thread() and not self.lost:
-            self._reply = _END
-            _wake(self._resumed)
+            self.ended = True  # first, because after an interrupt no job must begin that would come after ``_END``
+            self._replies.put(_END)
             if thread.ident is not None:  # otherwise an interrupt came before the thread started
                 thread.join(SECONDS_TO_UNWIND)
             if thread.is_alive():
@@ -157,7 +141,7 @@ class ThreadDriver(Driver):
     def _serve(self) -> None:
         self._register()
         try:
-            while not self.ended and (reply := self._wait()) is not _END:
+            while not self.ended and (reply := self._replies.get()) is not _END:
                 if reply is _JOB:
                     self._do()
                 reply = None
@@ -165,8 +149,7 @@ class ThreadDriver(Driver):
             self._forget_stack()
 
     def _do(self) -> None:
-        context: Any = self._context
-        self._context = None
+        context, self._context = self._context, None
         try:
             event: Event = context.run(self._work)
         except BaseException as error:  # raised from another thread; without an event the user would wait for ever
@@ -182,26 +165,18 @@ class ThreadDriver(Driver):
                 raise event[1].pop()  # the model has forked, and this process has no user to tell
             return
         self.idle = True
-        self._event = self._outcome_event = event
-        _wake(self._arrived)
-
-    def _wait(self) -> Any:
-        resumed = self._resumed
-        while self._reply is _NOTHING:
-            resumed.acquire()
-        reply, self._reply = self._reply, _NOTHING
-        return reply
+        self._arrived.put(event)
 
     def _decider(self, hook: Hook, event: Any, away: bool = False) -> Interceptor:
-        deliver = event.deliver
+        """Make the function that sends an event for the calls of a hook, and carries out the replies."""
+        deliver, ask, answer = event.deliver, self._arrived.put, self._replies.get
         rule: Any = hook.rule
         if event.report is not None:
-            rule = reporting_rule(hook, event, lambda report: self._decider(hook, report))
+            rule = reporting_rule(hook, self._decider(hook, event.report))
 
         def decide(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-            self._event = (event, args, kwargs)
-            _wake(self._arrived)
-            reply = self._wait()
+            ask((event, args, kwargs))
+            reply = answer()
             if reply is RULE:
                 return rule(*args, **kwargs)
             if reply is _EXIT:
@@ -210,9 +185,3 @@ class ThreadDriver(Driver):
             return reply if deliver is None else deliver(reply, *args, **kwargs)
 
         return decide
-
-
-def _wake(lock: Any) -> None:
-    """Wake the thread that waits for a lock, or let its next wait return at once."""
-    if lock.locked():
-        lock.release()

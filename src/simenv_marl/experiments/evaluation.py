@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.context import reuse_resources
 from ..core.options import EpisodeOptions
 from ..core.packing import pack
 from ..core.plan import Plan
 from ..core.points import Points
-from ..core.reuse import reuse_resources
 from ..data.plots import COLOURS, INK, PALE, label_below, style
 from ..errors import OptionValueError, did_you_mean, short_repr
 from ..many.parallel import import_extra, progress_bar, spread

@@ -19,12 +19,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
+from ..core.context import reuse_resources
 from ..core.options import EpisodeOptions
 from ..core.packing import pack
 from ..core.plan import Plan
 from ..core.points import Points, portable
 from ..core.provenance import as_json, describe, source_name
-from ..core.reuse import reuse_resources
 from ..errors import OptionValueError, SimEnvError, SimulationError, StoreError, describe_error, short_repr
 from ..many.parallel import import_extra, progress_bar, spread
 from .runner import RUN_COLUMNS, STATUS_COLUMNS, TEAM, Returns, Runner, distinct_seeds, make_table, plain_value

@@ -43,7 +43,7 @@ OUTSIDE: Final = object()
 """The entry in ``STACKS`` for a simulation's stack on which another environment runs."""
 
 STACKS: Final[dict[greenlet, Any]] = {}
-"""The driver of each simulation by its stack, or ``OUTSIDE``; and a ``StartedThread`` for each thread that a simulation
+"""The driver of each simulation by its stack, or ``OUTSIDE``; and its driver for each thread that a simulation
 has started, by its root."""
 
 EVALUATING: Final[dict[greenlet, Evaluation]] = {}

@@ -16,11 +16,11 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
+from ..core.context import reuse_resources
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.planner import DeferredPolicy, PlannerPolicy, is_planner
 from ..core.point import Point
-from ..core.reuse import reuse_resources
 from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.spaces import duplicate

@@ -6,10 +6,10 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from ..core.context import reuse_resources
 from ..core.options import EpisodeOptions
 from ..core.plan import Plan
 from ..core.points import Points
-from ..core.reuse import reuse_resources
 from ..core.session import Session, checked_seed
 from ..errors import OptionValueError, close_after, short_repr
 from .batch import policy_keys, run

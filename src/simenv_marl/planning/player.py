@@ -6,10 +6,13 @@ The environment may have wrappers. The agent's actions go through them, and its 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from math import isfinite
+from numbers import Real
 from typing import Any
 
+import numpy as np
 from gymnasium import spaces
 
 from ..core.actions import ILLEGAL, action_check
@@ -266,3 +269,39 @@ def player_of(env: Any, base: Any) -> Player:
     view = pending_view(env, "planning")
     players = {SimulationAECEnv: AECPlayer, SimulationParallelEnv: ParallelPlayer, SimulationJointEnv: JointPlayer}
     return next((player for kind, player in players.items() if isinstance(view, kind)), Player)(env, base)
+
+
+def rollout(player: Player, actions: Sequence[Any], options: Any) -> list[float]:
+    """Take actions in a branch, one after the other, and continue with the base.
+
+    If an action is illegal when its decision arises, the base decides. Return the discounted reward of each decision of
+    the agent; the terminal value is added to the last one. ``options`` are ``RolloutOptions``.
+    """
+    player.start()
+    rewards: list[float] = []
+    action, start = actions[0], player.now() if options.timed else 0.0
+    while True:
+        number, elapsed = len(rewards), player.now() - start if options.timed else 0.0
+        weight = options.discount ** (elapsed if options.discount_by == "time" else number)
+        if number:
+            reached = elapsed if options.horizon_by == "time" else number
+            if options.horizon is not None and reached >= options.horizon:
+                break
+            planned = number < len(actions) and player.allows(actions[number])
+            action = actions[number] if planned else player.decide()
+        rewards.append(weight * player.step(action))
+        if player.over:
+            return rewards
+    if options.terminal_value is not None:
+        value: Any = options.terminal_value(player.env)
+        if isinstance(value, np.ndarray) and value.size == 1:
+            value = value.item()
+        if not is_number(value):
+            raise OptionValueError(f"terminal_value must return a finite number, not {short_repr(value)}")
+        rewards[-1] += float(value) * weight
+    return rewards
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is one finite number."""
+    return isinstance(value, Real) and not isinstance(value, bool) and isfinite(value)

@@ -6,7 +6,7 @@ from math import inf
 from typing import Any
 from weakref import finalize
 
-from ..core.reuse import acquire, release
+from ..core.context import acquire, release
 from ..decision import BY_NAME, Definition
 from ..errors import (
     BranchError,

@@ -29,10 +29,9 @@ import numpy as np
 from greenlet import getcurrent
 
 from ..core.actions import MASK
-from ..core.context import environment_context
+from ..core.context import GlobalRandom, environment_context
 from ..core.driver import SimulationExit
 from ..core.plan import Plan
-from ..core.rng import GlobalRandom
 from ..decision import DecisionPoint
 from ..errors import describe_error, error_notes
 from ..hooks.patches import Installation

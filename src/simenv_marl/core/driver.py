@@ -320,7 +320,6 @@ class Driver:
         if self.stack is not None:
             for hook in self._hooks():
                 hook.leave(self.stack)
-                hook.interceptors.others.discard(self)
 
     def show(self) -> None:
         """Enter all hooks, so that the driver takes part in calls on the stack."""
@@ -328,8 +327,6 @@ class Driver:
         if stack is not None:
             for hook in self._hooks():
                 hook.enter(stack, self._interceptor(hook), self.plugins)
-                if self.has_started_threads:
-                    hook.interceptors.others.add(self)
 
     def _hooks(self) -> list[Hook]:
         return [*self._events, *(() if self.plugins is None else self.plugins.hooks)]

@@ -23,7 +23,7 @@ from ..errors import (
     warn_user,
 )
 from ..hooks.hook import Hook
-from ..hooks.plugins import Plugins
+from ..plugins import Plugins
 from ..simulation import RULE, SimulationInterface
 from .agent import make_updates
 from .options import Options

@@ -15,7 +15,7 @@ from ..core.plan import Plan
 from ..core.rng import GlobalRandom
 from ..decision import DecisionPoint
 from ..envs.make import VIEWS, view_class
-from ..hooks.patches import Installation
+from ..hooks.handlers import Installation
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import make_simulation, resetter
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 from contextlib import suppress
 from functools import partial, update_wrapper
+from threading import local
 from types import FunctionType
 from typing import Any, Final
 
@@ -22,11 +23,21 @@ from .stacks import OUTSIDE, STACKS, Interceptor, plugins_at, spawner_of, stack_
 _SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
 
 _ROOTS: Final[set[greenlet]] = set()
-"""Roots of threads that have called wrappers, and on which no simulation runs: hooks without handlers run their rule
-there at once."""
+"""Roots of threads on which no simulation runs. Hooks without handlers run their rule there at once."""
 
-_MOST_ROOTS: Final = 100
-"""The number of roots that are remembered, since some threads have ended."""
+_THREAD: Final = local()
+"""Has a ``_Root`` in each thread whose root is in ``_ROOTS``."""
+
+
+class _Root:
+    """Forgets the root of a thread when the thread ends. A root that outlives its thread makes greenlets crash."""
+
+    def __init__(self, root: greenlet) -> None:
+        self._forget = partial(_ROOTS.discard, root)
+
+    def __del__(self) -> None:
+        self._forget()
+
 
 # -- wrappers -------------------------------------------------------------------------------------
 
@@ -236,8 +247,8 @@ class Hook(Target):
         if decide is not None:
             return self.around(decide, plugins)
         if here.parent is None and here not in STACKS:
-            if len(_ROOTS) >= _MOST_ROOTS:
-                _ROOTS.clear()
+            if not hasattr(_THREAD, "root"):
+                _THREAD.root = _Root(here)
             _ROOTS.add(here)
         return self.interceptors.get(plugins) or self.interceptors.get(None) or self.run_rule
 

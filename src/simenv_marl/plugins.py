@@ -288,19 +288,23 @@ class Plugins:
 
     def __init__(self, entries: Iterable[Any], named: Mapping[str, Target] = MappingProxyType({})) -> None:
         """Find the targets, and check that the handlers fit; ``named`` has the names that the simulation defines."""
-        self._given = list(entries)
+        self._given, self._users = list(entries), set[object]()
         with LOCK:
             self._handlers = [_make_handler(entry, named, self) for entry in self._given]
 
     def install(self, user: object) -> None:
-        """Attach the handlers, as ``Patch.install``."""
-        for handler in self._handlers:
-            handler.install(user)
+        """Attach the handlers until every user has called ``uninstall``."""
+        with LOCK:
+            self._users.add(user)
+            for handler in self._handlers:
+                handler.install(self)
 
     def uninstall(self, user: object) -> None:
         """Undo ``install``, also where it failed half-way."""
-        for handler in reversed(self._handlers):
-            handler.uninstall(user)
+        with LOCK:
+            self._users.discard(user)
+            for handler in reversed(self._handlers) if not self._users else ():
+                handler.uninstall(self)
 
     @property
     def plugins(self) -> Plugins:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
 from ..errors import DefinitionError, PatchError, UnknownPointError, name_of, short_repr
-from ..hooks.places import Purpose, all_classes, find_hook, is_importable, raw_attribute, resolve, unbind
+from ..hooks.places import PlacedHook, Purpose, all_classes, find_hook, is_importable, raw_attribute, resolve, unbind
 
 Points = str | Callable[..., Any] | Iterable[str | Callable[..., Any]] | Mapping[Any, Definition | None] | None
 """The ways to name decision points: see ``generate_env``."""
@@ -167,10 +167,10 @@ def find_point(key: Any, definition: Any = None, *, own: Own = _NONE) -> NamedPo
 
 def _inherited(point: DecisionPoint) -> Definition | None:
     """Return the definition that a class inherits, together with the decision function, from a base class."""
-    place = point.hook.place
-    if place is None or not place.inherited:
+    hook = point.hook
+    if not isinstance(hook, PlacedHook) or not hook.inherited:
         return None
-    known = point_of(unbind(raw_attribute(place.owner, place.attribute)))
+    known = point_of(unbind(raw_attribute(hook.owner, hook.attribute)))
     return known and (known[1] or known[0].definition)
 
 

@@ -161,12 +161,13 @@ class Hook(Target):
         alone: Whether every call has one argument, the object it is called on.
         interceptors: Those of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
             other calls while an environment with these plugins, or without plugins, is evaluated.
-        place: The place of a wrapper while the hook is installed; None if none is to be set.
         permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
         point: The object that the layer above makes of the hook.
     """
 
-    def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None, place: Any = None) -> None:
+    permanent = True
+
+    def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None) -> None:
         """Make the hook of a function.
 
         Args:
@@ -174,7 +175,6 @@ class Hook(Target):
             name: Its dotted name.
             bound: Whether, in a class, its first argument is the object it is called on.
             like: The function that determines what calls return, if ``function`` only forwards to it.
-            place: The place for a temporary wrapper.
 
         Raises:
             PatchError: It is an async generator function.
@@ -196,9 +196,7 @@ class Hook(Target):
         ]
         self.alone = self.bound and len(first) == len(parameters) == 1
         self.interceptors = Interceptors(self)
-        self.place, self.permanent = place, place is None
         self.point: Any = None
-        self._temporary: FunctionType | None = None  # the wrapper for the place
 
     def __reduce__(self) -> Any:
         return _restored, (self.function, self.name, self.bound, self.kind, self.exposed), self.point
@@ -251,23 +249,6 @@ class Hook(Target):
                 _THREAD.root = _Root(here)
             _ROOTS.add(here)
         return self.interceptors.get(plugins) or self.interceptors.get(None) or self.run_rule
-
-    # -- where it is set --------------------------------------------------------------------------
-
-    @property
-    def stale(self) -> bool:  # type: ignore[override]
-        """Whether something else has replaced it while no wrapper was set in its place."""
-        return self.place is not None and not self._users and not self.place.is_free(self)
-
-    def _apply(self) -> None:
-        if self.place is not None:
-            if self._temporary is None:
-                self._temporary = self.make_wrapper()
-            self.place.put(self, self._temporary)
-
-    def _revert(self) -> None:
-        if self.place is not None and self._temporary is not None:
-            self.place.put_back(self._temporary)
 
     # -- who takes part ---------------------------------------------------------------------------
 

@@ -146,12 +146,7 @@ _TARGET: Final = Purpose(
 
 
 def _find_target(target: Any) -> Target:
-    """Find the target for handlers: a function, an exposed iterable, or the dotted name of one of these.
-
-    Raises:
-        UnknownTargetError: The name does not exist.
-        PatchError: It is not exposed and cannot be patched.
-    """
+    """Find the target for handlers: a function, an exposed iterable, or the dotted name of one of these."""
     if isinstance(target, str):
         try:
             owner, attribute = resolve(target, _TARGET)

@@ -153,10 +153,9 @@ class Hook(Target):
     """A function of a model that is decided or extended, with the interceptors of its calls.
 
     Attributes:
-        function: The function.
+        function: The function. Its signature is its own, not that of what it wraps.
         rule: The innermost part of a call: the function, or its temporary replacement.
         kind: What a call returns: "function" (a value), "generator" or "coroutine".
-        signature: The signature of the function itself, not of what it wraps; None if it is unknown.
         bound: Whether its first argument is the object it is called on, which is never passed by keyword.
         alone: Whether every call has one argument, the object it is called on.
         interceptors: Those of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
@@ -168,16 +167,13 @@ class Hook(Target):
     permanent = True
 
     def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None) -> None:
-        """Make the hook of a function.
+        """Make the hook of a function; raise a ``PatchError`` for an async generator function.
 
         Args:
             function: The function.
             name: Its dotted name.
             bound: Whether, in a class, its first argument is the object it is called on.
             like: The function that determines what calls return, if ``function`` only forwards to it.
-
-        Raises:
-            PatchError: It is an async generator function.
         """
         like = function if like is None else like
         if inspect.isasyncgenfunction(like):
@@ -227,11 +223,7 @@ class Hook(Target):
         return True
 
     def _intercept(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Run a call for which the stack itself has no interceptor.
-
-        Raises:
-            WrongThreadError: It is a decision, and the simulation cannot wait for its answer here.
-        """
+        """Run a call for which the stack itself has no interceptor, or refuse it with a ``WrongThreadError``."""
         return self._interceptor_at(getcurrent())(args, kwargs)
 
     def _interceptor_at(self, here: greenlet) -> Interceptor:
@@ -253,12 +245,9 @@ class Hook(Target):
     # -- who takes part ---------------------------------------------------------------------------
 
     def enter(self, stack: greenlet, decide: Interceptor | None, plugins: Any) -> None:
-        """Enter an interceptor for calls on the stack of a simulation.
+        """Enter an interceptor for calls on the stack of a simulation, whose environment has these plugins.
 
-        Args:
-            stack: The stack.
-            decide: What decides instead of the rule. None: the rule decides, with handlers if the plugins have some.
-            plugins: The plugins of the simulation's environment.
+        ``decide`` decides instead of the rule. None: the rule decides, with handlers if the plugins have some.
         """
         _ROOTS.discard(stack)
         if decide is not None:

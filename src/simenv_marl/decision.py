@@ -19,7 +19,7 @@ from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, short_repr
-from .hooks.hook import Hook, hook_of, made_with, unwrap
+from .hooks.hook import Hook, hook_of, made_with, unbind
 from .hooks.places import permanent_hook
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
@@ -299,19 +299,14 @@ def point_for(hook: Hook) -> "DecisionPoint":
 
 
 def point_of(function: Any) -> "tuple[DecisionPoint, Definition | None] | None":
-    """Return the point of a decision function and its definition; None for anything else."""
+    """Return the point of a decision function, also as an attribute of a class, and its definition; or None."""
     hook = hook_of(function)
     if hook is None:
         return None
-    definition: Definition | None = made_with(function)
+    definition: Definition | None = made_with(unbind(function))
     if definition is None and hook.point is None:
         return None
     return point_for(hook), definition
-
-
-def unwrapped(function: Any) -> Any:
-    """Return the function behind a decision function or an exposed function; any other function itself, unbound."""
-    return unwrap(getattr(function, "__func__", function))
 
 
 def registered(name: str) -> "DecisionPoint | None":

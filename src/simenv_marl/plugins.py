@@ -292,14 +292,14 @@ class Plugins:
         with LOCK:
             self._users.add(user)
             for handler in self._handlers:
-                handler.install(self)
+                handler.target.install(handler)
 
     def uninstall(self, user: object) -> None:
         """Undo ``install``, also where it failed half-way."""
         with LOCK:
             self._users.discard(user)
             for handler in reversed(self._handlers) if not self._users else ():
-                handler.uninstall(self)
+                handler.target.uninstall(handler)
 
     @property
     def plugins(self) -> Plugins:

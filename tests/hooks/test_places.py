@@ -17,8 +17,8 @@ from greenlet import getcurrent
 from simenv_marl import aec_env
 from simenv_marl.errors import PatchError, UnknownTargetError
 from simenv_marl.hooks.handlers import Installation
-from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.places import PlacedHook, find_hook, hook_at, places_of, resolve, unbind
+from simenv_marl.hooks.hook import hook_of, unbind
+from simenv_marl.hooks.places import PlacedHook, find_hook, hook_at, places_of, resolve
 from simenv_marl.plugins import _TARGET as TARGET
 from simenv_marl.plugins import (
     ChangedResult,

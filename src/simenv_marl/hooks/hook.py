@@ -18,7 +18,7 @@ from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
 from .handlers import CALLS, ITEMS, Target
-from .stacks import OUTSIDE, STACKS, Interceptor, plugins_at, spawner_of, stack_of
+from .stacks import EVALUATING, OUTSIDE, STACKS, Interceptor, spawner_of, stack_of
 
 _SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
 
@@ -108,15 +108,19 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
     return f"async {source.lstrip()}" if hook.kind == "coroutine" else source
 
 
-def is_wrapper(function: Any) -> bool:
-    """Return whether a function is a wrapper."""
-    # Checked by its code, not by an attribute: other decorators copy a function's attributes.
-    return isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE)
+def unbind(value: Any) -> Any:
+    """Return an attribute of a class or module without its binding."""
+    return value.__func__ if isinstance(value, (staticmethod, classmethod)) else value
 
 
-def hook_of(function: Any) -> Hook | None:
-    """Return the hook of a wrapper; None for any other function."""
-    return vars(function)[_MADE_WITH][0] if is_wrapper(function) else None
+def hook_of(value: Any) -> Hook | None:
+    """Return the hook of a wrapper, also as an attribute of a class; None for anything else."""
+    function = unbind(value)
+    # A wrapper is known by its code, not by an attribute: other decorators copy a function's attributes.
+    if isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE):
+        hook: Hook = vars(function)[_MADE_WITH][0]
+        return hook
+    return None
 
 
 def made_with(wrapper: FunctionType) -> Any:
@@ -125,7 +129,8 @@ def made_with(wrapper: FunctionType) -> Any:
 
 
 def unwrap(function: Any) -> Any:
-    """Return the function behind a wrapper; any other function itself."""
+    """Return the function behind a wrapper; any other function itself, unbound."""
+    function = getattr(function, "__func__", function)
     hook = hook_of(function)
     return function if hook is None else hook.function
 
@@ -232,8 +237,9 @@ class Hook(Target):
         if spawner is not None and not spawner.own_thread and spawner.decides(self):
             refuse: Interceptor = spawner.refuse(self, _SPAWNED)
             return refuse
+        evaluation = EVALUATING.get(here) if driver is None else driver
+        plugins = None if evaluation is None else evaluation.plugins
         decide = None if driver is None else driver.interceptor(self)
-        plugins = plugins_at(here, driver)
         if decide is not None:
             return self.around(decide, plugins)
         if here.parent is None and here not in STACKS:

@@ -73,9 +73,10 @@ def spawner_of(here: Any) -> Any:
     return driver
 
 
-def plugins_at(here: greenlet, driver: Any) -> Any:
-    """Return the plugins that take part in a greenlet of a driver, or of none. None: those of the whole process."""
-    evaluation = EVALUATING.get(here) if driver is None else driver
+def plugins_at_work() -> Any:
+    """Return the plugins that take part here. None: only the handlers of the whole process."""
+    here = getcurrent()
+    evaluation = (stack_of(here) if STACKS else None) or EVALUATING.get(here)
     return None if evaluation is None else evaluation.plugins
 
 

@@ -244,15 +244,17 @@ class DecisionPoint:
 
     Attributes:
         hook: The hook of the function.
+        name: The dotted name, ``package.module.Class.function``.
+        rule: The undecorated function, which decides where no environment or policy does.
         definition: The latest definition, which the bare name means; None for a point that was named from outside the
             model and is a decision point for some environments only.
         removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
     """
 
-    __slots__ = ("__weakref__", "definition", "hook", "removed_by")
+    __slots__ = ("__weakref__", "definition", "hook", "name", "removed_by", "rule")
 
     def __init__(self, hook: Hook) -> None:
-        self.hook = hook
+        self.hook, self.name, self.rule = hook, hook.name, hook.function
         self.definition: Definition | None = None
         self.removed_by: dict[Any, Mapped | None] = {}
 
@@ -267,16 +269,6 @@ class DecisionPoint:
         if self.definition is None:
             self.definition = definition
             _REGISTRY.setdefault(self.name, self)
-
-    @property
-    def name(self) -> str:
-        """The dotted name, ``package.module.Class.function``."""
-        return self.hook.name
-
-    @property
-    def rule(self) -> Any:
-        """The undecorated function, which decides where no environment or policy does."""
-        return self.hook.function
 
     @property
     def letters(self) -> str:

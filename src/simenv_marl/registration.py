@@ -68,7 +68,7 @@ def register_simulation(
         others = dict(simulation.options)
         options.setdefault("flatten", others.pop("flatten"))
         simulation = replace(simulation, options=others)
-    plan = Plan.draw_up(simulation, points, options)
+    plan = Plan(simulation, points, options)
     recipe = f"{name}-v{version}"
     where = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
     _RECIPES[recipe] = _Recipe(simulation, points, dict(options), [point.point.name for point in plan.active])
@@ -116,12 +116,12 @@ def make_view(recipe: str, module: str, view: str, point: str | None = None, **o
     """
     known, options = _recipe(recipe, module, view, point, options)
     mode = options.pop("render_mode", None)
-    plan = Plan.draw_up(known.simulation, known.points, options)
+    plan = Plan(known.simulation, known.points, options)
     wrapper: Any = None
-    if view in ("single", "joint") and isinstance(mode, str) and mode not in plan.model.render_modes:
-        if mode.endswith("_list") and mode.removesuffix("_list") in plan.model.render_modes:
+    if view in ("single", "joint") and isinstance(mode, str) and mode not in plan.render_modes:
+        if mode.endswith("_list") and mode.removesuffix("_list") in plan.render_modes:
             mode, wrapper = mode.removesuffix("_list"), RenderCollection
-        elif mode == "human" and "rgb_array" in plan.model.render_modes:
+        elif mode == "human" and "rgb_array" in plan.render_modes:
             mode, wrapper = "rgb_array", HumanRendering
     env = view_class(plan, view)(plan.amended({"render_mode": mode}))
     return env if wrapper is None else wrapper(env)

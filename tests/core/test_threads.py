@@ -267,7 +267,7 @@ def test_what_comes_of_a_move_is_read_before_another_thread_may_move(view, move)
                     in_a_thread(env.step, action)
 
     main = calling(*[decide] * 4)().main
-    env = Shown(Plan.draw_up(lambda: Drawn(main), decide, {"driver": "thread", "render_mode": "human"}))
+    env = Shown(Plan(lambda: Drawn(main), decide, {"driver": "thread", "render_mode": "human"}))
     env.reset()
     armed.append(True)
     env.reset() if move == "reset" else env.step(action)

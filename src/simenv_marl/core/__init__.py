@@ -10,7 +10,7 @@ Each module imports only from those below it::
     rounds, run                 rounds of the parallel and joint views; the run on the simulation's stack
     delegation                  decisions that policies or the rule take
     plan                        the checked description of an environment
-    agent, prototype, roster    one agent; a simulation made for inspection; who decides where
+    agent, roster               one agent; who decides where
     greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
     planner                     policies that get the environment
     point, loops                decision points and other events; asyncio's loops of two stacks

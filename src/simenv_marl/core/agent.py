@@ -1,4 +1,4 @@
-"""One agent of an episode: how its decisions are handled, and how it is rewarded and observed."""
+"""One agent of an episode: how its decisions are handled and answered, and how it is rewarded and observed."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from weakref import ref
 import numpy as np
 from greenlet import getcurrent
 
-from ..errors import MaskError, RewardError, short_repr
+from ..errors import AgentError, MaskError, RewardError, short_repr
 from ..hooks.stacks import DIFFERENCES, EVALUATING
 from ..simulation import RULE
-from .actions import MASK
+from .actions import MASK, only_choice
 from .driver import WAIT
 from .planner import DeferredPolicy, PlannerPolicy
 from .point import Point
@@ -23,6 +23,7 @@ from .spaces import duplicate
 
 if TYPE_CHECKING:
     from .episode import Episode
+    from .plan import Plan
 
 _NOTHING: Final[dict[str, Any]] = {}
 """The keyword arguments of calls without any. Nothing writes to this dict."""
@@ -70,10 +71,11 @@ class Agent:
         "point", "policy", "present", "report", "rest", "reward", "rule_action", "update",
     )  # fmt: skip
 
-    def __init__(self, name: str, point: Point, policy: Any, own: bool, clock: Any, plugins: Any) -> None:
-        self.name, self.point, self.clock, self.plugins = name, point, clock, plugins
-        self.follow(policy)
-        self.own, self.delegated = own, not own
+    def __init__(self, name: str, point: Point, plan: Plan, clock: Any) -> None:
+        self.name, self.point, self.clock, self.plugins = name, point, clock, plan.plugins
+        self.follow(plan.policy_of(name, point))
+        self.own = plan.owns(self.policy)
+        self.delegated = not self.own
         self.deliver, self.report = point.deliver, point.report
         self.update: Callable[..., None] = point.updates[0]
         self.decided = self.acted = self.ended = self.present = self.asked = self.informs_rule_action = False
@@ -109,7 +111,7 @@ class Agent:
             The reply to the simulation, or ``WAIT``.
         """
         if self.delegated:
-            return episode.consult(self, args, kwargs)
+            return self.ask_policy(episode, args, kwargs)
         point = self.point
         if point.agent is None:
             entity = self.entity
@@ -124,11 +126,90 @@ class Agent:
         episode.latest = self
         decide = episode.decide
         if decide is not None:  # in a round, after the last step, or where forced moves are skipped
-            return decide(episode, self, args, kwargs)
+            return decide(self, episode, args, kwargs)
         update = self.update  # a local variable: calling the attribute directly is slower
         update(self, args, kwargs)
         episode.pending = self
         return WAIT
+
+    def ask_policy(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Let the agent's policy answer a decision.
+
+        Returns:
+            The reply to the simulation; ``WAIT`` if the policy is asked later, for many decisions at once, or if a
+            replay has reached the other episode's decision.
+        """
+        if self.ended:
+            raise self.decides_after_end()
+        if episode.is_complete:  # else the simulation might run for ever without a decision for the user
+            return self.decide_too_late(episode, args, kwargs, truncated=False)
+        policy = self.policy
+        if policy is RULE:
+            return RULE
+        episode.latest = self
+        update = self.point.updates[0]
+        update(self, args, kwargs, reward=False)
+        forced = self.only_action() if episode.skips else None
+        if forced is not None:
+            return self.answer_forced(episode, forced)
+        if self.is_deferred and not episode.plan.solo:
+            episode.pending = self
+            return WAIT
+        if self.is_planner:
+            self.consultations += 1
+            self.keep(episode, args, kwargs)
+        if episode.script:
+            action = episode.script.popleft()
+        else:
+            episode.consulted = self
+            if episode.script is not None:
+                episode.pending = self
+                return WAIT
+            try:
+                action = policy.alone(episode, self) if self.is_deferred else policy(self.observation, self.info)
+            finally:
+                episode.consulted = None
+        episode.record(duplicate(action))
+        return episode.answer(self, self.checked(action), False)
+
+    def decide_unless_forced(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Update the agent. Its rewards add up until it has more than one legal action."""
+        self.update(self, args, kwargs)
+        self.reward, self.carried = self.reward + self.carried, 0.0
+        forced = self.only_action()
+        if forced is not None or not self.asked:  # ``reset`` returns no rewards either
+            self.reward, self.carried = 0.0, self.reward
+        if forced is not None:
+            return self.answer_forced(episode, forced)
+        self.asked = True
+        episode.pending = self
+        return WAIT
+
+    def decide_too_late(
+        self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any], truncated: bool = True
+    ) -> Any:
+        """End the episode in place of a decision: the user has taken the last step, or has no agent left."""
+        episode.finish(truncated=truncated)
+        return WAIT
+
+    def answer_forced(self, episode: Episode, action: Any) -> Any:
+        """Answer with the only legal action. The elapsed time adds up until the agent is asked, as rewards do."""
+        before = self.answered_at
+        reply = episode.answer(self, action, False)
+        if before is not None:
+            self.answered_at = before
+        return reply
+
+    def only_action(self) -> Any:
+        """The only legal action of the pending decision; None if there are several."""
+        return only_choice(self.point.definition.action_space, self.mask)
+
+    def decides_after_end(self) -> AgentError:
+        """Make the error for a decision after the agent's end."""
+        return AgentError(
+            f"the agent {self.name!r} decides at {self.point.point.name} after its end; agent= must give each entity a"
+            " name of its own, and removed_by= or end_agent() must end an agent only when its entity is gone"
+        )
 
     def keep(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         """Keep the arguments of a decision.
@@ -149,8 +230,16 @@ class Agent:
         first = self.entity()
         return None if first is None else (first, *self.rest)  # type: ignore[misc]
 
-    def release(self) -> None:
-        """Release the arguments. The agent has nothing more to observe."""
+    def conclude(self, episode: Episode) -> None:
+        """End the agent's episode: give it its last reward and its last observation, and release the arguments."""
+        episode.latest = self
+        args = self.arguments()
+        if args is None:  # the agent never decided, or the model has freed its entity
+            self.clear_observation()
+        else:
+            update = self.point.updates[0]
+            update(self, args, self.kwargs, last=True)
+        self.reward, self.carried = self.reward + self.carried, 0.0
         self.entity = self.rest = self.answered_at = None
         self.kwargs = _NOTHING
 

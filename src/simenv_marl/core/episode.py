@@ -14,7 +14,7 @@ A decision::
       suspended          ------>   ``handle``: find the agent; if the rule decides, back to the simulation
                                    ``update``: reward of the previous action (the first of an episode is dropped),
                                      legal actions, info, observation
-                                   if a policy answers (``delegation.consult``), back to the simulation with its action
+                                   if a policy answers (``Agent.ask_policy``), back to the simulation with its action
                                    else PENDING, until the user answers
                                    ``answer``: map the checked action to the reply
       returns            <------   ``advance``
@@ -30,7 +30,7 @@ episode is RESETTING or MOVING on the user's side, decision functions run their 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from math import inf
 from typing import Any, Final
 
@@ -43,20 +43,20 @@ from ..simulation import RULE
 from .actions import ILLEGAL
 from .agent import Agent
 from .context import ExclusiveLock
-from .delegation import consult, decide_too_late, decide_unless_forced, decides_after_end
 from .driver import WAIT, Driver
 from .plan import Plan
 from .point import Point
 from .rng import GlobalRandom
+from .roster import declared_agents, two_arguments
 from .rounds import Rounds
 from .run import Run
 from .spaces import duplicate
 
 LONGEST_TAPE: Final = 200_000
-"""How many actions are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""
+"""How many answers are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""
 
 LOST: Final[deque[Any]] = deque(maxlen=0)
-"""The tape of an episode that has more actions or is never replayed. It keeps nothing."""
+"""The tape of an episode that has more answers or is never replayed. It keeps nothing."""
 
 
 class Episode(Run):
@@ -100,20 +100,13 @@ class Episode(Run):
         lock: ExclusiveLock | None = None,
         script: Iterable[Any] | None = None,
     ) -> None:
-        """Prepare an episode of a simulation that has been reset.
+        """Prepare an episode of a simulation that has been reset. The driver's next ``resume`` begins ``run``.
 
-        Args:
-            plan: The plan of the environment.
-            simulation: The simulation.
-            driver: The simulation's driver. Its next ``resume`` begins ``run``.
-            seed: The seed of the simulation's reset.
-            in_rounds: Whether all agents are updated when a step returns.
-            rng: The environment's own state of the global generators. None if it has none.
-            lock: The lock that lets one thread at a time use the environment. None if only one thread can use it.
-            script: The tape of another episode to replay. None: this is an ordinary episode.
+        An episode ``in_rounds`` updates all agents when a step returns. ``script`` is the tape of another episode to
+        replay; ordinary episodes have none. For the other arguments, see ``Run``.
         """
         super().__init__(plan, simulation, driver, seed, rng, lock)
-        self.agents = {name: self._new_agent(name, point) for name, point in plan.roster.items()}
+        self.agents = {name: Agent(name, point, plan, self.clock) for name, point in plan.roster.items()}
         self.others: dict[str, Agent] = {}
         self.ended: dict[str, Agent] = {}
         self.just_ended: list[Agent] = []
@@ -131,9 +124,7 @@ class Episode(Run):
         if self.rounds is not None:
             self.decide = self.rounds.decide
         elif self.skips:
-            self.decide = decide_unless_forced
-
-    consult = consult
+            self.decide = Agent.decide_unless_forced
 
     def events_by_hook(self) -> dict[Hook, Any]:
         """The events that the simulation sends: an agent where it is the only one of a point, else the plan's event."""
@@ -143,14 +134,10 @@ class Episode(Run):
     # -- steps ------------------------------------------------------------------------------------
 
     def begin(self, at_first_event: Callable[[], None] | None = None) -> None:
-        """Run the simulation to its first decision.
-
-        Args:
-            at_first_event: Called when the simulation has sent its first event.
+        """Run the simulation to its first decision; when it has sent its first event, call a function.
 
         Raises:
             NoDecisionError: There is no decision for the environment's user.
-            BaseException: Any error of the model, a mapping or a policy.
         """
         with self.context():
             try:
@@ -166,6 +153,8 @@ class Episode(Run):
                         self.rounds.update_all(self)
                     elif not self.plan.unattended or self.plan.rewarded:
                         self._observe_announced()
+                    for agent in self.agents.values() if self.skips else ():
+                        agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards
                 if self.rounds is not None:
                     self.rounds.ended_at_reset = self.just_ended if self.skips else []
                 self.begun = True
@@ -194,7 +183,6 @@ class Episode(Run):
         Raises:
             InvalidActionError: The action is not legal. Nothing has moved.
             EpisodeOverError, ReentrancyError: No decision is pending.
-            BaseException: Any error of the model, a mapping or a policy.
         """
         agent = self.pending
         if agent is None:
@@ -220,18 +208,9 @@ class Episode(Run):
             raise
 
     def answer(self, agent: Agent, action: Any, turn: bool = True) -> Any:
-        """Turn the checked action of an agent into the reply to the simulation.
+        """Turn the checked action of an agent, or ``RULE``, into the reply for the driver's ``resume``.
 
-        Args:
-            agent: The agent whose decision is answered.
-            action: The action, or ``RULE``.
-            turn: Whether the user answers the pending decision.
-
-        Returns:
-            The reply, for the driver's ``resume``.
-
-        Raises:
-            BaseException: Any error of a mapping. The decision stays pending.
+        If a mapping raises, the decision stays pending. ``turn``: The user answers the pending decision.
         """
         try:
             self.pending = None  # so that an action from inside a mapping is refused
@@ -263,8 +242,7 @@ class Episode(Run):
     def advance(self, reply: Any) -> None:
         """Resume the simulation with a reply, and run to the user's next decision, or to the end.
 
-        Raises:
-            BaseException: Any error of the model, a mapping or a policy. The caller must then call ``fail``.
+        If the model, a mapping or a policy raises, the caller must call ``fail``.
         """
         while True:
             resume = self.driver.resume  # a local variable: calling the attribute directly is slower
@@ -286,7 +264,7 @@ class Episode(Run):
             self.tape = LOST
         self.limit = self.most_steps
         if self.turns == self.limit:
-            self.decide = decide_too_late
+            self.decide = Agent.decide_too_late
 
     def _observe_announced(self) -> None:
         """After a reset, observe the agents that ``expected_calls`` announces and that have not decided."""
@@ -298,14 +276,8 @@ class Episode(Run):
                 agent.update(agent, args, agent.kwargs, reward=False)
                 agent.choices = None  # ``legal`` returns them again when the agent decides
         self.pending = following
-        for agent in self.agents.values() if self.skips else ():
-            agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards
 
     # -- agents -----------------------------------------------------------------------------------
-
-    def _new_agent(self, name: str, point: Point) -> Agent:
-        policy = self.plan.policy_of(name, point)
-        return Agent(name, point, policy, self.plan.owns(policy), self.clock, self.plan.plugins)
 
     def agent_for(self, point: Point, name: Any) -> Agent:
         """Find the agent with a name that decides at a point, or let it join.
@@ -318,8 +290,8 @@ class Episode(Run):
         agent = self.others.get(name) or self.agents.get(name)
         if agent is None:
             if name in self.ended:
-                raise decides_after_end(self.ended[name])
-            agent = self._new_agent(name, point)
+                raise self.ended[name].decides_after_end()
+            agent = Agent(name, point, self.plan, self.clock)
             (self.agents if agent.own else self.others)[name] = agent
         elif agent.point is not point:
             raise AgentError(
@@ -360,24 +332,54 @@ class Episode(Run):
     def end_agent(self, agent: Agent) -> None:
         """End the episode of one agent while the simulation's goes on."""
         latest = self.latest
-        self._conclude(agent)
+        agent.conclude(self)
         self.latest = latest  # the model continues after this agent's decision
         agent.ended = agent.delegated = True
         self.ended[agent.name] = self.agents.pop(agent.name)
         self.just_ended.append(agent)
         self.is_complete = agent.name == self.plan.one_agent
 
-    def _conclude(self, agent: Agent) -> None:
-        """Give an agent its last reward and its last observation."""
-        self.latest = agent
-        args = agent.arguments()
-        if args is None:  # the agent never decided, or the model has freed its entity
-            agent.clear_observation()
-        else:
-            update = agent.point.updates[0]
-            update(agent, args, agent.kwargs, last=True)
-        agent.reward, agent.carried = agent.reward + agent.carried, 0.0
-        agent.release()
+    # -- branches that wait for one agent ---------------------------------------------------------
+
+    def single_out(self, agent: Agent) -> None:
+        """In a branch, make one agent the only agent of the environment, and wait for its pending decision.
+
+        Policies answer for all other agents, or the rule where there is no policy.
+        """
+        if list(self.agents.values()) != [agent]:
+            self.most_steps = self.limit = inf  # ``max_steps`` counts the steps of other agents
+        plan = self.plan = self.plan.for_one(agent.name)
+        for name, other in self.agents.items():
+            if other is not agent:
+                self.others[name], other.delegated = other, True
+                other.follow(plan.policy_of(name, other.point))
+        self.others.pop(agent.name, None)
+        self.agents, self.just_ended, self.is_complete = {agent.name: agent}, [], False
+        agent.follow(None)
+        agent.delegated, agent.own, agent.asked = False, True, True
+        self.rounds, self.decide = None, Agent.decide_unless_forced if self.skips else None
+        self.begun = True
+        if not agent.decided:  # drop the first value of the reward mapping, which rewards no action
+            with self.context():
+                agent.update(agent, agent.arguments(), agent.kwargs, observe=False)
+        self.consulted, self.pending = None, agent
+
+    def delegate(self, policies: Mapping[str, Any]) -> None:
+        """In a branch, let policies, given by agent, answer for agents that neither the user nor a policy answers."""
+        others = {name: self.others.get(name) for name, policy in policies.items() if policy is not RULE}
+        others = {name: agent for name, agent in others.items() if agent is None or agent.policy is RULE}
+        found = {name: two_arguments(policies[name]) for name in others if name not in self.agents}
+        self.plan = self.plan.with_policies(found)
+        for name, agent in others.items():
+            if agent is not None:
+                agent.follow(self.plan.policies[name])
+
+    def may_have(self, name: Any) -> bool:
+        """Whether there is an agent with that name, or could be one later."""
+        declared = self.plan.options.possible_agents
+        open_to_all = declared is None and any(point.agent is None for point in self.plan.points)
+        known = (self.agents, self.others, self.plan.roster, self.plan.policies, declared_agents(declared))
+        return any(name in names for names in known) or (open_to_all and isinstance(name, str))
 
     # -- ends -------------------------------------------------------------------------------------
 
@@ -385,7 +387,7 @@ class Episode(Run):
         """End the episode of all live agents."""
         self.pending = None
         for agent in self.agents.values():
-            self._conclude(agent)
+            agent.conclude(self)
         self.over, self.truncated, self.terminated = True, truncated, not truncated
         if self.plan.unmatched_names:
             self._warn_of_unmatched_names()

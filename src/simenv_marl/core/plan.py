@@ -6,10 +6,12 @@ state of any episode, so that one plan serves any number of environments.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
-from typing import Any
+from typing import Any, Final
+from weakref import finalize
 
 from ..decision import DecisionPoint, Definition
 from ..errors import (
@@ -23,26 +25,53 @@ from ..errors import (
     warn_user,
 )
 from ..hooks.hook import Hook
+from ..hooks.stacks import outside_simulation
 from ..plugins import Plugins
-from ..simulation import RULE, SimulationInterface
+from ..simulation import RULE, SimulationInterface, make_simulation
 from .agent import make_updates
+from .driver import Driver
+from .greenlets import GreenletDriver
 from .options import Options
 from .planner import DeferredPolicy, PlannerPolicy, bind_session
 from .point import EndAgent, Point, Removal, given_simulation
-from .points import (
-    NamedPoint,
-    by_name,
-    find_points,
-    have_instances,
-    locate,
-    owner_class,
-    portable,
-)
-from .prototype import DRIVERS, Model, Prototype
+from .points import NamedPoint, by_name, find_points, have_instances, locate, own_points, owner_class, portable
 from .roster import agent_names, declared_agents, mentions_agents, resolve_policies, resolve_roster
+from .threads import ThreadDriver
 
-END_AGENT = f"{SimulationInterface.__module__}.{SimulationInterface.end_agent.__qualname__}"
+DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {"greenlet": GreenletDriver, "thread": ThreadDriver}
+
+END_AGENT: Final = f"{SimulationInterface.__module__}.{SimulationInterface.end_agent.__qualname__}"
 """The dotted name of the method by which a simulation ends an agent's episode."""
+
+RENDER_MODES: Final = ("ansi", "human", "rgb_array")
+"""The render modes of a simulation with a method ``render`` that does not define ``render_modes``."""
+
+RENDER_FPS: Final = 4
+"""The frames per second of a simulation that does not define ``render_fps``."""
+
+
+class Prototype:
+    """A simulation that a plan made for inspection, with its stack, until an environment claims both.
+
+    Attributes:
+        driver, simulation: The stack, and the simulation that was made on it.
+    """
+
+    def __init__(self, source: Any, kind: str) -> None:
+        """Make a simulation from a simulation, class or factory, on a stack of the driver with that name."""
+        self.driver = DRIVERS[kind]()
+        self._end = finalize(self, self.driver.end)
+        try:
+            with outside_simulation():
+                self.simulation = self.driver.run(lambda: make_simulation(source))
+        except BaseException:
+            self._end()
+            raise
+
+    def claim(self) -> tuple[Driver, Any]:
+        """Hand over the driver and the simulation. From now on the caller must end them."""
+        self._end.detach()
+        return self.driver, self.simulation
 
 
 class Plan:
@@ -51,8 +80,8 @@ class Plan:
     Attributes:
         source: The simulation, class or factory from which the environment makes its simulation.
         variant: The variant from which the environment is made. None if it is not made from a variant.
-        model: What is known of the simulation.
         options: The options.
+        render_modes, render_fps: The simulation's render modes, and the frames per second of its rendering.
         points: The decision points that do not run their rule.
         active: The decision points that the environment's user answers.
         events: For each hook, the event that the simulation sends when its function is called.
@@ -74,56 +103,14 @@ class Plan:
     def __init__(
         self,
         source: Any,
-        named: list[NamedPoint],
-        options: Options,
-        model: Model,
-        *,
-        unattended: bool = False,
-        rewarded: bool = False,
-        others: Any = None,
-        variant: Any = None,
-        prototypes: list[Prototype] | None = None,
-    ) -> None:
-        """Check everything, and find out who decides where: see ``Plan.build``."""
-        self.source, self.variant, self.options, self.model = source, variant, options, model
-        self._named = named
-        self._prototypes = [] if prototypes is None else prototypes
-        self.unattended, self.rewarded, self._others, self.solo = unattended, rewarded, others, False
-        modes = model.render_modes
-        if options.render_mode is not None and options.render_mode not in modes:
-            raise OptionValueError(
-                f"render_mode {short_repr(options.render_mode)} is not one of the simulation's:"
-                f" {modes or 'it has none'}{did_you_mean(options.render_mode, modes)}"
-            )
-        agents = agent_names(named)
-        if options.agent is not None and options.agent not in agents and None not in agents:
-            raise AgentError(
-                f"agent={short_repr(options.agent)} names no agent; the agents are {', '.join(filter(None, agents))}"
-                f"{did_you_mean(options.agent, filter(None, agents))}"
-            )
-        by_point, self.policies, extra = resolve_policies(options.policies or {}, named, agents, model.points)
-        self._everything, self._by_point = [*named, *extra], by_point
-        self.hooks: list[Hook] = [point.point.hook for point in self._everything]
-        own_hooks = {name: point.hook for name, point in by_name(model.points).items()}
-        self.plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
-        self.unmatched_names = {*self.policies, *declared_agents(options.possible_agents)}
-        mappings = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
-        self.has_planner = any(isinstance(p, PlannerPolicy) for p in (*by_point.values(), *self.policies.values()))
-        self.is_bound_to_simulation = mappings or self.has_planner
-        self._prepare_points(first=True)
-
-    @classmethod
-    def draw_up(
-        cls,
-        source: Any,
         points: Any,
         options: Mapping[str, Any],
         *,
         unattended: bool = False,
         rewarded: bool = False,
         others: Any = None,
-    ) -> Plan:
-        """Make a plan from the arguments that a user gives.
+    ) -> None:
+        """Make a plan from the arguments that a user gives, and check them.
 
         Args:
             source: A simulation, its class, a factory, or a variant.
@@ -136,29 +123,56 @@ class Plan:
         Raises:
             SimEnvError: The arguments do not work. The subclass of the error says why.
         """
-        variant = source if hasattr(source, "environment_arguments") else None
-        if variant is not None:
-            source, points, options = variant.environment_arguments(points, options)
-        checked = Options().amended(options)
-        if unattended and checked.agent is not None:
+        self.variant = source if hasattr(source, "environment_arguments") else None
+        if self.variant is not None:
+            source, points, options = self.variant.environment_arguments(points, options)
+        self.source, self.options = source, Options().amended(options)
+        self.unattended, self.rewarded, self._others, self.solo = unattended, rewarded, others, False
+        if unattended and self.options.agent is not None:
             raise UnknownOptionError("agent is an option of single views only, as single_env makes them")
         inspected: Any = source
-        prototypes: list[Prototype] = []
+        self._prototypes: list[Prototype] = []
         is_factory = not isinstance(source, type) and not hasattr(source, "run")
         if is_factory or (points is None and getattr(source, "points", None) is None):
-            prototypes.append(Prototype(source, checked.driver))
-            inspected = prototypes[0].simulation
-        required = not unattended or others is not None or mentions_agents(checked.policies)
-        model = Model.of(inspected)
-        named = find_points(points, inspected, model.points, required=required, empty=unattended)
-        return cls(
-            source, named, checked, model, unattended=unattended, rewarded=rewarded, others=others, variant=variant,
-            prototypes=prototypes,
-        )  # fmt: skip
+            self._prototypes.append(Prototype(source, self.options.driver))
+            inspected = self._prototypes[0].simulation
+        kind = inspected if isinstance(inspected, type) else type(inspected)
+        self._ends_agents = issubclass(kind, SimulationInterface)
+        modes = getattr(inspected, "render_modes", RENDER_MODES) if hasattr(inspected, "render") else ()
+        self.render_modes, self.render_fps = list(modes), getattr(inspected, "render_fps", RENDER_FPS)
+        self._own = own_points(inspected)
+        required = not unattended or others is not None or mentions_agents(self.options.policies)
+        self._named = find_points(points, inspected, self._own, required=required, empty=unattended)
+        self._resolve()
+
+    def _resolve(self) -> None:
+        """Check the options against the simulation and its points, and find out which policy answers where."""
+        options, modes = self.options, self.render_modes
+        if options.render_mode is not None and options.render_mode not in modes:
+            raise OptionValueError(
+                f"render_mode {short_repr(options.render_mode)} is not one of the simulation's:"
+                f" {modes or 'it has none'}{did_you_mean(options.render_mode, modes)}"
+            )
+        agents = agent_names(self._named)
+        if options.agent is not None and options.agent not in agents and None not in agents:
+            raise AgentError(
+                f"agent={short_repr(options.agent)} names no agent; the agents are {', '.join(filter(None, agents))}"
+                f"{did_you_mean(options.agent, filter(None, agents))}"
+            )
+        by_point, self.policies, extra = resolve_policies(options.policies or {}, self._named, agents, self._own)
+        self._everything, self._by_point = [*self._named, *extra], by_point
+        self.hooks: list[Hook] = [point.point.hook for point in self._everything]
+        own_hooks = {name: point.hook for name, point in by_name(self._own).items()}
+        self.plugins = Plugins(options.plugins, own_hooks) if options.plugins else None
+        self.unmatched_names = {*self.policies, *declared_agents(options.possible_agents)}
+        mappings = any(given_simulation(point.definition, None) is not point.definition for point in self._everything)
+        self.has_planner = any(isinstance(p, PlannerPolicy) for p in (*by_point.values(), *self.policies.values()))
+        self.is_bound_to_simulation = mappings or self.has_planner
+        self._prepare_points(warns=True)
 
     # -- who decides where ------------------------------------------------------------------------
 
-    def _prepare_points(self, *, first: bool) -> None:
+    def _prepare_points(self, *, warns: bool) -> None:
         """Prepare the decision points, and find out who decides at each."""
         options = self.options
         agents = agent_names(self._everything)
@@ -175,8 +189,8 @@ class Plan:
             else:
                 self.unmatched_names.discard(agent)
         events: dict[DecisionPoint, Any] = {point.point: point for point in self.points}
-        self._find_removals(events, warns=first)
-        if self.points and self.model.ends_agents:
+        self._find_removals(events, warns=warns)
+        if self.points and self._ends_agents:
             self._add_event(events, locate(END_AGENT), EndAgent())
         self.events = {point.hook: event for point, event in events.items()}
         if not self.active and not self.unattended:
@@ -233,7 +247,7 @@ class Plan:
     def _find_removals(self, events: dict[DecisionPoint, Any], *, warns: bool) -> None:
         for point in self.points:
             for name, agent in (*point.point.removed_by.items(), *point.definition.removed_by.items()):
-                remover = locate(name, self.model.points)
+                remover = locate(name, self._own)
                 removal = self._add_event(events, remover, Removal(remover))
                 if not isinstance(removal, Removal):
                     raise DefinitionError(
@@ -307,48 +321,45 @@ class Plan:
         return prototype if type(prototype.driver) is DRIVERS[self.options.driver] else None
 
     @property
-    def maker(self) -> Any:
-        """The class or factory of the simulation."""
+    def name(self) -> str:
+        """The name of the simulation's class or factory."""
         source = self.source
         while isinstance(source, partial):
             source = source.func
-        return source if hasattr(source, "__qualname__") else type(source)
-
-    @property
-    def name(self) -> str:
-        """The name of the simulation's class or factory."""
-        return str(self.maker.__name__)
+        return str((source if hasattr(source, "__qualname__") else type(source)).__name__)
 
     # -- other plans ------------------------------------------------------------------------------
 
     def with_simulation(self, simulation: Any, session: Any) -> Plan:
         """Copy the plan, and give the simulation and its session to the mappings and policies that ask for them."""
-        made = self._copied()
+        made = copy.copy(self)
         made._everything = [
             replace(point, definition=given_simulation(point.definition, simulation)) for point in self._everything
         ]
         made._by_point = {key: bind_session(policy, session) for key, policy in self._by_point.items()}
         made.policies = {key: bind_session(policy, session) for key, policy in self.policies.items()}
-        made._prepare_points(first=False)
+        made._prepare_points(warns=False)
         return made
 
     def for_one(self, agent: str) -> Plan:
         """Copy the plan for a branch that waits for one agent only. The rule decides for agents without a policy."""
-        made = self._copied()
+        made = copy.copy(self)
         made.unattended, made.rewarded, made.solo = True, False, True
         made.one_agent, made.unmatched_names = agent, set()
         return made
 
     def with_policies(self, policies: Mapping[str, Any]) -> Plan:
         """Copy the plan for a branch in which policies, given by agent, answer for agents that have none."""
-        made = self._copied()
+        made = copy.copy(self)
         made.policies = {**policies, **self.policies}
         return made
 
     def redefined(self, point: DecisionPoint, definition: Definition) -> Plan:
         """Make the same plan with another definition of a point."""
-        named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
-        return self._like(named, self.options)
+        made = copy.copy(self)
+        made._named = [replace(own, definition=definition) if own.point is point else own for own in self._named]
+        made._resolve()
+        return made
 
     def declared(self, roster: Mapping[str, Point]) -> Plan:
         """Make the same plan with a roster of agents that was found out."""
@@ -356,20 +367,20 @@ class Plan:
         for agent, point in roster.items():
             if point.agent is None:
                 names[point.point.name].append(agent)
-        plan = self.amended({"possible_agents": names})
-        plan.unmatched_names = self.unmatched_names  # the user has not named the agents that were found out
-        return plan
+        made = self.amended({"possible_agents": names})
+        made.unmatched_names = self.unmatched_names  # the user has not named the agents that were found out
+        return made
 
     def amended(self, options: Mapping[str, Any]) -> Plan:
         """Make the same plan with other values of the given options."""
-        return self._like(self._named, self.options.amended(options)) if options else self
+        if not options:
+            return self
+        made = copy.copy(self)
+        made.options = self.options.amended(options)
+        made._resolve()
+        return made
 
-    def _like(self, named: list[NamedPoint], options: Options) -> Plan:
-        return Plan(
-            self.source, named, options, self.model, variant=self.variant, prototypes=self._prototypes
-        )  # fmt: skip
-
-    def _copied(self) -> Plan:
+    def __copy__(self) -> Plan:
         made = Plan.__new__(Plan)
         vars(made).update(vars(self))
         return made
@@ -384,10 +395,10 @@ class Plan:
             if isinstance(options[name], Mapping):
                 options[name] = {portable(key): value for key, value in options[name].items()}
         options["plugins"] = [] if self.plugins is None else self.plugins.portable
-        return _remade, (self.source, points, options, self.variant, self.unattended)
+        return _unpickle, (self.source, points, options, self.variant, self.unattended)
 
 
-def _remade(source: Any, points: Any, options: dict[str, Any], variant: Any, unattended: bool) -> Plan:
-    plan = Plan.draw_up(source, points, options, unattended=unattended)
+def _unpickle(source: Any, points: Any, options: dict[str, Any], variant: Any, unattended: bool) -> Plan:
+    plan = Plan(source, points, options, unattended=unattended)
     plan.variant = variant
     return plan

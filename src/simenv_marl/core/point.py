@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from types import FunctionType
@@ -29,11 +30,6 @@ MAPPINGS: Final = (
 """The parts of a definition, besides ``removed_by``, that get the simulation if they ask for it."""
 
 
-def asks_for_simulation(function: Any) -> bool:
-    """Whether a mapping has a keyword-only parameter ``_simulation``."""
-    return asks_for(function, "_simulation")
-
-
 def asks_for(function: Any, name: str) -> bool:
     """Whether a function has a keyword-only parameter with a given name."""
     if not callable(function):
@@ -52,18 +48,10 @@ def asks_for(function: Any, name: str) -> bool:
 
 
 def given_simulation(definition: Definition, simulation: Any) -> Definition:
-    """Give the simulation to the mappings of a definition that ask for it.
-
-    Args:
-        definition: The definition.
-        simulation: The simulation. None serves to find out whether any mapping asks.
-
-    Returns:
-        The changed definition; the given definition itself if no mapping asks.
-    """
+    """Give the simulation to the mappings that ask for it; return the definition itself if no mapping asks."""
 
     def given(function: Any) -> Any:
-        return partial(function, _simulation=simulation) if asks_for_simulation(function) else function
+        return partial(function, _simulation=simulation) if asks_for(function, "_simulation") else function
 
     changes = {name: given(getattr(definition, name)) for name in MAPPINGS}
     changes = {name: function for name, function in changes.items() if function is not getattr(definition, name)}
@@ -293,17 +281,24 @@ async def _awaiting(value: Any) -> Any:
 # -- other events -----------------------------------------------------------------------------------
 
 
-class Removal:
-    """The event of a call that ends the episode of agents: of a function that ``removed_by=`` names.
+class Notice:
+    """An event that changes nothing in the simulation: the function itself runs, or has run.
+
+    Attributes:
+        deliver, report: None, because there is no reply to deliver and no result to report.
+    """
+
+    deliver = report = None
+
+
+class Removal(Notice):
+    """The notice of a call that ends the episode of agents: of a function that ``removed_by=`` names.
 
     Attributes:
         point: The function.
         of: A tuple for each decision point whose agents it ends: the point; a callable that takes the call's arguments
             and names the agent, or None; the class whose instances are such agents, or None if it is not known.
-        deliver, report: None, because the call always runs the function, and its result is not reported.
     """
-
-    deliver = report = None
 
     def __init__(self, point: DecisionPoint) -> None:
         self.point = point
@@ -325,14 +320,8 @@ class Removal:
         return RULE
 
 
-class EndAgent:
-    """The event of a call of the simulation's ``end_agent``.
-
-    Attributes:
-        deliver, report: None, because the call always runs the function, and its result is not reported.
-    """
-
-    deliver = report = None
+class EndAgent(Notice):
+    """The notice of a call of the simulation's ``end_agent``."""
 
     def handle(self, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """End the agent's episode if it is a live agent of the environment."""
@@ -343,15 +332,12 @@ class EndAgent:
         return RULE
 
 
-class RuleDecided:
-    """The event of a decision that the rule of a point has made.
+class RuleDecided(Notice):
+    """The notice of a decision that the rule of a point has made.
 
     Attributes:
         point: The decision point.
-        deliver, report: None, because the simulation continues with its own decision.
     """
-
-    deliver = report = None
 
     def __init__(self, point: Point) -> None:
         self.point = point
@@ -382,19 +368,19 @@ class RuleDecided:
         if mapping is None and choices is not None:
             same = (place for place, choice in enumerate(choices) if choice is decision or choice == decision)
             return next(same, None)
-        try:
-            if mapping is None:
+        if mapping is None:
+            with suppress(TypeError):  # the decision is not hashable
                 return None if self._inverse is None else self._inverse.get(decision)
-            if isinstance(mapping, dict):
+            return None
+        if isinstance(mapping, dict):
+            try:
                 action = mapping[decision]
-        except (KeyError, TypeError):  # a TypeError: the decision is not hashable
-            if mapping is None:
-                return None
-            raise InvalidActionError(
-                f"the dict rule_action_mapping has no action for the rule's decision {short_repr(decision)}; add one,"
-                " or pass a callable that returns None where no action corresponds"
-            ) from None
-        if not isinstance(mapping, dict):
+            except (KeyError, TypeError):
+                raise InvalidActionError(
+                    f"the dict rule_action_mapping has no action for the rule's decision {short_repr(decision)}; add"
+                    " one, or pass a callable that returns None where no action corresponds"
+                ) from None
+        else:
             action = mapping(decision) if self._decision_only else mapping(decision, *args, **kwargs)
         legal = None if action is None else point.check(action)
         if legal is ILLEGAL:

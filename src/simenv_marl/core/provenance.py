@@ -47,7 +47,7 @@ def provenance(
     Raises:
         SimEnvError: No environment can be made of these arguments. The subclass tells why.
     """
-    return describe(Plan.draw_up(simulation, points, options), seed)
+    return describe(Plan(simulation, points, options), seed)
 
 
 def describe(plan: Plan, seed: int | None) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from ..hooks.stacks import EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import ILLEGAL
 from .agent import Agent
-from .delegation import forced_action
 from .driver import WAIT
 from .spaces import duplicate
 
@@ -57,7 +56,6 @@ class Rounds:
             InvalidActionError: An action is not legal. Nothing has moved. An action that is legal now and illegal at
                 its turn counts as missing.
             EpisodeOverError, ReentrancyError: No decision is pending.
-            BaseException: Any error of the model, a mapping or a policy.
         """
         pending = episode.pending
         if pending is None:
@@ -94,14 +92,7 @@ class Rounds:
             )
 
     def check(self, episode: Episode, actions: Mapping[str, Any]) -> dict[str, Any]:
-        """Check the actions of a round, as far as this is possible before the simulation moves.
-
-        Returns:
-            The actions in the form that mappings take.
-
-        Raises:
-            UnknownAgentError, InvalidActionError, EpisodeOverError, ReentrancyError: See ``play``.
-        """
+        """Check the actions of a round before the simulation moves; return them in the form that mappings take."""
         pending, agents, checked = episode.pending, episode.agents, {}
         if pending is None:
             raise episode.refusal()
@@ -126,7 +117,7 @@ class Rounds:
             checked[name] = action
         return checked
 
-    def decide(self, episode: Episode, agent: Agent, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def decide(self, agent: Agent, episode: Episode, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Answer a decision with the agent's action of this round, or wait for the next round."""
         if agent.point.legal is not None:
             agent.mask, agent.choices = agent.point.legal(args, kwargs)
@@ -135,7 +126,7 @@ class Rounds:
         return self._use_action(episode, agent)
 
     def _use_action(self, episode: Episode, agent: Agent) -> Any:
-        action = forced_action(episode, agent) if episode.skips else None
+        action = agent.only_action() if episode.skips else None
         if action is None:
             action = self.actions.pop(agent.name, MISSING)
             mask = agent.mask
@@ -149,12 +140,7 @@ class Rounds:
         return episode.answer(agent, action, False)
 
     def update_all(self, episode: Episode, *, truncated: bool = False) -> None:
-        """Reward and observe all live agents when a step or a reset returns.
-
-        Args:
-            episode: The episode.
-            truncated: Whether the episode ends here.
-        """
+        """Reward and observe all live agents when a step or a reset returns. ``truncated``: The episode ends here."""
         following, episode.pending = episode.pending, None  # so that an action from inside a mapping is refused
         for agent, call in episode.announced().items():
             if agent is not following:
@@ -175,5 +161,3 @@ class Rounds:
             if agent.choices is not None and agent is not following:
                 agent.choices = None  # ``legal`` returns them again when the agent decides
         episode.pending = following
-        for agent in episode.agents.values() if episode.skips and not episode.begun else ():
-            agent.reward, agent.carried = 0.0, agent.carried + agent.reward  # ``reset`` returns no rewards

@@ -27,7 +27,7 @@ class Run:
     """The run of a simulation on its stack: the part of an episode that does not depend on who decides.
 
     Attributes:
-        plan, simulation, driver: The plan, the simulation, and its driver.
+        plan, simulation, driver: The plan of the environment, the simulation, and the simulation's driver.
         seed: The seed of the simulation's reset.
         plugins: The plugins of the environment. None if it has none.
         clock: Returns the simulation's time. None if the simulation has no time.
@@ -55,7 +55,7 @@ class Run:
         rng: GlobalRandom | None,
         lock: ExclusiveLock | None,
     ) -> None:
-        """Prepare the run: see ``Episode``."""
+        """Prepare the run, with the environment's own global generators and its lock, if it has these."""
         self.plan, self.simulation, self.driver, self.seed, self.plugins = plan, simulation, driver, seed, plan.plugins
         self._rng, self._lock = rng, lock
         clock = getattr(simulation, "time", None)
@@ -103,7 +103,6 @@ class Run:
         Raises:
             ReentrancyError: The simulation is moving or is being unwound.
             WrongThreadError: The simulation is suspended in another thread.
-            BaseException: Any error that the simulation raises in its ``stop`` or while it unwinds.
         """
         if self.running and self.driver.lost:
             self.running, self.over = False, True

@@ -24,8 +24,7 @@ from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, environment_context
 from .driver import Driver
 from .episode import LONGEST_TAPE, LOST, Episode
-from .plan import Plan
-from .prototype import DRIVERS
+from .plan import DRIVERS, Plan
 from .resources import open_resources
 from .rng import GlobalRandom, draws_check, is_seed
 from .run import refusal
@@ -72,12 +71,7 @@ class Session:
     )  # fmt: skip
 
     def __init__(self, plan: Plan) -> None:
-        """Make the simulation, and set the plan's decision functions in the model.
-
-        Raises:
-            SimulationError: The plan's source does not make a simulation.
-            PatchError: A function cannot be patched.
-        """
+        """Make the simulation, and set the plan's decision functions in the model."""
         self.plan, self.state = plan, State.NEW
         self.seed: int | None = None
         self.options: dict[str, Any] | None = None
@@ -183,7 +177,6 @@ class Session:
 
         Raises:
             NoDecisionError: The simulation ended without a decision.
-            BaseException: Any error of the model.
         """
         with self.exclusive():
             self.end()
@@ -257,14 +250,10 @@ class Session:
         return known[2]
 
     def replay(self, other: Session) -> Episode:
-        """Bring the simulation to the current decision of another session with the same plan.
-
-        Returns:
-            The episode.
+        """Bring the simulation to the current decision of another session with the same plan; return the episode.
 
         Raises:
             BranchError: The replay does not reach the same decision.
-            BaseException: Any error of the model.
         """
         episode = other.episode
         if episode is None or (episode.pending or episode.consulted) is None:
@@ -279,7 +268,7 @@ class Session:
         while again.script:
             again.play(again.script.popleft())
         again.script = None
-        if not _same_decision(again, episode):
+        if not same(_decision(again), _decision(episode)):
             again.close()
             raise BranchError(
                 f"{type(self.simulation).__name__} does not repeat its decisions with the same seed and the same"
@@ -312,7 +301,6 @@ class Session:
 
         Raises:
             ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
-            BaseException: Any error that the simulation raises while it unwinds.
         """
         if self.state is State.STARTING:
             raise refusal("resetting")
@@ -335,19 +323,14 @@ class Session:
         if mode is None:
             warn_user(
                 "render() shows nothing without a render_mode; the simulation's render modes are"
-                f" {self.plan.model.render_modes}"
+                f" {self.plan.render_modes}"
             )
             return None
         with self.context():
             return self.simulation.render(mode)
 
     def close(self) -> None:
-        """Unwind the simulation and remove the patches.
-
-        Raises:
-            ReentrancyError, WrongThreadError: The episode cannot be ended from here, and continues.
-            BaseException: Any error that the simulation raises while it unwinds.
-        """
+        """Unwind the simulation and remove the patches. For errors, see ``end``."""
         try:
             self.end()
         finally:
@@ -397,14 +380,7 @@ class Session:
             )
 
     def reseed(self, seed: int) -> None:
-        """Draw the simulation's future random numbers anew.
-
-        Args:
-            seed: The seed for the simulation's ``reseed``, and for its own global generators if it has them.
-
-        Raises:
-            BaseException: Any error of the simulation's ``reseed``.
-        """
+        """Draw the simulation's future random numbers anew, by its ``reseed`` and its own global generators."""
         reseed = getattr(self.simulation, "reseed", None)
         with self.context():
             if self._rng is not None:
@@ -417,17 +393,10 @@ class Session:
                     raise
 
 
-def _same_decision(one: Episode, other: Episode) -> bool:
-    """Whether the pending decisions of two episodes look the same."""
-    mine, theirs = one.pending, other.pending or other.consulted
-    return (
-        mine is not None
-        and theirs is not None
-        and mine.name == theirs.name
-        and list(one.agents) == list(other.agents)
-        and same(mine.observation, theirs.observation)
-        and same(mine.mask, theirs.mask)
-    )
+def _decision(episode: Episode) -> Any:
+    """What the pending decision of an episode looks like; None if there is none."""
+    agent = episode.pending or episode.consulted
+    return agent and (agent.name, list(episode.agents), agent.observation, agent.mask)
 
 
 def checked_seed(seed: Any) -> int | None:

@@ -100,7 +100,7 @@ def learners_plan(
     keys = {key: entry.place for key, entry in entries.items() if isinstance(entry, PolicyKey)}
     others = PolicyKey(len(entries), BatchPolicy(_follow_rule)) if all_points else None
     options = {**options, "policies": entries}
-    plan = Plan.draw_up(simulation, points, options, unattended=True, rewarded=True, others=others)
+    plan = Plan(simulation, points, options, unattended=True, rewarded=True, others=others)
     for key in left:
         for point in plan.points:
             if point.report is None and is_answered_by(plan, point, keys[key]):

@@ -67,8 +67,7 @@ class View:
     @classmethod
     def metadata_of(cls, plan: Plan) -> dict[str, Any]:
         """Return the metadata of a plan's environments."""
-        model = plan.model
-        return {"name": f"{plan.name.lower()}_v0", "render_modes": model.render_modes, "render_fps": model.render_fps}
+        return {"name": f"{plan.name.lower()}_v0", "render_modes": plan.render_modes, "render_fps": plan.render_fps}
 
     @property
     def simulation(self) -> Any:

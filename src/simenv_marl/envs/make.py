@@ -50,11 +50,11 @@ def generate_env(
             ``agent=`` names one agent; else AEC.
         {options}
     """
-    plan = Plan.draw_up(simulation, points, options)
+    plan = Plan(simulation, points, options)
     base = view_class(plan, view)
 
     def initialise(self: Any, **changes: Any) -> None:
-        current = Plan.draw_up(simulation, points, options) if plan.stale else plan
+        current = Plan(simulation, points, options) if plan.stale else plan
         base.__init__(self, current.amended(changes))
 
     attributes = {
@@ -73,7 +73,7 @@ def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOption
     {arguments}
         {options}
     """
-    return SimulationAECEnv(Plan.draw_up(simulation, points, options))
+    return SimulationAECEnv(Plan(simulation, points, options))
 
 
 @explain_arguments
@@ -83,7 +83,7 @@ def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewO
     {arguments}
         {options}
     """
-    return SimulationParallelEnv(Plan.draw_up(simulation, points, options))
+    return SimulationParallelEnv(Plan(simulation, points, options))
 
 
 @explain_arguments
@@ -96,7 +96,7 @@ def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOpt
     {arguments}
         {options}
     """
-    plan = Plan.draw_up(simulation, points, options)
+    plan = Plan(simulation, points, options)
     return single_view(plan)(plan)
 
 
@@ -109,7 +109,7 @@ def joint_env(simulation: Any, points: Points = None, **options: Unpack[ViewOpti
     {arguments}
         {options}
     """
-    return SimulationJointEnv(Plan.draw_up(simulation, points, options))
+    return SimulationJointEnv(Plan(simulation, points, options))
 
 
 @explain_arguments

@@ -7,7 +7,6 @@ from typing import Any, NoReturn
 
 from gymnasium import spaces
 
-from ..core.delegation import single_out
 from ..core.plan import Plan
 from ..core.session import Session
 from ..errors import BranchError, CopyError, ReentrancyError
@@ -56,7 +55,7 @@ class PlannerEnv(SimulationEnv):
         if not self._branched:
             self._branched = True
             self._session.step_out()
-            single_out(self._running(), self._own)
+            self._running().single_out(self._own)
 
     def check_pending(self) -> None:
         """Refuse a branch after the planner has returned its action."""

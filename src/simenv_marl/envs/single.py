@@ -12,7 +12,7 @@ from ..core.actions import open_mask
 from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.point import asks_for_simulation
+from ..core.point import asks_for
 from ..core.session import Session
 from ..errors import ViewError
 from .one_agent import OneAgentView
@@ -129,7 +129,7 @@ def with_goals(plan: Plan) -> Plan:
         "achieved_goal": definition.achieved_goal_mapping,
         "desired_goal": definition.desired_goal_mapping,
     }
-    asking = {key for key, part in parts.items() if asks_for_simulation(part)}
+    asking = {key for key, part in parts.items() if asks_for(part, "_simulation")}
 
     def observe_with_goals(*args: Any, **kwargs: Any) -> dict[str, Any]:
         return {key: part(*args, **kwargs) for key, part in parts.items()}

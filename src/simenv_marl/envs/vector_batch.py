@@ -53,7 +53,7 @@ class SubEnvironmentType:
     def __init__(self, simulation: Any, points: Any, options: Mapping[str, Any], view: str | None) -> None:
         """Choose the view, by arguments of ``vector_env``. For a joint view this may take the reset of a simulation."""
         self._arguments = simulation, points, options
-        plan = Plan.draw_up(simulation, points, options)
+        plan = Plan(simulation, points, options)
         if view is None:
             view = "joint" if plan.one_agent is None else "single"
         self.joint: Joint | None = None

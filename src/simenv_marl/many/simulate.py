@@ -42,7 +42,7 @@ def simulate(
         SimEnvError: Something cannot work. The subclass tells what.
         BaseException: Any exception of the model, a mapping or a policy.
     """
-    plan = Plan.draw_up(simulation, points, {**options, "policies": policies or {}}, unattended=True)
+    plan = Plan(simulation, points, {**options, "policies": policies or {}}, unattended=True)
     with reuse_resources():  # policies may branch
         session = Session(plan)
         try:
@@ -125,7 +125,7 @@ def simulate_many(
 
 
 def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options: Mapping[str, Any]) -> Plan:
-    return Plan.draw_up(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
+    return Plan(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
 
 
 def _simulate(

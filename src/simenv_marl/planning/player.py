@@ -15,7 +15,6 @@ from gymnasium import spaces
 from ..core.actions import ILLEGAL, action_check
 from ..core.agent import Agent
 from ..core.branching import pending_view
-from ..core.delegation import delegate, may_be
 from ..core.planner import PlannerPolicy, base_of
 from ..core.roster import two_arguments
 from ..core.spaces import duplicate
@@ -43,7 +42,7 @@ class Player:
         self.episode = self.view.episode
         self.record: Agent = self.episode.pending or self.episode.consulted
         self.agent = self.record.name
-        self.may_be: Callable[[Any], bool] = partial(may_be, self.episode)
+        self.may_be: Callable[[Any], bool] = self.episode.may_have
         self.over = False
         self._policies: dict[str, Any] = {}  # the bases that were asked, by agent
         self._seen: dict[str, Any] = {}  # observation and info, as the latest step has returned them, by agent
@@ -108,7 +107,7 @@ class Player:
         """Prepare a branch."""
         self.view.stop_showing()
         if isinstance(self.view, SimulationEnv) and isinstance(self.base, Mapping):
-            delegate(self.episode, self.base)  # the simulation answers for all other agents
+            self.episode.delegate(self.base)  # the simulation answers for all other agents
 
     def now(self) -> float:
         """Return the simulation's time."""

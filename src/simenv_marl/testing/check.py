@@ -73,7 +73,7 @@ def check_simulation(
         for pattern in _WARNINGS:
             warnings.filterwarnings("always", f".*{pattern}")
         try:
-            plan = Plan.draw_up(simulation, points, options)
+            plan = Plan(simulation, points, options)
             make_environment(plan, "aec")
             subject = Subject(plan=plan, seeds=tuple(map(int, chosen)), episodes=episodes, max_steps=max_steps)
             subject.seconds, subject.end, subject.own = time_limit / 4, time.monotonic() + time_limit, fingerprint
@@ -121,7 +121,7 @@ def inspect_simulation(
         Exception: Any exception of the model's constructor.
     """
     with quietly():
-        plan = Plan.draw_up(simulation, points, options)
+        plan = Plan(simulation, points, options)
         seed_global_generators(seed)
         run = Runner(plan=plan, max_steps=max_steps, seconds=time_limit, own=lambda simulation: None).run_plainly(seed)
         views = fitting_views(plan)

@@ -19,7 +19,7 @@ from greenlet import getcurrent
 from gymnasium import spaces
 
 from .errors import DefinitionError, PatchError, short_repr
-from .hooks.hook import Hook, hook_of, made_with, unwrap
+from .hooks.hook import Hook, hook_of, made_with, unbind
 from .hooks.places import permanent_hook
 from .hooks.stacks import DIFFERENCES, EVALUATING
 
@@ -61,13 +61,19 @@ class Definition:
         Raises:
             DefinitionError: The definition cannot work.
         """
-        _check_kinds(self)
-        _check_together(self)
+        _check(self)
         answers = _answers(self.action_space_mapping)
         if answers is not None:
-            _check_answers(answers, self.action_space)
             object.__setattr__(self, "action_space_mapping", dict(answers).__getitem__)
-        object.__setattr__(self, "removed_by", _removals(self.removed_by))
+        named: Any = [self.removed_by] if isinstance(self.removed_by, str) else self.removed_by
+        removed_by = dict(named if isinstance(named, Mapping) else dict.fromkeys(named))
+        for name, agent in removed_by.items():
+            if not isinstance(name, str) or not (agent is None or callable(agent)):
+                raise DefinitionError(
+                    "make_step: removed_by must be a dict from dotted names to callables, not"
+                    f" {short_repr(name)}: {short_repr(agent)}"
+                )
+        object.__setattr__(self, "removed_by", removed_by)
 
     def __call__(self, function: Any) -> Any:
         """Make the decision function.
@@ -153,21 +159,17 @@ def make_step(
     return Definition(**locals())  # which checks them
 
 
-REQUIRED = ("observation_space_mapping", "reward_mapping")
-ANSWERS = ("action_space_mapping", "apply", "choices")
-GOALS = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
-"""Arguments of ``make_step``: required ones; those of which one is required; those that belong together."""
-
-
-def _check_kinds(definition: Definition) -> None:
-    """Check the type of each part of a definition."""
+def _check(definition: Definition) -> None:
+    """Check the parts of a definition, one by one and together."""
     for name in ("observation_space", "action_space", "goal_space"):
         space = getattr(definition, name)
         if not isinstance(space, spaces.Space) and (name != "goal_space" or space is not None):
             raise DefinitionError(f"make_step: {name} must be a gymnasium space, not {short_repr(space)}")
-    for name in (*REQUIRED, *ANSWERS[1:], "action_mask_mapping", *GOALS[1:]):
+    required = ("observation_space_mapping", "reward_mapping")
+    goal = ("goal_space", "achieved_goal_mapping", "desired_goal_mapping", "compute_reward")
+    for name in (*required, "apply", "choices", "action_mask_mapping", *goal[1:]):
         function = getattr(definition, name)
-        if not callable(function) and (name in REQUIRED or function is not None):
+        if not callable(function) and (name in required or function is not None):
             raise DefinitionError(f"make_step: {name} must be callable, not {short_repr(function)}")
     for name in ("action_space_mapping", "rule_action_mapping"):
         mapping = getattr(definition, name)
@@ -176,11 +178,7 @@ def _check_kinds(definition: Definition) -> None:
     agent = definition.agent
     if agent is not None and not (callable(agent) or (isinstance(agent, str) and agent)):
         raise DefinitionError(f"make_step: agent must be a name or a callable, not {short_repr(agent)}")
-
-
-def _check_together(definition: Definition) -> None:
-    """Check that the parts of a definition fit together."""
-    given = [name for name in ANSWERS if getattr(definition, name) is not None]
+    given = [name for name in ("action_space_mapping", "apply", "choices") if getattr(definition, name) is not None]
     if len(given) != 1 and given != ["apply", "choices"]:
         raise DefinitionError(
             "make_step: give one of action_space_mapping, apply and choices (or both apply and choices), to say what an"
@@ -196,36 +194,21 @@ def _check_together(definition: Definition) -> None:
             raise DefinitionError(f"make_step: choices needs a Discrete action_space that starts at 0, not {space}")
         if mask is not None:
             raise DefinitionError("make_step: choices makes the mask itself; leave action_mask_mapping out")
-    missing = [name for name in GOALS if getattr(definition, name) is None]
-    if 0 < len(missing) < len(GOALS):
+    missing = [name for name in goal if getattr(definition, name) is None]
+    if 0 < len(missing) < len(goal):
         raise DefinitionError(f"make_step: a goal needs all of its parts; missing: {', '.join(missing)}")
-
-
-def _removals(removed_by: Any) -> Mapping[str, Mapped | None]:
-    """Return ``removed_by`` as a dict from dotted names to callables."""
-    if isinstance(removed_by, str):
-        removed_by = [removed_by]
-    named = removed_by if isinstance(removed_by, Mapping) else dict.fromkeys(removed_by)
-    for name, agent in named.items():
-        if not isinstance(name, str) or not (agent is None or callable(agent)):
-            raise DefinitionError(
-                f"make_step: removed_by must be a dict from dotted names to callables, not {short_repr(name)}:"
-                f" {short_repr(agent)}"
-            )
-    return dict(named)
-
-
-def _check_answers(answers: Mapping[Any, Any], space: spaces.Space[Any]) -> None:
-    """Check that a dict from action to decision fits the action space."""
+    answers = _answers(definition.action_space_mapping)
+    if answers is None:
+        return
     if not isinstance(space, spaces.Discrete):
         raise DefinitionError(f"make_step: a dict as action_space_mapping needs a Discrete action_space, not {space}")
     actions = range(int(space.start), int(space.start + space.n))
-    missing = [action for action in actions if action not in answers]
+    absent = [action for action in actions if action not in answers]
     surplus = [action for action in answers if action not in actions]
-    if missing or surplus:
+    if absent or surplus:
         raise DefinitionError(
             f"make_step: the dict action_space_mapping must have just the actions of {space};"
-            f" missing: {missing}, not in the space: {surplus}"
+            f" missing: {absent}, not in the space: {surplus}"
         )
 
 
@@ -261,15 +244,17 @@ class DecisionPoint:
 
     Attributes:
         hook: The hook of the function.
+        name: The dotted name, ``package.module.Class.function``.
+        rule: The undecorated function, which decides where no environment or policy does.
         definition: The latest definition, which the bare name means; None for a point that was named from outside the
             model and is a decision point for some environments only.
         removed_by: Functions (or names) whose calls end its agents, under every definition: see ``make_step``.
     """
 
-    __slots__ = ("__weakref__", "definition", "hook", "removed_by")
+    __slots__ = ("__weakref__", "definition", "hook", "name", "removed_by", "rule")
 
     def __init__(self, hook: Hook) -> None:
-        self.hook = hook
+        self.hook, self.name, self.rule = hook, hook.name, hook.function
         self.definition: Definition | None = None
         self.removed_by: dict[Any, Mapped | None] = {}
 
@@ -277,17 +262,13 @@ class DecisionPoint:
         return f"<DecisionPoint {self.name}>"
 
     def __reduce__(self) -> Any:
-        return point_for, (self.hook,), self.definition, None, None, _redefined
+        return point_for, (self.hook,), self.definition
 
-    @property
-    def name(self) -> str:
-        """The dotted name, ``package.module.Class.function``."""
-        return self.hook.name
-
-    @property
-    def rule(self) -> Any:
-        """The undecorated function, which decides where no environment or policy does."""
-        return self.hook.function
+    def __setstate__(self, definition: Definition) -> None:
+        """Set the definition after unpickling, unless the point has one of this process."""
+        if self.definition is None:
+            self.definition = definition
+            _REGISTRY.setdefault(self.name, self)
 
     @property
     def letters(self) -> str:
@@ -310,19 +291,14 @@ def point_for(hook: Hook) -> "DecisionPoint":
 
 
 def point_of(function: Any) -> "tuple[DecisionPoint, Definition | None] | None":
-    """Return the point of a decision function and its definition; None for anything else."""
+    """Return the point of a decision function, also as an attribute of a class, and its definition; or None."""
     hook = hook_of(function)
     if hook is None:
         return None
-    definition: Definition | None = made_with(function)
+    definition: Definition | None = made_with(unbind(function))
     if definition is None and hook.point is None:
         return None
     return point_for(hook), definition
-
-
-def unwrapped(function: Any) -> Any:
-    """Return the function behind a decision function or an exposed function; any other function itself, unbound."""
-    return unwrap(getattr(function, "__func__", function))
 
 
 def registered(name: str) -> "DecisionPoint | None":
@@ -333,13 +309,6 @@ def registered(name: str) -> "DecisionPoint | None":
 def decision_points() -> list[str]:
     """Return the dotted names of all decorated decision points, in the order of decoration."""
     return list(_REGISTRY)
-
-
-def _redefined(point: "DecisionPoint", definition: Definition | None) -> None:
-    """Set the definition of an unpickled point, unless it has one of this process. The two may refer to each other."""
-    if point.definition is None and definition is not None:
-        point.definition = definition
-        _REGISTRY.setdefault(point.name, point)
 
 
 # -- differences ----------------------------------------------------------------------------------

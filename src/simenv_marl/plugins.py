@@ -1,23 +1,32 @@
 """Extensions: handlers before, after and instead of a model's functions, without a change to the model (paper).
 
-Handlers are attached to functions, methods, generator and coroutine functions, iterables, and classes whose instances
-are iterable: for the whole process (``attach_handler``), for a block (``handlers``), or for one environment (the option
-``plugins``). A function without handlers costs nothing extra or, if ``expose_to_plugins`` exposed it, one test.
+Handlers are attached to functions, methods, generator and coroutine functions, and iterables: for the whole process
+(``attach_handler``), for a block (``handlers``), or for one environment (the option ``plugins``). A function without
+handlers costs nothing extra or, if ``expose_to_plugins`` exposed it, one test.
 """
 
-from collections.abc import Callable, Iterator
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from types import FunctionType, MappingProxyType, MethodType
+from typing import Any, Final, TypeVar, cast
 
 from .decision import decision_points
-from .errors import HandlerError, name_of, short_repr
-from .hooks.finding import expose, exposed_functions, find_target
-from .hooks.handlers import Call, ChangedArgs, ChangedResult, Handler, Trace
-from .hooks.hook import Hook
-from .hooks.patches import Installation
-from .hooks.plugins import Attachment, Entry, make_handler
+from .errors import HandlerError, PatchError, UnknownTargetError, name_of, short_repr
+from .hooks.handlers import TRACE, Call, ChangedArgs, ChangedResult, Handler, Installation, Target
+from .hooks.hook import Hook, hook_of
+from .hooks.places import (
+    Purpose,
+    find_hook,
+    hook_at,
+    is_importable,
+    permanent_hook,
+    raw_attribute,
+    resolve,
+    split_binding,
+)
 from .hooks.stacks import LOCK
-from .hooks.targets import Target
 
 __all__ = [
     "Call",
@@ -35,6 +44,19 @@ __all__ = [
 
 Thing = TypeVar("Thing")
 
+Entry = tuple[Callable[..., Any], Any, str]
+"""A handler, its target, and its position."""
+
+_FUNCTIONS: Final = (staticmethod, classmethod, FunctionType, MethodType)
+
+
+# -- what exists ----------------------------------------------------------------------------------
+
+
+def exposed_functions() -> list[str]:
+    """Return the names of all targets that are exposed to plugins or have handlers."""
+    return sorted({target.name for target in Target.all.values() if target.exposed or target.slot})
+
 
 def attached_handlers(env: Any = None) -> list[Entry]:
     """Return the attached handlers, by target, in the order in which they run.
@@ -49,7 +71,15 @@ def attached_handlers(env: Any = None) -> list[Entry]:
         entries: list[Entry] = env.unwrapped.plugins
         return entries
     targets = sorted(Target.all.values(), key=lambda target: target.name)
-    return [(handler.function, target.name, handler.position) for target in targets for handler in target.handlers]
+    return [(handler.function, target.name, handler.position) for target in targets for handler in _general(target)]
+
+
+def _general(target: Target) -> list[Handler]:
+    """Return the handlers of a target that users have attached for the whole process."""
+    return [handler for handler in target.handlers if handler.owner is None and handler.position is not TRACE]
+
+
+# -- targets --------------------------------------------------------------------------------------
 
 
 def expose_to_plugins(function_or_iterable: Thing) -> Thing:
@@ -60,18 +90,79 @@ def expose_to_plugins(function_or_iterable: Thing) -> Thing:
     attached to its dotted name.
 
     Args:
-        function_or_iterable: A function of any kind, an iterable, or a class whose instances are iterable.
+        function_or_iterable: A function of any kind, or an iterable.
 
     Returns:
         The exposed function, which keeps its name, signature and docstring and may be exposed again; for an iterable, a
-        proxy that behaves like it; for a class, the class itself.
+        proxy that behaves like it.
 
     Raises:
-        PatchError: It is none of these, or a method that is bound to one object.
+        PatchError: It is neither of these, or a method that is bound to one object.
     """
     with LOCK:
-        exposed: Thing = expose(function_or_iterable)
-    return exposed
+        return cast("Thing", _expose(function_or_iterable))
+
+
+def _expose(thing: Any) -> Any:
+    if _proxied(thing) is not None:
+        return thing
+    if isinstance(thing, _FUNCTIONS):
+        function, binding = split_binding(thing)
+        known = hook_of(function)
+        again = known is not None and known.permanent  # decorated or exposed already
+        hook, _ = permanent_hook(thing)
+        hook.exposed = True
+        if again and isinstance(thing, (staticmethod, classmethod)):
+            return thing
+        wrapper = function if again else hook.make_wrapper()
+        return wrapper if binding is None else binding(wrapper)
+    if isinstance(thing, type):
+        raise PatchError(
+            f"the class {name_of(thing)} cannot be exposed to plugins: expose one of its functions, such as __init__ or"
+            " an __iter__ that is a generator function"
+        )
+    if isinstance(thing, Iterable) or (hasattr(type(thing), "__getitem__") and hasattr(type(thing), "__len__")):
+        from .hooks.iterables import expose  # its dependency imports asyncio, which slows down decisions
+
+        return expose(thing)
+    if callable(thing):
+        hook = Hook(thing, f"{getattr(thing, '__module__', None) or '?'}.{name_of(thing)}")
+        hook.exposed = True
+        return hook.make_wrapper()
+    raise PatchError(f"{short_repr(thing)} cannot be exposed to plugins: it is neither a function nor an iterable")
+
+
+def _proxied(thing: Any) -> Target | None:
+    """Return the target of an exposed iterable; None for anything else."""
+    return thing._self_target if hasattr(type(thing), "_self_next") else None
+
+
+_TARGET: Final = Purpose(
+    "target of handlers",
+    UnknownTargetError,
+    exposed_functions,
+    "name a Python function that it calls, or that calls it, or use expose_to_plugins for an iterable",
+)
+
+
+def _find_target(target: Any) -> Target:
+    """Find the target for handlers: a function, an exposed iterable, or the dotted name of one of these."""
+    if isinstance(target, str):
+        try:
+            owner, attribute = resolve(target, _TARGET)
+        except (UnknownTargetError, PatchError):
+            named = [other for other in Target.all.values() if other.name == target and other.exposed]
+            if not named:
+                raise
+            return named[-1]  # exposed inside a function, under the latest's name
+        return _proxied(raw_attribute(owner, attribute)) or hook_at(target, owner, attribute, _TARGET)
+    found = _proxied(target)
+    if found is None and not isinstance(target, _FUNCTIONS):
+        raise PatchError(
+            f"no handlers can be attached to {short_repr(target)}: pass what expose_to_plugins returns for it, or the"
+            " dotted name of a function"
+        )
+    return found or find_hook(target, _TARGET)
 
 
 # -- handlers -------------------------------------------------------------------------------------
@@ -97,8 +188,8 @@ def attach_handler(handler: Callable[..., Any], target: Any, position: str) -> N
         PatchError: The target is not exposed and cannot be patched.
     """
     with LOCK:
-        made = make_handler((handler, target, position))
-        made.target.add(made)
+        made = _make_handler((handler, target, position))
+        made.target.install(made)
 
 
 def remove_handler(target: Any, position: str, handler: Callable[..., Any] | None = None) -> None:
@@ -115,15 +206,15 @@ def remove_handler(target: Any, position: str, handler: Callable[..., Any] | Non
         HandlerError: There is no such handler.
     """
     with LOCK:
-        found = find_target(target)
-        present = found.handlers
+        found = _find_target(target)
+        present = _general(found)
         chosen = [h for h in present if h.position == position and (handler is None or h.function == handler)]
         if not chosen:
             what = "no handler is" if handler is None else f"{name_of(handler)} is not"
             at = ", ".join(sorted({h.position for h in present})) or "nowhere"
             raise HandlerError(f"{what} attached {short_repr(position)} {found.name}; handlers are attached: {at}")
         for removed in chosen if handler is None else chosen[-1:]:
-            found.remove(removed)
+            found.uninstall(removed)
 
 
 @contextmanager
@@ -137,22 +228,12 @@ def handlers(*entries: Entry) -> Iterator[None]:
         SimEnvError: As ``attach_handler`` raises it; then none of the handlers is attached.
     """
     with LOCK:
-        made = [make_handler(entry) for entry in entries]
-    with _attached([(handler.target, handler) for handler in made]):
-        yield
-
-
-@contextmanager
-def _attached(entries: list[tuple[Target, Handler | Trace]]) -> Iterator[None]:
-    """Attach handlers or traces for the duration of a ``with`` block, or until an interrupted block is collected."""
-    installation = Installation([Attachment(entries)])
+        made = [_make_handler(entry) for entry in entries]
+    installation = Installation(made)
     try:
         yield
     finally:
         installation.uninstall()
-
-
-# -- seeing what happens --------------------------------------------------------------------------
 
 
 @contextmanager
@@ -170,9 +251,78 @@ def trace(*targets: Any) -> Iterator[list[Call]]:
     Raises:
         SimEnvError: As ``attach_handler``.
     """
-    recording = Trace()
+    calls: list[Call] = []
     with LOCK:
-        found = [find_target(target) for target in targets] if targets else list(Target.all.values())
+        found = [_find_target(target) for target in targets] if targets else list(Target.all.values())
         hooks = [target for target in dict.fromkeys(found) if isinstance(target, Hook)]
-    with _attached([(hook, recording) for hook in hooks if targets or hook.permanent or hook.slot]):
-        yield recording.calls
+    installation = Installation(
+        [Handler(calls.append, hook, TRACE) for hook in hooks if targets or hook.permanent or hook.slot]
+    )
+    try:
+        yield calls
+    finally:
+        installation.uninstall()
+
+
+def _make_handler(entry: Any, named: Mapping[str, Target] = MappingProxyType({}), owner: Any = None) -> Handler:
+    """Return a handler, checked to fit its target; ``named`` has names that take precedence over importable names."""
+    if not isinstance(entry, (tuple, list)) or len(entry) != 3:
+        raise HandlerError(f"handlers are given as (handler, target, position), not {short_repr(entry)}")
+    function, target, position = entry
+    known = named.get(target) if isinstance(target, str) else None
+    return Handler(function, _find_target(target) if known is None else known, position, owner)
+
+
+class Plugins:
+    """The handlers of the environments of one plan, attached while one of these is in use.
+
+    It is also the key under which targets know them, and an ``Evaluation``: agents keep the memory of differences.
+    """
+
+    memory: dict[Any, Any] | None = None
+
+    def __init__(self, entries: Iterable[Any], named: Mapping[str, Target] = MappingProxyType({})) -> None:
+        """Find the targets, and check that the handlers fit; ``named`` has the names that the simulation defines."""
+        self._given, self._users = list(entries), set[object]()
+        with LOCK:
+            self._handlers = [_make_handler(entry, named, self) for entry in self._given]
+
+    def install(self, user: object) -> None:
+        """Attach the handlers until every user has called ``uninstall``."""
+        with LOCK:
+            self._users.add(user)
+            for handler in self._handlers:
+                handler.target.install(handler)
+
+    def uninstall(self, user: object) -> None:
+        """Undo ``install``, also where it failed half-way."""
+        with LOCK:
+            self._users.discard(user)
+            for handler in reversed(self._handlers) if not self._users else ():
+                handler.target.uninstall(handler)
+
+    @property
+    def plugins(self) -> Plugins:
+        """This object: its handlers take part in evaluations for its environment."""
+        return self
+
+    @property
+    def entries(self) -> list[Entry]:
+        """Tuples of the handler, the dotted name of its target, and its position."""
+        return [(handler.function, handler.target.name, handler.position) for handler in self._handlers]
+
+    @property
+    def portable(self) -> list[Entry]:
+        """The same as ``entries``, but with the given target where its name would not lead to it in another process."""
+        pairs = zip(self.entries, self._given, strict=True)
+        return [entry if is_importable(entry[1]) else given for entry, given in pairs]
+
+    @property
+    def stale(self) -> bool:
+        """Whether something else has replaced a target while nothing was set there."""
+        return any(handler.target.stale for handler in self._handlers)
+
+    @property
+    def hooks(self) -> Iterable[Hook]:
+        """The hooks of functions that have handlers."""
+        return dict.fromkeys(handler.target for handler in self._handlers if isinstance(handler.target, Hook))

@@ -447,9 +447,7 @@ def test_an_interrupt_anywhere_in_a_close_leaves_nothing_patched_in_the_end(then
         nothing_is_left()
         if number % 10 == 0:
             assert cycle_of(farm_env(aec_env, "before")) == fresh, where
-    assert {word for where in reached for word in ("uninstall", "put_back", "remove") if word in where} == {
-        "uninstall", "put_back", "remove",
-    }  # fmt: skip
+    assert {word for where in reached for word in ("uninstall", "_revert") if word in where} == {"uninstall", "_revert"}
 
 
 @pytest.mark.greenlet("the release is the same with every driver")

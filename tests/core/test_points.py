@@ -10,9 +10,9 @@ import pytest
 from simenv_marl.core import packing
 from simenv_marl.core.packing import pack, unpack
 from simenv_marl.core.points import find_point, find_points, locate, own_points, portable
-from simenv_marl.decision import point_of, registered, unwrapped
+from simenv_marl.decision import point_of, registered
 from simenv_marl.errors import UnknownPointError
-from simenv_marl.hooks.hook import hook_of
+from simenv_marl.hooks.hook import hook_of, unwrap
 from simenv_marl.plugins import handlers
 from tests.worlds.models import define
 
@@ -61,7 +61,7 @@ def test_it_is_found_while_it_is_set_and_while_it_has_handlers():
     point.hook.install(1)
     try:
         assert locate(Base.plain) is locate(f"{HERE}.Base.plain") is point
-        assert unwrapped(Base.plain) is point.rule
+        assert unwrap(Base.plain) is point.rule
     finally:
         point.hook.uninstall(1)
     with handlers((lambda self: None, f"{HERE}.Base.plain", "before")):

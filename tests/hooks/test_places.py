@@ -16,10 +16,10 @@ from greenlet import getcurrent
 
 from simenv_marl import aec_env
 from simenv_marl.errors import PatchError, UnknownTargetError
-from simenv_marl.hooks.finding import TARGET
-from simenv_marl.hooks.hook import hook_of
-from simenv_marl.hooks.patches import Installation
-from simenv_marl.hooks.places import Place, find_hook, hook_at, places_of, resolve, unbind
+from simenv_marl.hooks.handlers import Installation
+from simenv_marl.hooks.hook import hook_of, unbind
+from simenv_marl.hooks.places import PlacedHook, find_hook, hook_at, places_of, resolve
+from simenv_marl.plugins import _TARGET as TARGET
 from simenv_marl.plugins import (
     ChangedResult,
     attach_handler,
@@ -417,8 +417,8 @@ def _dawdling(monkeypatch):
 
         return slow
 
-    for name in ("__init__", "is_free", "put", "put_back"):
-        monkeypatch.setattr(Place, name, dawdle(getattr(Place, name)))
+    for name in ("__init__", "is_free", "_apply", "_revert"):
+        monkeypatch.setattr(PlacedHook, name, dawdle(getattr(PlacedHook, name)))
 
 
 SOURCE = """

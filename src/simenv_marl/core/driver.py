@@ -128,7 +128,7 @@ class Driver:
     """
 
     __slots__ = (
-        "__weakref__", "_context", "_events", "_exiting", "_handled", "_has_started_threads", "_job",
+        "__weakref__", "_context", "_events", "_exiting", "_handled", "_job",
         "_process_refused", "_refused", "caller", "ended", "given_up", "idle", "opened", "plugins", "stack",
     )  # fmt: skip
 
@@ -152,7 +152,7 @@ class Driver:
         self.stack: greenlet | None = None
         self.caller: greenlet | None = None
         self.given_up: str | None = None
-        self.ended, self.idle, self._exiting, self._has_started_threads = False, True, False, False
+        self.ended, self.idle, self._exiting = False, True, False
         self._job: Any = None
         self._context: Any = None
         self._events = NO_EVENTS
@@ -298,15 +298,12 @@ class Driver:
         if stack is not None:
             for hook in (*self._events, *self._handled):
                 hook.enter(stack, self.interceptor(hook, away=False), self.plugins)
-                if self._has_started_threads:
-                    hook.interceptors.others.add(self)
 
     def _leave_hooks(self) -> None:
         stack = self.stack
         if stack is not None:
             for hook in (*self._events, *self._handled):
                 hook.leave(stack)
-                hook.interceptors.others.discard(self)
 
     # -- refusals ---------------------------------------------------------------------------------
 
@@ -332,11 +329,6 @@ class Driver:
     def refuse_all(self, where: str) -> None:
         """Refuse all decisions in this process. Only the model gets the errors."""
         self._process_refused = where
-        self._enter_hooks()
-
-    def refuse_threads(self) -> None:
-        """Refuse the decisions of the first thread that the simulation starts, and of all later ones."""
-        self._has_started_threads = True
         self._enter_hooks()
 
     def refusal(self) -> WrongThreadError:
@@ -402,7 +394,6 @@ def _noting(method: Any) -> Any:
         driver = stack_of(getcurrent()) if STACKS else None
         if driver is not None and isinstance(self, Thread):
             self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
-            driver.refuse_threads()
         method(self, *args, **kwargs)
         if driver is not None:
             driver.opened.add(self)

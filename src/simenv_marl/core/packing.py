@@ -20,9 +20,9 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import cloudpickle
 
-from ..decision import Definition, unwrapped
+from ..decision import Definition
 from ..errors import WorkerError, describe_error, error_notes
-from ..hooks.hook import Hook, hook_of, made_with
+from ..hooks.hook import Hook, hook_of, made_with, unwrap
 
 
 def pack(thing: Any) -> bytes:
@@ -177,7 +177,7 @@ def _import(module: str | None, path: str) -> Any:
 def _find(module: str | None, path: str, rule: bool) -> Any:
     """Import a function, without the class that binds it, or the rule behind a decision function."""
     found = _import(module, path)
-    return unwrapped(found) if rule else getattr(found, "__func__", found)
+    return unwrap(found) if rule else getattr(found, "__func__", found)
 
 
 def _make_wrapper(token: str, hook: Hook, definition: Definition | None) -> Any:

@@ -25,8 +25,8 @@ from ..errors import (
     warn_user,
 )
 from ..hooks.hook import Hook
-from ..hooks.plugins import Plugins
 from ..hooks.stacks import outside_simulation
+from ..plugins import Plugins
 from ..simulation import RULE, SimulationInterface, make_simulation
 from .agent import make_updates
 from .driver import Driver

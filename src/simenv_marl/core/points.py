@@ -13,9 +13,10 @@ from sys import modules
 from types import FunctionType, MappingProxyType
 from typing import Any, Final
 
-from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered, unwrapped
+from ..decision import BY_NAME, DecisionPoint, Definition, decision_points, point_for, point_of, registered
 from ..errors import DefinitionError, PatchError, UnknownPointError, name_of, short_repr
-from ..hooks.places import Purpose, all_classes, find_hook, is_importable, raw_attribute, resolve, unbind
+from ..hooks.hook import unwrap
+from ..hooks.places import PlacedHook, Purpose, all_classes, find_hook, is_importable, raw_attribute, resolve
 
 Points = str | Callable[..., Any] | Iterable[str | Callable[..., Any]] | Mapping[Any, Definition | None] | None
 """The ways to name decision points: see ``generate_env``."""
@@ -167,10 +168,10 @@ def find_point(key: Any, definition: Any = None, *, own: Own = _NONE) -> NamedPo
 
 def _inherited(point: DecisionPoint) -> Definition | None:
     """Return the definition that a class inherits, together with the decision function, from a base class."""
-    place = point.hook.place
-    if place is None or not place.inherited:
+    hook = point.hook
+    if not isinstance(hook, PlacedHook) or not hook.inherited:
         return None
-    known = point_of(unbind(raw_attribute(place.owner, place.attribute)))
+    known = point_of(raw_attribute(hook.owner, hook.attribute))
     return known and (known[1] or known[0].definition)
 
 
@@ -195,7 +196,7 @@ def portable(key: Any, name: str | None = None) -> Any:
 
     Anything but a function is returned as it is.
     """
-    function = unwrapped(key)
+    function = unwrap(key)
     if not isinstance(function, FunctionType):
         return key
     if hasattr(function, BY_NAME):

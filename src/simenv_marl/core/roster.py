@@ -6,8 +6,9 @@ from collections.abc import Callable, Collection, Mapping
 from sys import modules
 from typing import Any
 
-from ..decision import DecisionPoint, Definition, unwrapped
+from ..decision import DecisionPoint, Definition
 from ..errors import AgentError, DefinitionError, OptionValueError, SimEnvError, UnknownPointError, short_repr
+from ..hooks.hook import unwrap
 from ..simulation import RULE
 from .planner import PlannerPolicy, is_planner, takes_info
 from .point import Point
@@ -52,7 +53,7 @@ def resolve_roster(active: list[Point], declared: Any, known: Collection[str | N
     names: dict[Point, list[Any]] = {}
     if isinstance(declared, Mapping):
         for key, value in declared.items():
-            point = next((b for b in named if key == b.point.name or unwrapped(key) is b.point.rule), None)
+            point = next((b for b in named if key == b.point.name or unwrap(key) is b.point.rule), None)
             if point is None:
                 raise OptionValueError(
                     f"possible_agents names {short_repr(key)}, which is not an active decision point with a callable as"
@@ -101,7 +102,7 @@ def resolve_policies(
         if isinstance(key, str) and key in agents:
             by_agent[key] = policy
             continue
-        point = next((p for p in named if key == p.point.name or unwrapped(key) is p.point.rule), None)
+        point = next((p for p in named if key == p.point.name or unwrap(key) is p.point.rule), None)
         if point is None:
             try:
                 point = find_point(key, own=own)

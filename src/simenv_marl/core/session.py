@@ -19,7 +19,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 
 from ..errors import BranchError, OptionValueError, annotate, short_repr, warn_user
-from ..hooks.patches import Installation
+from ..hooks.handlers import Installation
 from ..simulation import closer, make_simulation, resetter
 from .context import ExclusiveLock, GlobalRandom, environment_context
 from .driver import Driver, open_resources

@@ -18,7 +18,7 @@ from ..core.provenance import describe
 from ..core.session import Session, checked_seed
 from ..core.spaces import observation_cast
 from ..errors import UnknownOptionError, ViewError
-from ..hooks.plugins import Entry
+from ..plugins import Entry
 
 _OWN = frozenset(("_deciding", "_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))
 """The attributes that no copy takes over."""

@@ -10,18 +10,34 @@ from __future__ import annotations
 import inspect
 from contextlib import suppress
 from functools import partial, update_wrapper
+from threading import local
 from types import FunctionType
 from typing import Any, Final
-from weakref import WeakKeyDictionary, WeakSet
 
 from greenlet import getcurrent, greenlet
 
 from ..errors import PatchError
-from .handlers import CALLS, ITEMS
-from .stacks import EVALUATING, STACKS, Interceptor, spawner_of, stack_of
-from .targets import Target
+from .handlers import CALLS, ITEMS, Target
+from .stacks import EVALUATING, OUTSIDE, STACKS, Interceptor, spawner_of, stack_of
 
 _SPAWNED: Final = 'a greenlet that the simulation has spawned with gevent (driver="thread" allows that)'
+
+_ROOTS: Final[set[greenlet]] = set()
+"""Roots of threads on which no simulation runs. Hooks without handlers run their rule there at once."""
+
+_THREAD: Final = local()
+"""Has a ``_Root`` in each thread whose root is in ``_ROOTS``."""
+
+
+class _Root:
+    """Forgets the root of a thread when the thread ends. A root that outlives its thread makes greenlets crash."""
+
+    def __init__(self, root: greenlet) -> None:
+        self._forget = partial(_ROOTS.discard, root)
+
+    def __del__(self) -> None:
+        self._forget()
+
 
 # -- wrappers -------------------------------------------------------------------------------------
 
@@ -33,10 +49,8 @@ _FILE: Final = "<wrapper of "
 _MADE_WITH: Final = "__simenv_marl__"
 """The attribute of a wrapper with its hook and the object that it was made with."""
 
-_RULE = "not INTERCEPTORS or not OTHERS and getcurrent().parent is None"
-"""Whether the rule decides at once: the hook has no interceptors, or they are all on stacks of simulations, and the
-call comes from the root of a thread."""
-
+# No variable has the stack: a suspended stack that refers to itself could not be collected.
+_RULE = "not INTERCEPTORS or getcurrent() in INTERCEPTORS.roots"
 _INTERCEPT = "(INTERCEPTORS.get(getcurrent()) or intercept)"
 
 _RETURN = {"function": "return {}", "generator": "return (yield from {})", "coroutine": "return (await {})"}
@@ -94,15 +108,19 @@ def _source(hook: Hook, scope: dict[str, Any]) -> str:
     return f"async {source.lstrip()}" if hook.kind == "coroutine" else source
 
 
-def is_wrapper(function: Any) -> bool:
-    """Return whether a function is a wrapper."""
-    # Checked by its code, not by an attribute: other decorators copy a function's attributes.
-    return isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE)
+def unbind(value: Any) -> Any:
+    """Return an attribute of a class or module without its binding."""
+    return value.__func__ if isinstance(value, (staticmethod, classmethod)) else value
 
 
-def hook_of(function: Any) -> Hook | None:
-    """Return the hook of a wrapper; None for any other function."""
-    return vars(function)[_MADE_WITH][0] if is_wrapper(function) else None
+def hook_of(value: Any) -> Hook | None:
+    """Return the hook of a wrapper, also as an attribute of a class; None for anything else."""
+    function = unbind(value)
+    # A wrapper is known by its code, not by an attribute: other decorators copy a function's attributes.
+    if isinstance(function, FunctionType) and function.__code__.co_filename.startswith(_FILE):
+        hook: Hook = vars(function)[_MADE_WITH][0]
+        return hook
+    return None
 
 
 def made_with(wrapper: FunctionType) -> Any:
@@ -111,83 +129,56 @@ def made_with(wrapper: FunctionType) -> Any:
 
 
 def unwrap(function: Any) -> Any:
-    """Return the function behind a wrapper; any other function itself."""
+    """Return the function behind a wrapper; any other function itself, unbound."""
+    function = getattr(function, "__func__", function)
     hook = hook_of(function)
     return function if hook is None else hook.function
 
 
 # -- hooks ----------------------------------------------------------------------------------------
 
-MADE_OF: Final[WeakKeyDictionary[Any, WeakSet[Hook]]] = WeakKeyDictionary()
-"""The hooks in front of each function, one per decoration."""
 
+class Interceptors(dict[Any, Interceptor]):
+    """The interceptors of one hook. A wrapper that is pickled by value finds those of the process it arrives in.
 
-class _Interceptors(dict[Any, Interceptor]):
-    """The interceptors of one hook. A wrapper that is pickled by value finds those of the process it arrives in."""
+    ``roots`` has the roots of threads from which calls run the rule at once.
+    """
 
-    __slots__ = ("hook", "others")
+    __slots__ = ("hook", "roots")
 
     def __init__(self, hook: Hook) -> None:
         super().__init__()
-        self.hook, self.others = hook, _Others(self)
-
-    def __setitem__(self, key: Any, interceptor: Interceptor) -> None:
-        super().__setitem__(key, interceptor)
-        if not isinstance(key, greenlet) or key.parent is None:
-            self.others.add(key)
-
-    def remove(self, key: Any) -> None:
-        """Remove the interceptor of a key, if there is one."""
-        self.pop(key, None)
-        self.others.discard(key)
+        self.hook, self.roots = hook, _ROOTS
 
     def __reduce__(self) -> Any:
         return getattr, (self.hook, "interceptors")
-
-
-class _Others(set[Any]):
-    """The keys that are no stack of a greenlet (a thread's root, plugins, None), and drivers with threads."""
-
-    __slots__ = ("_interceptors",)
-
-    def __init__(self, interceptors: _Interceptors) -> None:
-        super().__init__()
-        self._interceptors = interceptors
-
-    def __reduce__(self) -> Any:
-        return getattr, (self._interceptors, "others")
 
 
 class Hook(Target):
     """A function of a model that is decided or extended, with the interceptors of its calls.
 
     Attributes:
-        function: The function.
+        function: The function. Its signature is its own, not that of what it wraps.
         rule: The innermost part of a call: the function, or its temporary replacement.
         kind: What a call returns: "function" (a value), "generator" or "coroutine".
-        signature: The signature of the function itself, not of what it wraps; None if it is unknown.
         bound: Whether its first argument is the object it is called on, which is never passed by keyword.
         alone: Whether every call has one argument, the object it is called on.
         interceptors: Those of calls. Key: a greenlet for calls on the stack of a simulation; plugins, or None, for all
             other calls while an environment with these plugins, or without plugins, is evaluated.
-        wrappers: The wrappers of the function.
-        place: The place of a wrapper while the hook is installed; None if none is to be set.
         permanent: Whether a wrapper was set permanently, as a decorated or exposed function.
         point: The object that the layer above makes of the hook.
     """
 
-    def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None, place: Any = None) -> None:
-        """Make the hook of a function.
+    permanent = True
+
+    def __init__(self, function: Any, name: str, *, bound: bool = True, like: Any = None) -> None:
+        """Make the hook of a function; raise a ``PatchError`` for an async generator function.
 
         Args:
             function: The function.
             name: Its dotted name.
             bound: Whether, in a class, its first argument is the object it is called on.
             like: The function that determines what calls return, if ``function`` only forwards to it.
-            place: The place for a temporary wrapper.
-
-        Raises:
-            PatchError: It is an async generator function.
         """
         like = function if like is None else like
         if inspect.isasyncgenfunction(like):
@@ -198,44 +189,33 @@ class Hook(Target):
         signature = None
         with suppress(TypeError, ValueError):  # the signature is unknown
             signature = inspect.signature(function, follow_wrapped=False)
+        super().__init__(name, CALLS + ITEMS if self.kind == "generator" else CALLS, signature)
         self.bound = bound and "." in name.removeprefix(f"{function.__module__}.").rpartition("<locals>.")[2]
         parameters = [] if signature is None else list(signature.parameters.values())
         first = [
             p for p in parameters if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
         ]
         self.alone = self.bound and len(first) == len(parameters) == 1
-        self.interceptors = _Interceptors(self)
-        self.wrappers: WeakSet[FunctionType] = WeakSet()
-        self.place, self.permanent = place, place is None
+        self.interceptors = Interceptors(self)
         self.point: Any = None
-        self._temporary: FunctionType | None = None  # the wrapper for the place
-        positions = CALLS + ITEMS if self.kind == "generator" else CALLS
-        super().__init__(name, positions, "is not a generator function", signature)
-        with suppress(TypeError):  # not all objects can be referenced weakly
-            MADE_OF.setdefault(function, WeakSet()).add(self)
 
     def __reduce__(self) -> Any:
-        made_of = (self.function, self.name, self.bound, self.kind, self.exposed)
-        return _restored, made_of, self.point, None, None, _came_along
+        return _restored, (self.function, self.name, self.bound, self.kind, self.exposed), self.point
+
+    def __setstate__(self, point: Any) -> None:
+        """Do nothing: the layer above unpickles the point itself and gives it to the hook of this process."""
 
     def make_wrapper(self, made_with: Any = None) -> FunctionType:
-        """Make a wrapper of the hook's function.
-
-        Args:
-            made_with: The object that the function ``made_with`` returns for it.
-        """
+        """Make a wrapper of the hook's function, for which the function ``made_with`` returns that object."""
         scope: dict[str, Any] = {
-            "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors,
-            "OTHERS": self.interceptors.others, "fits": self._fits, "getcurrent": getcurrent,
-            "intercept": self._intercept, "rule": self.function,
+            "__name__": __name__, "ABSENT": _ABSENT, "INTERCEPTORS": self.interceptors, "fits": self._fits,
+            "getcurrent": getcurrent, "intercept": self._intercept, "rule": self.function,
         }  # fmt: skip
         exec(compile(_source(self, scope), f"{_FILE}{self.name}>", "exec"), scope)
         made: FunctionType = scope["wrapper"]
-        name = getattr(self.function, "__name__", "call")
-        made.__code__ = made.__code__.replace(co_name=name)  # the name in tracebacks
+        made.__code__ = made.__code__.replace(co_name=getattr(self.function, "__name__", "call"))  # for tracebacks
         update_wrapper(made, self.function)
         vars(made)[_MADE_WITH] = self, made_with
-        self.wrappers.add(made)
         return made
 
     def _fits(self, *args: Any, **kwargs: Any) -> bool:
@@ -248,58 +228,44 @@ class Hook(Target):
         return True
 
     def _intercept(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Run a call for which the stack itself has no interceptor.
+        """Run a call for which the stack itself has no interceptor, or refuse it with a ``WrongThreadError``."""
+        return self._interceptor_at(getcurrent())(args, kwargs)
 
-        Raises:
-            WrongThreadError: It is a decision, and the simulation cannot wait for its answer here.
-        """
-        return (self.interceptor_at(getcurrent()) or self.run_rule)(args, kwargs)
-
-    # -- where it is set --------------------------------------------------------------------------
-
-    @property
-    def stale(self) -> bool:  # type: ignore[override]
-        """Whether something else has replaced it while no wrapper was set in its place."""
-        return self.place is not None and not self._users and not self.place.is_free(self)
-
-    def install(self, user: object) -> None:
-        """Set a wrapper in its place until every user has called ``uninstall``.
-
-        Raises:
-            PatchError: The place cannot be patched, or something else was set there meanwhile.
-        """
-        if self.place is not None:
-            super().install(user)
-
-    def _apply(self) -> None:
-        if self._temporary is None:
-            self._temporary = self.make_wrapper()
-        self.place.put(self, self._temporary)
-
-    def _revert(self) -> None:
-        if self.place is not None and self._temporary is not None:
-            self.place.put_back(self._temporary)
+    def _interceptor_at(self, here: greenlet) -> Interceptor:
+        driver = stack_of(here) if STACKS else None
+        spawner = spawner_of(here)
+        if spawner is not None and not spawner.own_thread and spawner.decides(self):
+            refuse: Interceptor = spawner.refuse(self, _SPAWNED)
+            return refuse
+        evaluation = EVALUATING.get(here) if driver is None else driver
+        plugins = None if evaluation is None else evaluation.plugins
+        decide = None if driver is None else driver.interceptor(self)
+        if decide is not None:
+            return self.around(decide, plugins)
+        if here.parent is None and here not in STACKS:
+            if not hasattr(_THREAD, "root"):
+                _THREAD.root = _Root(here)
+            _ROOTS.add(here)
+        return self.interceptors.get(plugins) or self.interceptors.get(None) or self.run_rule
 
     # -- who takes part ---------------------------------------------------------------------------
 
     def enter(self, stack: greenlet, decide: Interceptor | None, plugins: Any) -> None:
-        """Enter an interceptor for calls on the stack of a simulation.
+        """Enter an interceptor for calls on the stack of a simulation, whose environment has these plugins.
 
-        Args:
-            stack: The stack.
-            decide: What decides instead of the rule. None: the rule decides, with handlers if the plugins have some.
-            plugins: The plugins of the simulation's environment.
+        ``decide`` decides instead of the rule. None: the rule decides, with handlers if the plugins have some.
         """
+        _ROOTS.discard(stack)
         if decide is not None:
             self.interceptors[stack] = self.around(decide, plugins)
         elif plugins in self.slot and plugins is not None:
             self.interceptors[stack] = self.around(self.run_rule, plugins)
         else:
-            self.interceptors.remove(stack)
+            self.leave(stack)
 
     def leave(self, stack: greenlet) -> None:
-        """Remove the interceptor of a stack."""
-        self.interceptors.remove(stack)
+        """Remove the interceptor of a stack, if there is one."""
+        self.interceptors.pop(stack, None)
 
     def around(self, inner: Interceptor, plugins: Any) -> Interceptor:
         """Return an interceptor that runs the handlers of plugins, or of the whole process, around ``inner``."""
@@ -313,53 +279,30 @@ class Hook(Target):
         return self.rule(*args, **kwargs)
 
     def replace_rule(self, rule: Any = None) -> None:
-        """Replace the rule; None restores the function.
-
-        Simulations that are already running keep the rule they had.
-        """
+        """Replace the rule; None restores the function."""
         self.rule = self.function if rule is None else rule
-        self._changed()
+        self._update()
 
-    def interceptor_at(self, here: greenlet) -> Interceptor | None:
-        """Return the interceptor of a call in a greenlet; None if only the rule runs."""
-        driver = stack_of(here) if STACKS else None
-        spawner = spawner_of(here)
-        if spawner is not None and not spawner.own_thread and spawner.decides(self):
-            refuse: Interceptor = spawner.refuse(self, _SPAWNED)
-            return refuse
-        if driver is None:
-            evaluation = EVALUATING.get(here)
-            plugins = None if evaluation is None else evaluation.plugins
-        else:
-            plugins = driver.plugins
-            decide = driver.interceptor(self)
-            if decide is not None:
-                return self.around(decide, plugins)
-        return self.interceptors.get(plugins) or self.interceptors.get(None)
-
-    def _changed(self) -> None:
-        interceptors, slot = self.interceptors, self.slot
-        for plugins in list(slot) if self.rule is self.function else [None, *slot]:  # garbage collection may change it
+    def _update(self) -> None:
+        super()._update()
+        interceptors, replaced = self.interceptors, self.rule is not self.function
+        for plugins in [None, *self.slot] if replaced else [*self.slot]:
             interceptors[plugins] = self.around(self.run_rule, plugins)
-        for key, interceptor in list(interceptors.items()):
-            if not isinstance(key, greenlet):
-                if key not in slot and (key is not None or self.rule is self.function):
-                    interceptors.remove(key)
-                continue
-            inner = interceptor.args[0] if isinstance(interceptor, partial) else interceptor
-            plugins = getattr(STACKS.get(key), "plugins", None)
-            self.enter(key, None if inner == self.run_rule else inner, plugins)
+        for key in list(interceptors):
+            if isinstance(key, greenlet):
+                driver = STACKS.get(key, OUTSIDE)
+                if driver is not OUTSIDE:
+                    driver.show()
+            elif key not in self.slot and (key is not None or not replaced):  # garbage collection may change the slot
+                interceptors.pop(key, None)
+        interceptors.roots = set() if self.slot or replaced else _ROOTS
 
 
 def _restored(function: Any, name: str, bound: bool, kind: str, exposed: bool) -> Hook:
     """Return the hook of an unpickled function: an existing one, or a new one."""
-    for hook in MADE_OF.get(function, ()):
-        if hook.name == name:
+    for hook in list(Target.all.values()):
+        if isinstance(hook, Hook) and hook.function is function and hook.name == name:
             return hook
     hook = Hook(function, name, bound=bound)
     hook.bound, hook.kind, hook.exposed = bound, kind, exposed
     return hook
-
-
-def _came_along(hook: Hook, point: Any) -> None:
-    """Do nothing: the layer above unpickles the point itself and gives it to the hook of this process."""

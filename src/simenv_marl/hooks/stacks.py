@@ -66,42 +66,30 @@ def stack_of(here: greenlet | None) -> Any:
 
 def spawner_of(here: Any) -> Any:
     """Return the entry of the stack whose code has spawned a greenlet with gevent; None if none has."""
-    spawner = getattr(here, "spawning_greenlet", None)
-    while spawner is not None and (here := spawner()) is not None:
+    driver = None
+    while driver is None and (spawner := getattr(here, "spawning_greenlet", None)) is not None:
+        here = spawner()  # None if it is gone
         driver = stack_of(here)
-        if driver is not None:
-            return driver
-        spawner = getattr(here, "spawning_greenlet", None)
-    return None
+    return driver
 
 
 def plugins_at_work() -> Any:
     """Return the plugins that take part here. None: only the handlers of the whole process."""
     here = getcurrent()
-    driver = stack_of(here) if STACKS else None
-    if driver is not None:
-        return driver.plugins
-    evaluation = EVALUATING.get(here)
+    evaluation = (stack_of(here) if STACKS else None) or EVALUATING.get(here)
     return None if evaluation is None else evaluation.plugins
 
 
 class outside_simulation:  # noqa: N801 - it is used like a function
     """Separate code in this greenlet from a simulation or an evaluation that runs around it.
 
-    Inside, decision functions run their rule, and only the given evaluation's plugins take part.
-
-    This is a class because the context manager of a generator cannot pass on immutable errors, such as frozen
-    dataclasses.
+    Inside, decision functions run their rule, and only the given evaluation's plugins take part. This is a class
+    because the context manager of a generator cannot pass on immutable errors, such as frozen dataclasses.
     """
 
     __slots__ = ("_before", "_driver", "_entry", "_evaluation", "_here")
 
     def __init__(self, evaluation: Evaluation | None = None) -> None:
-        """Prepare the separation.
-
-        Args:
-            evaluation: The evaluation that runs inside.
-        """
         self._evaluation = evaluation
 
     def __enter__(self) -> None:

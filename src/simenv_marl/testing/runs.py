@@ -34,7 +34,7 @@ from ..core.driver import SimulationExit
 from ..core.plan import Plan
 from ..decision import DecisionPoint
 from ..errors import describe_error, error_notes
-from ..hooks.patches import Installation
+from ..hooks.handlers import Installation
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import RULE, make_simulation, resetter
 from .fingerprint import Difference, Fingerprint, describe_differences, differences, fingerprint

@@ -237,15 +237,10 @@ def run(
     finish: Callable[[int, Any], Callable[[], None] | None],
     watcher: Watcher | None = None,
 ) -> None:
-    """Run one simulation per seed. Batched policies answer the decisions. After an error, all simulations are unwound.
+    """Run one simulation per seed, ``size`` at a time. After an error, all simulations are unwound.
 
-    Args:
-        plan: The plan of the episodes, with a ``PolicyKey`` for each policy.
-        seeds: The seeds of the simulations.
-        size: The largest number of simulations at a time.
-        finish: Called with the index of a seed and its simulation when the simulation has ended. If it returns a
-            callable, that is called after the simulation is closed.
-        watcher: The observer of rewards and ends. None: agents are not rewarded.
+    The plan has a ``PolicyKey`` for each policy. ``finish`` is called with the index of a seed and its simulation when
+    the simulation has ended. If it returns a callable, that is called after the simulation is closed.
     """
     simulations = _Simulations(plan, seeds, size, finish, watcher)
     with outside_simulation(), reuse_resources():
@@ -362,17 +357,11 @@ def step_all(
     actions: Sequence[Any],
     blame: Callable[[int, BaseException], None] = lambda number, error: None,
 ) -> None:
-    """Answer the pending decisions of many episodes, and run each episode to its next decision.
+    """Answer the pending decisions of episodes of one plan with checked actions, and run each to its next decision.
 
-    All simulations move before any agent is updated, so that the data of each loop stays in the processor's caches.
-
-    Args:
-        episodes: The episodes, of one plan. In each a decision is pending.
-        actions: A checked action for each episode; for those that are played in rounds, the actions of a round.
-        blame: A function that is called with the number of the episode and the error if an episode raises.
-
-    Raises:
-        BaseException: See ``Episode.play``. The other episodes may have moved or not. They can be closed.
+    All simulations move before any agent is updated, so that the data of each loop stays in the processor's caches. If
+    an episode raises, ``blame`` is called with its number and the error. The others may have moved or not; they can be
+    closed.
     """
     if not episodes:
         return
@@ -418,10 +407,9 @@ def step_all(
 
 
 def close_all(sessions: Iterable[tuple[str, Session]], error: BaseException | None = None) -> BaseException | None:
-    """Close sessions, given with their names, also if closing one raises an error or there was an error before.
+    """Close all sessions, given with their names. Return the first error, with notes of all others; None without any.
 
-    Returns:
-        The first error, with notes of all others; None if there was none.
+    ``error`` is an error before.
     """
     for name, session in sessions:
         try:

@@ -65,15 +65,10 @@ def spread(
     least: int,
     share: int = 4,
 ) -> Iterator[tuple[int, Any]]:
-    """Call ``work`` with the arguments and a part of the seeds (or of other items) in worker processes, for all parts.
+    """Call ``work``, a function of this package, in worker processes: for each part of the seeds (or of other items).
 
-    Args:
-        work: A function of this package.
-        arguments: Its arguments before the seeds.
-        seeds: All seeds.
-        workers: The number of worker processes. -1: as many as joblib's backend has.
-        least: The smallest size of a part, as long as every worker gets some seeds.
-        share: The number of parts per process.
+    With -1 workers there are as many as joblib's backend has. A process gets about ``share`` parts, none of which is
+    smaller than ``least`` as long as every process gets some seeds.
 
     Yields:
         The number of seeds of a part, and the function's result; in the order of the seeds.
@@ -137,11 +132,9 @@ EXIT: Final = b""
 
 
 def serve(pipe: Connection, other_end: Connection | None) -> None:
-    """Answer messages in a worker: make an object, then call its methods. At the end, abandon the object.
+    """Answer messages in a worker, each a packed pair: a callable that makes an object, then methods, and arguments.
 
-    Args:
-        pipe: The pipe. A message is a packed pair of a callable, later the name of a method, and its arguments.
-        other_end: The user's end of the pipe, if a fork has copied it.
+    ``other_end`` is the user's end of the pipe, if a fork has copied it.
     """
     with suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the user's process, which decides what to do
@@ -319,6 +312,11 @@ class WorkerPool:
             self._workers.append(Worker(place, part, recipe))
         self._start_missing()
 
+    @property
+    def _owned(self) -> bool:
+        """Whether this process has started the workers, and is not a fork of the one that has."""
+        return os.getpid() == self._process
+
     def _start_missing(self) -> None:
         """Start the workers that do not run."""
         new = [worker for worker in self._workers if not worker.alive]
@@ -341,19 +339,16 @@ class WorkerPool:
                 raise error
         return [result for result, _ in answers]
 
-    def _check_process(self) -> None:
-        if os.getpid() != self._process:
-            raise WorkerError(
-                "the workers belong to the process from which this one was forked; make a new environment"
-            )
-
     def ask(self, method: str, *arguments: Any) -> list[Any]:
         """Call a method of each worker's object; return the results, or raise the first error.
 
         Of lists and arrays, which have an item for each simulation, each worker gets its part. For a reset, workers
         that have died are replaced.
         """
-        self._check_process()
+        if not self._owned:
+            raise WorkerError(
+                "the workers belong to the process from which this one was forked; make a new environment"
+            )
         if method == "reset":
             self._start_missing()
         messages = []
@@ -368,9 +363,8 @@ class WorkerPool:
 
     def close(self) -> None:
         """Close the objects and end the workers, by force after some seconds. Raise the first error of an object."""
-        self._check_process()
         deadline = monotonic() + SECONDS_TO_CLOSE
-        asked = [worker for worker in self._workers if worker.alive and not worker.owes]
+        asked = [worker for worker in self._workers if worker.alive and not worker.owes and self._owned]
         try:
             for worker in asked:
                 with suppress(WorkerError):
@@ -388,12 +382,10 @@ class WorkerPool:
 
     def abandon(self) -> None:
         """End the workers. A finalizer may call this; it raises no errors."""
-        if os.getpid() != self._process:
-            return  # the workers belong to the process of which this one is a fork
-        for worker in self._workers:
-            if worker.alive:
-                with suppress(OSError):
-                    worker.pipe.send_bytes(EXIT)
+        workers = [worker for worker in self._workers if worker.alive and self._owned]
+        for worker in workers:
+            with suppress(OSError):
+                worker.pipe.send_bytes(EXIT)
         deadline = monotonic() + SECONDS_TO_CLOSE
-        for worker in self._workers:
+        for worker in workers:
             worker.stop(max(deadline - monotonic(), 0.0))

@@ -162,11 +162,11 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         After an error in a reset or a step they may stand at different steps. Then all of them need a reset.
         """
         simulations = self._simulations
-        simulations.intact = method not in ("reset", "step")
         try:
             return simulations.ask(method, *arguments)
         except BaseException:
-            self._failed = self._failed or not simulations.intact
+            moved = method in ("reset", "step") and not simulations.untouched
+            self._failed = self._failed or moved or simulations.broken
             raise
 
     def _joined(self, answers: list[Any]) -> Any:
@@ -187,13 +187,15 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 numbers.append(number)
                 values.append(value)
         for key, (numbers, values) in columns.items():
-            merged = self._add_info(merged, {key: values[0]}, numbers[0])
-            if isinstance(merged[key], np.ndarray) and merged[key].dtype != object:
-                merged[key][numbers] = values
-                merged[f"_{key}"][numbers] = True
-                continue
-            for number, value in zip(numbers, values, strict=True):
-                merged = self._add_info(merged, {key: value}, number)
+            column = self._add_info(merged, {key: values[0]}, numbers[0])[key]
+            merged[f"_{key}"][numbers] = True
+            if isinstance(column, dict):
+                merged[key] = self._merged(zip(numbers, values, strict=True))
+            elif column.dtype != object:
+                column[numbers] = values
+            else:
+                for number, value in zip(numbers, values, strict=True):
+                    column[number] = value
         return merged
 
     def _split(self, actions: Any) -> list[Any]:

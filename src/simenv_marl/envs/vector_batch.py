@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
-from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.session import Session
 from ..core.stacking import stacker
@@ -39,8 +39,11 @@ class SimulationBatch:
         joint: What joint views share. None if the views are single ones.
         observation_space, action_space: The spaces of one sub-environment.
         sessions: The sessions of the sub-environments.
-        intact: Set to True if the latest ``reset`` or ``step`` raised an error before any simulation had moved.
+        untouched: Whether the latest ``reset`` or ``step`` raised an error before any simulation had moved.
+        broken: False: there is no worker that could die.
     """
+
+    broken = False
 
     def __init__(
         self,
@@ -84,11 +87,10 @@ class SimulationBatch:
         self._stack = stacker(self.observation_space, cast=True, other=concatenate)
         self._observations = create_empty_array(self.observation_space, len(part))
         self._observed: list[Any] = [None] * len(part)
-        self._views: list[OneAgentView] = []
         self._episodes: list[Any] = []  # the episodes of ``_agents``, in the single view
         self._agents: list[Any] = []
         self._first = -1
-        self.intact = True
+        self.untouched = False
         self.sessions: list[Session] = []
         try:
             while len(self.sessions) < len(part):
@@ -113,7 +115,7 @@ class SimulationBatch:
             The observations of all sub-environments, and the infos of those that were reset.
         """
         numbers = chosen.nonzero()[0].tolist()
-        self._first = numbers[0] if numbers else -1
+        self._first, self.untouched = numbers[0] if numbers else -1, False
         infos = [(self._part[number], self._begin(number, seeds[number], options)) for number in numbers]
         return self._stacked(), infos
 
@@ -142,7 +144,7 @@ class SimulationBatch:
             Observations, rewards, terminations, truncations and infos.
         """
         begun = ended.nonzero()[0].tolist()
-        self._first = -1 if begun else 0
+        self._first, self.untouched = -1 if begun else 0, False
         for number in begun:
             self._begin(number)
         self._move((~ended).nonzero()[0].tolist() if begun else range(len(actions)), actions)
@@ -155,9 +157,10 @@ class SimulationBatch:
         infos: Infos = []
         eventful = any(news) or None in [episode.pending for episode in episodes]
         for number, (episode, info) in enumerate(zip(episodes, news, strict=True)) if eventful else ():
-            end = self._end_of(episode) if episode.pending is None else None
-            if end is not None:
-                terminations[number], truncations[number] = end
+            if episode.over and not episode.unreported_end:  # which the next step reports
+                removed = self.joint is None and self._agent in episode.ended
+                terminations[number] = removed or episode.terminated
+                truncations[number] = episode.truncated and not removed
                 if self._mode == AutoresetMode.SAME_STEP:
                     final = {"final_obs": self._observed[number], "final_info": info}
                     infos.append((self._part[number], final))
@@ -209,14 +212,6 @@ class SimulationBatch:
             [agent.info for agent in agents],
         )
 
-    def _end_of(self, episode: Episode) -> tuple[bool, bool] | None:
-        """The flags terminated and truncated of an episode, as its view reports them; None if it continues."""
-        if episode.unreported_end:  # the next step reports it
-            return None
-        if self.joint is None and self._agent in episode.ended:
-            return True, False
-        return (episode.terminated, episode.truncated) if episode.over else None
-
     def _stacked(self) -> Any:
         """The latest observations, in an array (or a dict or tuple of arrays) that the next call overwrites."""
         self._observations = self._stack(self._observed, self._observations)
@@ -226,16 +221,14 @@ class SimulationBatch:
         """Say in an error which sub-environment raised it. Nothing has moved if it is the first and still waits."""
         annotate(error, f"simenv_marl: in sub-environment {self._part[number]}")
         episode = self.sessions[number].episode
-        self.intact = number == self._first and episode is not None and episode.pending is not None
+        self.untouched = number == self._first and episode is not None and episode.pending is not None
 
     # -- views ------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def views(self) -> list[OneAgentView]:
         """The Gymnasium views of the sub-environments."""
-        if not self._views:
-            self._views = [self.view(self.view_plan, session=session) for session in self.sessions]
-        return self._views
+        return [self.view(self.view_plan, session=session) for session in self.sessions]
 
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
         """Call a method of each view, or get an attribute of each."""

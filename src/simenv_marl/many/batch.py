@@ -394,14 +394,14 @@ def step_all(
                 episode.advance(reply)
     except BaseException as error:
         events = event = args = kwargs = resume = None  # so that the error's traceback does not keep them alive
-        for place, episode in enumerate(episodes):
-            if place == number:
-                if episode.pending is None and not episode.over:
-                    episode.fail(error)
-                elif together:  # otherwise the episode has already done this
-                    episode.annotate(error)
-            elif episode.pending is None and not episode.over:
+        culprit = episodes[number]
+        for episode in episodes:
+            if episode.pending is None and not episode.over and episode is not culprit:
                 episode.pending = episode.latest  # so that it can be closed
+        if culprit.pending is None and not culprit.over:
+            culprit.fail(error)
+        elif together:  # otherwise the episode has already done this
+            culprit.annotate(error)
         blame(number, error)
         raise
 

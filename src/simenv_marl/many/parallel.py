@@ -12,7 +12,7 @@ import re
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
 from math import ceil
@@ -136,8 +136,7 @@ def serve(pipe: Connection, other_end: Connection | None) -> None:
 
     ``other_end`` is the user's end of the pipe, if a fork has copied it.
     """
-    with suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the user's process, which decides what to do
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the user's process, which decides what to do
     if other_end is not None:
         other_end.close()
     made: Any = None
@@ -165,81 +164,56 @@ class Worker:
 
     Attributes:
         part: The numbers of its simulations.
-        recipe: The message that makes its object.
         name: Its name in messages.
-        pipe: The user's end of the pipe. None if the process does not run.
-        owes: Whether it has not yet answered the last message.
+        pipe: The user's end of the pipe.
     """
 
-    def __init__(self, number: int, part: range, recipe: bytes) -> None:
-        self.part, self.recipe = part, recipe
-        self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
-        self.owes = False
-        self.pipe: Any = None
-        self._process: Any = None
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process was started and is not known to have ended."""
-        return self._process is not None
-
-    def start(self, context: Any) -> None:
+    def __init__(self, context: Any, number: int, part: range) -> None:
         """Start the process."""
-        ours, theirs = context.Pipe()
-        copied = ours if context.get_start_method() == "fork" else None
-        process = context.Process(target=serve, args=(theirs, copied), name=f"simenv_marl {self.name}", daemon=True)
+        self.part = part
+        self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
+        self.pipe, theirs = context.Pipe()
+        copied = self.pipe if context.get_start_method() == "fork" else None
+        name = f"simenv_marl {self.name}"
+        self._process = context.Process(target=serve, args=(theirs, copied), name=name, daemon=True)
         try:
-            process.start()
+            self._process.start()
         except BaseException:
-            ours.close()
+            self.pipe.close()
             raise
         finally:
             theirs.close()
-        self.pipe, self._process, self.owes = ours, process, False
 
     def send(self, message: bytes) -> None:
-        """Send a message to the worker, after the answer to one whose wait was interrupted."""
-        if self.owes:
-            self.receive()
-        if not self.alive:
-            raise WorkerError(f"{self.name} is dead; reset() starts a new one")
-        self.owes = True
+        """Send a message, or raise ``WorkerError`` if the worker is dead."""
         try:
             self.pipe.send_bytes(message)
         except OSError:
             raise self._died() from None
-        except BaseException:  # a part of the message may have been sent
-            self.stop()
-            raise
 
-    def answers_within(self, seconds: float | None) -> bool:
-        """Wait until the worker answers or dies; return whether it did within that time."""
-        return bool(wait([self.pipe, self._process.sentinel], seconds))
+    def receive(self, seconds: float | None = None) -> tuple[Any, BaseException | None] | None:
+        """Wait for the answer: a result, or None and an error. Return None if it does not come within some seconds.
 
-    def receive(self) -> tuple[Any, BaseException | None]:
-        """Wait for the answer. Return the result, or None and the error, also if the worker is dead."""
-        self.answers_within(None)
+        Raises:
+            WorkerError: The worker is dead.
+        """
+        if not wait([self.pipe, self._process.sentinel], seconds):
+            return None
         try:
             if not self.pipe.poll():
                 raise EOFError
             parcel = self.pipe.recv_bytes()
         except (EOFError, OSError):
-            return None, self._died()
-        except BaseException:  # a part of the answer may have been received
-            self.stop()
-            raise
-        self.owes = False
+            raise self._died() from None
         result, error = unpack_outcome(parcel)
         if error is not None:
             annotate(error, f"simenv_marl: in {self.name}")
         return result, error
 
     def _died(self) -> WorkerError:
-        """Clean up after a dead worker. Return the error that says how it died."""
-        process = self._process
-        process.join(1.0)  # the pipe closes a moment before the process ends
-        code = process.exitcode
-        self.stop()
+        """Make the error that says how the worker died."""
+        self._process.join(1.0)  # the pipe closes a moment before the process ends
+        code = self._process.exitcode
         how = "closed its pipe" if code is None else f"died with exit code {code}"
         script = (
             '. In a script, make environments with workers under `if __name__ == "__main__":`, because each worker'
@@ -248,17 +222,13 @@ class Worker:
             else ""
         )
         return WorkerError(
-            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts a new one{script}"
+            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts new workers{script}"
         )
 
-    def stop(self, seconds: float = 0.0) -> None:
+    def stop(self, seconds: float) -> None:
         """End the process, by force if it does not end within some seconds."""
-        process, pipe = self._process, self.pipe
-        self._process = self.pipe = None
-        self.owes = False
-        if process is None:
-            return
-        pipe.close()
+        self.pipe.close()
+        process = self._process
         process.join(seconds)
         for force in (process.terminate, process.kill):
             if process.exitcode is None:
@@ -275,11 +245,12 @@ class WorkerPool:
     user ends.
 
     Attributes:
-        intact: Set to False if a worker is found dead.
+        broken: Whether a worker has died, or a wait for an answer was interrupted. Then a reset starts all anew.
+        untouched: False: if a reset or a step fails, some simulations may have moved.
         idle: True: no simulation runs in this process.
     """
 
-    intact = idle = True
+    untouched, idle = False, True
 
     def __init__(
         self, make: Callable[..., Any], arguments: tuple[Any, ...], number: int, workers: int, context: Any
@@ -288,8 +259,6 @@ class WorkerPool:
 
         ``make`` is a function of this package. It returns an object that has the methods ``close`` and ``abandon``.
         """
-        self._process = os.getpid()
-        self._workers: list[Worker] = []
         try:
             self._context = context
             if not isinstance(context, BaseContext):
@@ -299,41 +268,39 @@ class WorkerPool:
                 f"context must be one of {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
                 f" of multiprocessing, not {short_repr(context)}"
             ) from None
-        workers = min(workers, number)
-        for place in range(workers):
-            part = range(number * place // workers, number * (place + 1) // workers)
-            try:
-                recipe = pack_plainly((make, (*arguments, part)))
-            except Exception as error:
-                raise OptionValueError(
-                    "the simulation, its points or its options cannot be sent to another process"
-                    f" ({describe_error(error)}); pass a class or a factory of a module, or workers=0"
-                ) from error
-            self._workers.append(Worker(place, part, recipe))
-        self._start_missing()
-
-    @property
-    def _owned(self) -> bool:
-        """Whether this process has started the workers, and is not a fork of the one that has."""
-        return os.getpid() == self._process
-
-    def _start_missing(self) -> None:
-        """Start the workers that do not run."""
-        new = [worker for worker in self._workers if not worker.alive]
+        cuts = [number * place // min(workers, number) for place in range(min(workers, number) + 1)]
         try:
-            for worker in new:
-                worker.start(self._context)
-            self._exchange(new, [worker.recipe for worker in new])
+            self._recipes = {part: pack_plainly((make, (*arguments, part))) for part in map(range, cuts, cuts[1:])}
+        except Exception as error:
+            raise OptionValueError(
+                "the simulation, its points or its options cannot be sent to another process"
+                f" ({describe_error(error)}); pass a class or a factory of a module, or workers=0"
+            ) from error
+        self._process = os.getpid()
+        self._workers: list[Worker] = []
+        self._start()
+
+    def _start(self) -> None:
+        """Start all workers, and have them make their objects."""
+        self.broken = True
+        try:
+            for number, part in enumerate(self._recipes):
+                self._workers.append(Worker(self._context, number, part))
+            self._exchange(self._recipes.values())
+            self.broken = False
         except BaseException:
-            for worker in new:
-                worker.stop()
+            self.abandon()
             raise
 
-    def _exchange(self, workers: Sequence[Worker], messages: Sequence[bytes]) -> list[Any]:
+    def _exchange(self, messages: Iterable[bytes]) -> list[Any]:
         """Send each worker its message, and return the answers of all, or raise the first error."""
-        for worker, message in zip(workers, messages, strict=True):
-            worker.send(message)
-        answers = [worker.receive() for worker in workers]
+        try:
+            for worker, message in zip(self._workers, messages, strict=True):
+                worker.send(message)
+            answers: list[Any] = [worker.receive() for worker in self._workers]
+        except BaseException:
+            self.broken = True
+            raise
         for _, error in answers:
             if error is not None:
                 raise error
@@ -342,47 +309,46 @@ class WorkerPool:
     def ask(self, method: str, *arguments: Any) -> list[Any]:
         """Call a method of each worker's object; return the results, or raise the first error.
 
-        Of lists and arrays, which have an item for each simulation, each worker gets its part. For a reset, workers
-        that have died are replaced.
+        Of lists and arrays, which have an item for each simulation, each worker gets its part.
         """
-        if not self._owned:
+        if os.getpid() != self._process:
             raise WorkerError(
                 "the workers belong to the process from which this one was forked; make a new environment"
             )
-        if method == "reset":
-            self._start_missing()
+        if self.broken and method == "reset":
+            self.abandon()
+            self._start()
+        elif self.broken:
+            raise WorkerError("a worker is dead, or a wait for it was interrupted; reset() starts new workers")
         messages = []
-        for worker in self._workers:
-            part = slice(worker.part.start, worker.part.stop)
-            own = [each[part] if isinstance(each, (list, np.ndarray)) else each for each in arguments]
+        for part in self._recipes:
+            own = [a[part.start : part.stop] if isinstance(a, (list, np.ndarray)) else a for a in arguments]
             messages.append(pack_plainly((method, own)))
-        try:
-            return self._exchange(self._workers, messages)
-        finally:
-            self.intact = self.intact and all(worker.alive for worker in self._workers)
+        return self._exchange(messages)
 
     def close(self) -> None:
         """Close the objects and end the workers, by force after some seconds. Raise the first error of an object."""
         deadline = monotonic() + SECONDS_TO_CLOSE
-        asked = [worker for worker in self._workers if worker.alive and not worker.owes and self._owned]
+        asked = [] if self.broken or os.getpid() != self._process else self._workers
+        answers: list[Any] = []
         try:
-            for worker in asked:
-                with suppress(WorkerError):
+            with suppress(WorkerError):  # nothing is left to close in a worker that is dead
+                for worker in asked:
                     worker.send(pack_plainly(("close", ())))
-            there = [worker for worker in asked if worker.alive]
-            ready = [worker for worker in there if worker.answers_within(max(deadline - monotonic(), 0.0))]
-            if len(ready) < len(there):
+                answers = [worker.receive(max(deadline - monotonic(), 0.0)) for worker in asked]
+            if None in answers:
                 warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are killed", ResourceWarning)
-            for worker in ready:
-                _, error = worker.receive()
-                if error is not None and worker.alive:  # nothing is left to close in one that is dead
+            for _, error in filter(None, answers):
+                if error is not None:
                     raise error
         finally:
             self.abandon()
 
     def abandon(self) -> None:
         """End the workers. A finalizer may call this; it raises no errors."""
-        workers = [worker for worker in self._workers if worker.alive and self._owned]
+        if os.getpid() != self._process:
+            return  # the workers belong to the process of which this one is a fork
+        workers, self._workers = self._workers, []
         for worker in workers:
             with suppress(OSError):
                 worker.pipe.send_bytes(EXIT)

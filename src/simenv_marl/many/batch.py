@@ -99,6 +99,8 @@ class PolicyKey(DeferredPolicy):
 
     def alone(self, episode: Any, agent: Any) -> Any:
         """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
+        if self.asked.asking:
+            return self(agent.observation, agent.info)
         group = self.asked.group(agent.point)
         actions, _ = group.ask(group.stack([agent.observation]), [episode], [agent])
         return actions[0]
@@ -110,10 +112,6 @@ class PlannerKey(PlannerPolicy, PolicyKey):
     def __init__(self, place: int, asked: BatchPolicy, policy: Callable[..., Any]) -> None:
         PlannerPolicy.__init__(self, policy)
         PolicyKey.__init__(self, place, asked)
-
-    def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
-        return self(agent.observation, agent.info)
 
 
 def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[Any, Any]:

@@ -25,15 +25,7 @@ from typing import Any, Final
 import numpy as np
 
 from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
-from ..errors import (
-    MissingExtraError,
-    OptionValueError,
-    WorkerError,
-    annotate,
-    describe_error,
-    short_repr,
-    warn_user,
-)
+from ..errors import MissingExtraError, OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 
 EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots"}
 """The extra that installs a package. All other packages belong to ``experiments``."""
@@ -58,12 +50,7 @@ def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
 
 
 def spread(
-    work: Callable[..., Any],
-    arguments: tuple[Any, ...],
-    seeds: Sequence[Any],
-    workers: int,
-    least: int,
-    share: int = 4,
+    work: Callable[..., Any], arguments: tuple[Any, ...], seeds: Sequence[Any], workers: int, least: int, share: int = 4
 ) -> Iterator[tuple[int, Any]]:
     """Call ``work``, a function of this package, in worker processes: for each part of the seeds (or of other items).
 

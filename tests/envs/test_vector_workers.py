@@ -424,7 +424,7 @@ def test_workers_of_an_environment_that_is_dropped_may_finish(tmp_path):
 
 
 def test_a_simulation_that_hangs_does_not_keep_the_environment_from_closing(monkeypatch):
-    monkeypatch.setattr("simenv_marl.envs.vector_workers.SECONDS_TO_CLOSE", 0.5)
+    monkeypatch.setattr("simenv_marl.many.parallel.SECONDS_TO_CLOSE", 0.5)
     envs = workers(Hanging)
     envs.reset(seed=0)
     with pytest.warns(ResourceWarning, match="did not close"):

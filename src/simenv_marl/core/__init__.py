@@ -4,7 +4,6 @@ Each module imports only from those below it::
 
     branching                   exact continuations of an episode
     provenance                  the record of what an environment was made of
-    together                    steps of many episodes
     session                     the simulation of one environment, over all its episodes
     episode                     one episode, and the life cycle of a decision
     rounds, run                 rounds of the parallel and joint views; the run on the simulation's stack

@@ -41,14 +41,18 @@ def stacker(space: spaces.Space[Any], *, cast: bool = False, other: Stacker | No
             return stacks if isinstance(space, spaces.Dict) else tuple(stacks.values())
 
         return stack_parts
-    if isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)):
-        return _array_stacker(space.dtype, space.shape or (), cast=cast)
-    if other is None:
-        return _stack_objects
-    return lambda items, out=None: other(space, items, out)
+    if not isinstance(space, (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)):
 
+        def stack_objects(items: Sequence[Any], out: Any = None) -> Any:
+            if other is not None:
+                return other(space, items, out)
+            stacked = np.empty(len(items), object)
+            for place, item in enumerate(items):
+                stacked[place] = item
+            return stacked
 
-def _array_stacker(dtype: Any, shape: tuple[int, ...], *, cast: bool) -> Stacker:
+        return stack_objects
+    dtype, shape = space.dtype, space.shape or ()
     small = bool(shape) and np.dtype(dtype).itemsize * prod(shape) <= SMALL
 
     def stack(items: Sequence[Any], out: Any = None) -> Any:
@@ -58,32 +62,21 @@ def _array_stacker(dtype: Any, shape: tuple[int, ...], *, cast: bool) -> Stacker
             return out
         if not shape:
             out[:] = items
-        elif not cast:
+            return out
+        if not cast:
             out[:] = [np.reshape(item, shape) for item in items]
-        else:
-            if small:
-                try:
-                    # This takes a third of the time of ``concatenate``, which takes a third of that of ``stack``.
-                    memoryview(out.reshape(-1).view(np.uint8))[:] = b"".join(items)
-                    return out
-                except TypeError:  # an item has another memory layout
-                    pass
-            np.concatenate(items, out=out.reshape(-1, *shape[1:]))
+            return out
+        if small:
+            try:
+                # This takes a third of the time of ``concatenate``, which takes a third of that of ``stack``.
+                memoryview(out.reshape(-1).view(np.uint8))[:] = b"".join(items)
+                return out
+            except TypeError:  # an item has another memory layout
+                pass
+        np.concatenate(items, out=out.reshape(-1, *shape[1:]))
         return out
 
     return stack
-
-
-def _stack_objects(items: Sequence[Any], out: Any = None) -> NDArray[Any]:
-    stacked = np.empty(len(items), object)
-    for place, item in enumerate(items):
-        stacked[place] = item
-    return stacked
-
-
-def empty(space: spaces.Space[Any]) -> Any:
-    """Make an empty stack of a space."""
-    return stacker(space)([])
 
 
 def stack_masks(masks: Sequence[Any]) -> Any:

@@ -1,14 +1,15 @@
 """The vector view: many copies of a simulation, stepped together."""
 
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from threading import Lock
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space, iterate
+from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from ..core.session import checked_seed
@@ -23,10 +24,10 @@ from ..errors import (
     ReentrancyError,
     short_repr,
 )
+from ..many.parallel import WorkerPool
 from ..simulation import RULE
 from .one_agent import OneAgentView
-from .vector_batch import Infos, SimulationBatch, State, SubEnvironmentType, checked_actions
-from .vector_workers import WorkerPool
+from .vector_batch import SimulationBatch, checked_actions
 
 
 class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
@@ -67,24 +68,26 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         workers = _count(workers, "workers", 0)
         self._mode = _mode(autoreset_mode)
         self._copy = bool(copy)
-        kind = SubEnvironmentType(simulation, points, options, view)
-        plan = kind.plan
-        self.render_mode = plan.options.render_mode
-        self.metadata = {**kind.view.metadata_of(plan), "autoreset_mode": self._mode}
-        self.single_observation_space = kind.observation_space
-        self.single_action_space = kind.action_space
+        part = range(0 if workers else self.num_envs)
+        batch = SimulationBatch(simulation, points, options, view, self._mode, part)
+        self.render_mode = batch.plan.options.render_mode
+        self.metadata = {**batch.view.metadata_of(batch.plan), "autoreset_mode": self._mode}
+        self.single_observation_space = batch.observation_space
+        self.single_action_space = batch.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         # The point that takes all actions, if no simulation is needed to check them.
-        self._point = plan.active[0] if kind.joint is None and plan.active[0].legal is None else None
-        self._agent = str(plan.one_agent)
+        point = batch.plan.active[0]
+        self._point = point if batch.joint is None and point.legal is None else None
+        self._agent = str(batch.plan.one_agent)
         self.lock = Lock()
-        self._batch: SimulationBatch | WorkerPool
+        self._begun = self._failed = False
+        self._ended = np.zeros(self.num_envs, np.bool_)  # where the next episode begins with the next step or a reset
+        self._simulations: SimulationBatch | WorkerPool = batch
         if workers:
-            self._batch = WorkerPool(kind, self.num_envs, self._mode, workers, context)
-        else:
-            self._batch = SimulationBatch(kind, self.num_envs, self._mode)
-        self._finalizer = weakref.finalize(self, self._batch.abandon)
+            self._simulations = WorkerPool(SimulationBatch, batch.arguments, self.num_envs, workers, context)
+            self._observations = create_empty_array(self.single_observation_space, self.num_envs)
+        self._finalizer = weakref.finalize(self, self._simulations.abandon)
         self.closed = False
 
     # -- episodes ---------------------------------------------------------------------------------
@@ -112,7 +115,10 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         with _exclusive(self):
             seeds = self._seeds(seed)
             chosen, options = self._chosen(options)
-            observations, infos = self._batch.reset(seeds, options, chosen)
+            answers = self._ask("reset", seeds, options, chosen)
+            self._begun, self._failed = True, False
+            self._ended = self._ended & ~chosen
+            observations, infos = self._joined(answers)
         return duplicate(observations) if self._copy else observations, self._merged(infos)
 
     def step(
@@ -134,24 +140,62 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 of them need a reset.
         """
         with _exclusive(self):
-            state = int(self._batch.states.max())
-            if state == State.NEW:
+            if not self._begun:
                 raise NotResetError("there is no episode yet; call reset() first")
-            if state == State.FAILED:
+            if self._failed:
                 raise EpisodeOverError("an error has ended the episodes; call reset() to begin the next ones")
-            if state == State.ENDED and self._mode == AutoresetMode.DISABLED:
-                ended = np.flatnonzero(self._batch.states == State.ENDED).tolist()
+            if self._mode == AutoresetMode.DISABLED and self._ended.any():
                 raise EpisodeOverError(
-                    f"the episodes of the sub-environments {ended[:10]} are over; begin the next ones with"
-                    ' reset(options={"reset_mask": ...})'
+                    f"the episodes of the sub-environments {self._ended.nonzero()[0].tolist()[:10]} are over; begin the"
+                    ' next ones with reset(options={"reset_mask": ...})'
                 )
-            observations, *results, infos = self._batch.step(self._split(actions))
-        return duplicate(observations) if self._copy else observations, *results, self._merged(infos)
+            answers = self._ask("step", self._split(actions), self._ended)
+            observations, rewards, terminations, truncations, infos = self._joined(answers)
+            if self._mode != AutoresetMode.SAME_STEP:
+                self._ended = terminations | truncations
+        observations = duplicate(observations) if self._copy else observations
+        return observations, rewards, terminations, truncations, self._merged(infos)
 
-    def _merged(self, infos: Infos) -> dict[str, Any]:
+    def _ask(self, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of the simulations, here or in workers.
+
+        After an error in a reset or a step they may stand at different steps. Then all of them need a reset.
+        """
+        simulations = self._simulations
+        try:
+            return simulations.ask(method, *arguments)
+        except BaseException:
+            moved = method in ("reset", "step") and not simulations.untouched
+            self._failed = self._failed or moved or simulations.broken
+            raise
+
+    def _joined(self, answers: list[Any]) -> Any:
+        """Join what all parts have returned: observations, which the next call overwrites, arrays and infos."""
+        if isinstance(self._simulations, SimulationBatch):
+            return answers[0]
+        observations, *arrays, infos = zip(*answers, strict=True)
+        self._observations = _join(self.single_observation_space, observations, self._observations)
+        return self._observations, *map(np.concatenate, arrays), chain.from_iterable(infos)
+
+    def _merged(self, infos: Iterable[tuple[int, dict[str, Any]]]) -> dict[str, Any]:
+        """Merge infos as Gymnasium does, but all numbers of a key at once, which takes a fifth of the time."""
         merged: dict[str, Any] = {}
+        columns: dict[str, tuple[list[int], list[Any]]] = {}
         for number, info in infos:
-            merged = self._add_info(merged, info, number)
+            for key, value in info.items():
+                numbers, values = columns.setdefault(key, ([], []))
+                numbers.append(number)
+                values.append(value)
+        for key, (numbers, values) in columns.items():
+            column = self._add_info(merged, {key: values[0]}, numbers[0])[key]
+            merged[f"_{key}"][numbers] = True
+            if isinstance(column, dict):
+                merged[key] = self._merged(zip(numbers, values, strict=True))
+            elif column.dtype != object:
+                column[numbers] = values
+            else:
+                for number, value in zip(numbers, values, strict=True):
+                    column[number] = value
         return merged
 
     def _split(self, actions: Any) -> list[Any]:
@@ -160,7 +204,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             raise InvalidActionError("RULE is not an action in vector environments; use single_env, or policies=")
         point, space = self._point, self.single_action_space
         if point is None:
-            return self._batch.check(self._apart(actions))
+            return list(chain.from_iterable(self._ask("check", self._apart(actions), self._ended)))
         if type(actions) is np.ndarray and actions.shape == (self.num_envs, *(space.shape or ())):
             if isinstance(space, spaces.Discrete) and actions.dtype.kind in "iu":
                 if actions.min() >= space.start and actions.max() < space.start + space.n:
@@ -171,9 +215,8 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
                 and ((actions >= space.low) & (actions <= space.high)).all()
             ):
                 return list(actions.copy())  # so that the caller cannot change them
-        return checked_actions(
-            self._apart(actions), self._batch.states, lambda _, action: point.checked(action, self._agent, None)
-        )
+        check = lambda _, action: point.checked(action, self._agent, None)  # noqa: E731
+        return checked_actions(self._apart(actions), self._ended, check)
 
     def _apart(self, actions: Any) -> list[Any]:
         try:
@@ -198,32 +241,31 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             raise OptionValueError(f"there are {len(seeds)} seeds for {self.num_envs} simulations")
         return seeds
 
-    def _chosen(self, options: dict[str, Any] | None) -> tuple[list[int], dict[str, Any] | None]:
-        """Return the simulations to reset, and the options for them."""
-        numbers = list(range(self.num_envs))
+    def _chosen(self, options: dict[str, Any] | None) -> tuple[NDArray[np.bool_], dict[str, Any] | None]:
+        """Return which simulations to reset, and the options for them."""
         if options is None or "reset_mask" not in options:
-            return numbers, options
+            return np.ones(self.num_envs, np.bool_), options
         mask = options["reset_mask"]
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,):
             raise OptionValueError(
                 f"reset_mask must be a bool array of shape ({self.num_envs},), not {short_repr(mask)}"
             )
-        chosen: list[int] = np.flatnonzero(mask).tolist()
-        if not chosen:
+        if not mask.any():
             raise OptionValueError("reset_mask selects no simulation to reset")
-        state = int(self._batch.states.max())
-        if chosen != numbers and state == State.NEW:
+        if not (self._begun or mask.all()):
             raise NotResetError("there are no episodes yet; call reset() without a reset_mask first")
-        if chosen != numbers and state == State.FAILED:
+        if self._failed and not mask.all():
             raise EpisodeOverError("an error has ended the episodes; call reset() without a reset_mask")
-        return chosen, {name: value for name, value in options.items() if name != "reset_mask"}
+        return mask, {name: value for name, value in options.items() if name != "reset_mask"}
 
     # -- the simulations --------------------------------------------------------------------------
 
     @property
     def envs(self) -> list[OneAgentView]:
         """The Gymnasium environments of the simulations, in order."""
-        return list(self._batch.views)
+        if isinstance(self._simulations, WorkerPool):
+            raise AttributeError("the sub-environments are in other processes; use call(), get_attr() and set_attr()")
+        return list(self._simulations.views)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each sub-environment, or get its attribute.
@@ -241,7 +283,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             BaseException: Any exception of a sub-environment.
         """
         with _exclusive(self):
-            return tuple(self._batch.call(name, args, kwargs))
+            return tuple(chain.from_iterable(self._ask("call", name, args, kwargs)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return an attribute of each sub-environment, as a tuple."""
@@ -262,7 +304,7 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
         if len(values) != self.num_envs:
             raise OptionValueError(f"there are {len(values)} values for {self.num_envs} simulations")
         with _exclusive(self):
-            self._batch.set_attr(name, values)
+            self._ask("set_attr", name, list(values))
 
     @property  # type: ignore[misc]  # one generator for each cannot be set as one
     def np_random(self) -> Any:
@@ -289,9 +331,9 @@ class SimulationVectorEnv(VectorEnv[Any, Any, Any]):
             return
         with _exclusive(self):
             try:
-                self._batch.close()
+                self._simulations.close()
             finally:
-                self.closed = self._batch.idle
+                self.closed = self._simulations.idle
                 if self.closed:
                     self._finalizer.detach()
 
@@ -333,3 +375,14 @@ def _mode(mode: Any) -> AutoresetMode:
             f"autoreset_mode must be one of {', '.join(repr(known.value) for known in AutoresetMode)}, not"
             f" {short_repr(mode)}"
         ) from None
+
+
+def _join(space: spaces.Space[Any], parts: Sequence[Any], out: Any) -> Any:
+    """Join batches of a space into one, which is written into ``out`` where it consists of arrays."""
+    if isinstance(space, spaces.Dict):
+        return {key: _join(inner, [part[key] for part in parts], out[key]) for key, inner in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_join(inner, [part[i] for part in parts], out[i]) for i, inner in enumerate(space.spaces))
+    if isinstance(out, np.ndarray):
+        return np.concatenate(parts, out=out)
+    return tuple(chain.from_iterable(parts))

@@ -1,5 +1,7 @@
 """Many simulations at once, whose decisions are gathered and answered in batches.
 
+``step_all`` steps many episodes in one thread. Vector environments use it, too.
+
 Each simulation has a session and an episode, as in an environment. Where a batched policy decides, the episode waits
 until many decisions wait for the same policy. The number of simulations determines which decisions share a batch; it
 does not change the course of any simulation.
@@ -10,13 +12,16 @@ decisions are asked in ``Group``s; all decisions of a group have the same spaces
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final, Protocol
 
 import numpy as np
+from greenlet import getcurrent
 
 from ..core.context import reuse_resources
+from ..core.driver import WAIT
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.planner import DeferredPolicy, PlannerPolicy, is_planner
@@ -25,10 +30,9 @@ from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.spaces import duplicate
 from ..core.stacking import rows, stacker
-from ..core.together import step_all
 from ..decision import DecisionPoint
 from ..errors import InvalidActionError, annotate, short_repr
-from ..hooks.stacks import outside_simulation
+from ..hooks.stacks import EVALUATING, outside_simulation
 from ..simulation import RULE, positional
 
 # -- who is asked ---------------------------------------------------------------------------------
@@ -95,12 +99,10 @@ class PolicyKey(DeferredPolicy):
 
     def alone(self, episode: Any, agent: Any) -> Any:
         """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
+        if self.asked.asking:
+            return self(agent.observation, agent.info)
         group = self.asked.group(agent.point)
-        episode.pending = agent
-        try:
-            actions, _ = group.ask(group.stack([agent.observation]), [episode])
-        finally:
-            episode.pending = None
+        actions, _ = group.ask(group.stack([agent.observation]), [episode], [agent])
         return actions[0]
 
 
@@ -110,10 +112,6 @@ class PlannerKey(PlannerPolicy, PolicyKey):
     def __init__(self, place: int, asked: BatchPolicy, policy: Callable[..., Any]) -> None:
         PlannerPolicy.__init__(self, policy)
         PolicyKey.__init__(self, place, asked)
-
-    def alone(self, episode: Any, agent: Any) -> Any:
-        """Answer one decision at once, of an episode that is a branch and waits for one agent alone."""
-        return self(agent.observation, agent.info)
 
 
 def policy_keys(policies: Mapping[Any, Any], *, rewarded: bool = False) -> dict[Any, Any]:
@@ -144,10 +142,9 @@ class Group:
         waiting: The episodes whose decisions wait.
         places: The index of each waiting episode's seed.
         observations: The observation of each waiting episode.
-        book: The records of the decisions; None if no trajectories are collected.
     """
 
-    __slots__ = ("_discrete", "asked", "book", "observations", "places", "point", "stack", "waiting")
+    __slots__ = ("_discrete", "asked", "observations", "places", "point", "stack", "waiting")
 
     def __init__(self, asked: BatchPolicy, point: Point) -> None:
         self.asked, self.point = asked, point
@@ -156,7 +153,6 @@ class Group:
         self.places: list[int] = []
         # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
         self.observations: list[Any] = []
-        self.book: Any = None
         self._discrete = not point.definition.action_space.shape
 
     def takes(self, point: Point) -> bool:
@@ -168,18 +164,18 @@ class Group:
             and (self.point.legal is None) == (point.legal is None)
         )
 
-    def ask(self, observations: Any, waiting: Sequence[Episode]) -> tuple[list[Any], Mapping[str, Any]]:
+    def ask(
+        self, observations: Any, waiting: Sequence[Episode], agents: Sequence[Any]
+    ) -> tuple[list[Any], Mapping[str, Any]]:
         """Ask the policy about the stacked observations of waiting episodes; return the actions, and the extras."""
         asked = self.asked
         infos: list[Any] = []
-        if asked.informed:
-            for episode in waiting:
-                agent: Any = episode.pending
-                infos.append(agent.info)
-                agent.info = {}  # a policy may change its info; the next decision gets a new one
+        for agent in agents if asked.informed else ():
+            infos.append(agent.info)
+            agent.info = {}  # a policy may change its info; the next decision gets a new one
         try:
             identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
-            answers = _each(waiting) if asked.asking else asked.answers(observations, infos, identities)
+            answers = _each(agents) if asked.asking else asked.answers(observations, infos, identities)
             extras: Mapping[str, Any] = {}
             if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
                 answers, extras = answers
@@ -191,22 +187,17 @@ class Group:
                     " one action for each row of the observations, in their order"
                 )
         except BaseException as error:
-            seeds = [str(episode.seed) for episode in waiting]
-            several = f"seeds {', '.join(seeds[:5])}{' and others' if len(seeds) > 5 else ''}"
-            annotate(
-                error,
-                f"simenv_marl: in {asked!r}, asked for {len(seeds)} decisions at once;"
-                f" {several if len(seeds) > 1 else f'seed {seeds[0]}'}",
-            )
+            number, seeds = len(waiting), ", ".join(str(episode.seed) for episode in waiting[:5])
+            seeds = f"{'seed' if number == 1 else 'seeds'} {seeds}{' and others' if number > 5 else ''}"
+            annotate(error, f"simenv_marl: in {asked!r}, asked for {number} decisions at once; {seeds}")
             raise
         return actions, extras
 
 
-def _each(waiting: Sequence[Episode]) -> Any:
+def _each(agents: Sequence[Any]) -> Any:
     """Ask a policy that asks for the environment, one decision after the other."""
     answers = []
-    for episode in waiting:
-        agent: Any = episode.pending
+    for agent in agents:
         agent.consultations += 1
         answers.append(agent.policy(duplicate(agent.observation), agent.info))
         agent.info = {}
@@ -232,6 +223,11 @@ class Watcher(Protocol):
         """Note that an episode has reached its next decision or its end."""
 
 
+CROWD: Final = 256
+"""The number of simulations at first. With more, each has left the processor's caches when its turn comes again, and
+takes twice as long. If the policy takes longer than all simulations together, more simulations pay off."""
+
+
 def run(
     plan: Plan,
     seeds: Sequence[int],
@@ -239,18 +235,106 @@ def run(
     finish: Callable[[int, Any], Callable[[], None] | None],
     watcher: Watcher | None = None,
 ) -> None:
-    """Run one simulation per seed. Batched policies answer the decisions. After an error, all simulations are unwound.
+    """Run one simulation per seed, ``size`` at a time. After an error, all simulations are unwound.
 
-    Args:
-        plan: The plan of the episodes, with a ``PolicyKey`` for each policy.
-        seeds: The seeds of the simulations.
-        size: The largest number of simulations at a time.
-        finish: Called with the index of a seed and its simulation when the simulation has ended. If it returns a
-            callable, that is called after the simulation is closed.
-        watcher: The observer of rewards and ends. None: agents are not rewarded.
+    The plan has a ``PolicyKey`` for each policy. ``finish`` is called with the index of a seed and its simulation when
+    the simulation has ended. If it returns a callable, that is called after the simulation is closed.
     """
+    simulations = _Simulations(plan, seeds, size, finish, watcher)
     with outside_simulation(), reuse_resources():
-        _Simulations(plan, seeds, size, finish, watcher).run()
+        try:
+            simulations.refill()
+            while simulations.sessions:
+                # Waiting for large groups saves calls of policies.
+                simulations.answer(max(simulations.groups, key=lambda group: len(group.waiting)))
+        except BaseException as error:
+            left = simulations.sessions.items()
+            close_all(((f"the simulation of seed {seeds[place]}", session) for place, session in left), error)
+            raise
+
+
+@dataclass
+class _Simulations:
+    """The simulations that are running, and the decisions that wait: see ``run``."""
+
+    plan: Plan
+    seeds: Sequence[int]
+    size: int
+    finish: Callable[[int, Any], Callable[[], None] | None]
+    watcher: Watcher | None
+
+    def __post_init__(self) -> None:
+        self.crowd = min(self.size, CROWD)
+        self.next = 0
+        self.sessions: dict[int, Session] = {}  # by the place of their seed
+        self.groups: dict[Group, None] = {}
+
+    def answer(self, group: Group) -> None:
+        """Have the decisions of a group answered, and run each simulation to its next decision."""
+        waiting, group.waiting = group.waiting, []
+        places, group.places = group.places, []
+        observations, group.observations = group.observations, []
+        watcher, number, begun = self.watcher, len(waiting), perf_counter()
+        recorded = None if watcher is None else group.stack(observations)  # policies may change what they get
+        agents = [episode.pending for episode in waiting]
+        actions, extras = group.ask(group.stack(observations), waiting, agents)
+        asked = perf_counter()
+        if watcher is not None:
+            watcher.asking(group, places, waiting, recorded)
+        step_all(waiting, list(map(_checked, waiting, actions)))
+        waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
+        for place in places:
+            self._queue(place, waiting.pop())
+        if watcher is not None:
+            watcher.answered(group, actions, extras)
+        if 2 * number > self.crowd < self.size and asked - begun > perf_counter() - asked:
+            self.crowd = min(self.size, 2 * self.crowd)
+        self.refill()
+
+    def refill(self) -> None:
+        """Start simulations until the limit is reached."""
+        while self.next < len(self.seeds) and len(self.sessions) < self.crowd:
+            place, seed = self.next, self.seeds[self.next]
+            self.next += 1
+            try:
+                session = Session(self.plan)
+            except BaseException as error:
+                annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
+                raise
+            self.sessions[place] = session
+            self._queue(place, session.start(seed, None))
+
+    def _queue(self, place: int, episode: Episode) -> None:
+        """Queue an episode that waits at a decision, or end it if it is over."""
+        if self.watcher is not None:
+            self.watcher.moved(episode)
+        agent = episode.pending
+        if agent is None:
+            self._end(place)
+            return
+        group = agent.group
+        if group is None:
+            group = agent.group = agent.policy.asked.group(agent.point)
+            self.groups[group] = None
+        group.waiting.append(episode)
+        group.places.append(place)
+        # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
+        group.observations.append(agent.observation)
+        if self.watcher is None:
+            agent.observation = None
+
+    def _end(self, place: int) -> None:
+        session = self.sessions[place]
+        session.end()  # it may have been truncated
+        try:
+            closed = self.finish(place, session.simulation)
+            session.close()
+            if closed is not None:
+                closed()
+        except BaseException as error:
+            annotate(error, f"simenv_marl: after the simulation's end; seed {self.seeds[place]}")
+            raise
+        del self.sessions[place]
 
 
 def _checked(episode: Episode, action: Any) -> Any:
@@ -263,106 +347,75 @@ def _checked(episode: Episode, action: Any) -> Any:
         raise
 
 
-CROWD: Final = 256
-"""The number of simulations at first. With more, each has left the processor's caches when its turn comes again, and
-takes twice as long. If the policy takes longer than all simulations together, more simulations pay off."""
+# -- many episodes and sessions -------------------------------------------------------------------
 
 
-class _Simulations:
-    """The simulations that are running."""
+def step_all(
+    episodes: Sequence[Episode],
+    actions: Sequence[Any],
+    blame: Callable[[int, BaseException], None] = lambda number, error: None,
+) -> None:
+    """Answer the pending decisions of episodes of one plan with checked actions, and run each to its next decision.
 
-    def __init__(
-        self,
-        plan: Plan,
-        seeds: Sequence[int],
-        size: int,
-        finish: Callable[[int, Any], Callable[[], None] | None],
-        watcher: Watcher | None,
-    ) -> None:
-        self._plan, self._seeds, self._size = plan, seeds, size
-        self._finish, self._watcher = finish, watcher
-        self._crowd = min(size, CROWD)
-        self._next = 0
-        self._sessions: dict[int, Session] = {}  # by the place of their seed
-        self._groups: dict[Group, None] = {}
-
-    def run(self) -> None:
-        try:
-            self._refill()
-            while self._sessions:
-                # Waiting for large groups saves calls of policies.
-                self._answer(max(self._groups, key=lambda group: len(group.waiting)))
-        except BaseException as error:
-            for place, session in self._sessions.items():
-                try:
-                    session.close()
-                except BaseException as problem:
-                    where = f"unwinding the simulation of seed {self._seeds[place]}"
-                    annotate(error, f"simenv_marl: {where} raised {short_repr(problem)} as well")
-            raise
-
-    def _answer(self, group: Group) -> None:
-        """Have the decisions of a group answered, and run each simulation to its next decision."""
-        waiting, group.waiting = group.waiting, []
-        places, group.places = group.places, []
-        observations, group.observations = group.observations, []
-        watcher, number, begun = self._watcher, len(waiting), perf_counter()
-        recorded = None if watcher is None else group.stack(observations)  # policies may change what they get
-        actions, extras = group.ask(group.stack(observations), waiting)
-        asked = perf_counter()
-        if watcher is not None:
-            watcher.asking(group, places, waiting, recorded)
-        step_all(waiting, list(map(_checked, waiting, actions)))
-        waiting.reverse()  # popped one by one, so that nothing keeps ended episodes alive
-        for place in places:
-            self._queue(place, waiting.pop())
-        if watcher is not None:
-            watcher.answered(group, actions, extras)
-        if 2 * number > self._crowd < self._size and asked - begun > perf_counter() - asked:
-            self._crowd = min(self._size, 2 * self._crowd)
-        self._refill()
-
-    def _queue(self, place: int, episode: Episode) -> None:
-        """Queue an episode that waits at a decision, or end it if it is over."""
-        if self._watcher is not None:
-            self._watcher.moved(episode)
-        agent = episode.pending
-        if agent is None:
-            self._end(place)
+    All simulations move before any agent is updated, so that the data of each loop stays in the processor's caches. If
+    an episode raises, ``blame`` is called with its number and the error. The others may have moved or not; they can be
+    closed.
+    """
+    if not episodes:
+        return
+    agents: list[Any] = [episode.pending for episode in episodes]
+    callers = {episode.driver.caller for episode in episodes}
+    in_rounds, plugins = episodes[0].rounds is not None, episodes[0].plugins
+    together = callers == {getcurrent()} and not (EVALUATING or None in agents or plugins or in_rounds)
+    step = Episode.play if in_rounds else Episode.step
+    number = 0
+    event: Any = None
+    events: Any = []
+    try:
+        if not together:
+            for number, episode in enumerate(episodes):
+                step(episode, actions[number])
             return
-        group = agent.group
-        if group is None:
-            group = agent.group = agent.policy.asked.group(agent.point)
-            self._groups[group] = None
-        group.waiting.append(episode)
-        group.places.append(place)
-        # Kept outside the episodes: reading them from many suspended episodes would miss the processor's caches.
-        group.observations.append(agent.observation)
-        if self._watcher is None:
-            agent.observation = None
+        replies: list[Any] = []
+        for number, episode in enumerate(episodes):
+            replies.append(episode.answer(agents[number], actions[number]))
+        for number, episode in enumerate(episodes):
+            resume = episode.driver.resume
+            events.append(resume(replies[number]))
+        del replies
+        events.reverse()  # popped one by one, so that the list keeps nothing alive that a model frees
+        for number, episode in enumerate(episodes):  # noqa: B007 - the handler below needs the number
+            event, args, kwargs = events.pop()
+            reply = event.handle(episode, args, kwargs)
+            if reply is not WAIT:
+                event = args = kwargs = None
+                episode.advance(reply)
+    except BaseException as error:
+        events = event = args = kwargs = resume = None  # so that the error's traceback does not keep them alive
+        culprit = episodes[number]
+        for episode in episodes:
+            if episode.pending is None and not episode.over and episode is not culprit:
+                episode.pending = episode.latest  # so that it can be closed
+        if culprit.pending is None and not culprit.over:
+            culprit.fail(error)
+        elif together:  # otherwise the episode has already done this
+            culprit.annotate(error)
+        blame(number, error)
+        raise
 
-    def _refill(self) -> None:
-        """Start simulations until the limit is reached."""
-        while self._next < len(self._seeds) and len(self._sessions) < self._crowd:
-            place, seed = self._next, self._seeds[self._next]
-            self._next += 1
-            try:
-                session = Session(self._plan)
-            except BaseException as error:
-                annotate(error, f"simenv_marl: while the simulation was made; seed {seed}")
-                raise
-            self._sessions[place] = session
-            self._queue(place, session.start(seed, None))
 
-    def _end(self, place: int) -> None:
-        session = self._sessions[place]
-        session.end()  # it may have been truncated
+def close_all(sessions: Iterable[tuple[str, Session]], error: BaseException | None = None) -> BaseException | None:
+    """Close all sessions, given with their names. Return the first error, with notes of all others; None without any.
+
+    ``error`` is an error before.
+    """
+    for name, session in sessions:
         try:
-            closed = self._finish(place, session.simulation)
             session.close()
-            if closed is not None:
-                closed()
-        except BaseException as error:
-            annotate(error, f"simenv_marl: after the simulation's end; seed {self._seeds[place]}")
-            raise
-        del self._sessions[place]
+        except BaseException as problem:
+            if error is None:
+                error = problem
+                annotate(error, f"simenv_marl: in {name}")
+            else:
+                annotate(error, f"simenv_marl: closing {name} raised {short_repr(problem)} as well")
+    return error

@@ -1,18 +1,31 @@
-"""Work on many simulations in several processes, local or remote, with joblib."""
+"""Work on many simulations in several processes.
+
+``spread`` runs work that needs nothing from earlier work in processes of joblib, local or remote. A ``WorkerPool`` has
+processes of its own, in which objects live on between calls.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import re
+import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from importlib import import_module
 from math import ceil
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import BaseContext
+from time import monotonic
 from types import FunctionType
 from typing import Any, Final
 
-from ..core.packing import pack, pack_outcome, unpack, unpack_outcome
-from ..errors import MissingExtraError
+import numpy as np
+
+from ..core.packing import pack, pack_outcome, pack_plainly, unpack, unpack_outcome
+from ..errors import MissingExtraError, OptionValueError, WorkerError, annotate, describe_error, short_repr, warn_user
 
 EXTRAS: Final = {"joblib": "many", "tqdm": "many", "matplotlib": "plots"}
 """The extra that installs a package. All other packages belong to ``experiments``."""
@@ -33,23 +46,16 @@ def progress_bar(total: int, unit: str = "simulation", done: int = 0) -> Any:
     return import_extra("tqdm.auto", "progress=True").tqdm(total=total, unit=unit, initial=done)
 
 
-def spread(
-    work: Callable[..., Any],
-    arguments: tuple[Any, ...],
-    seeds: Sequence[Any],
-    workers: int,
-    least: int,
-    share: int = 4,
-) -> Iterator[tuple[int, Any]]:
-    """Call ``work`` with the arguments and a part of the seeds (or of other items) in worker processes, for all parts.
+# -- processes of joblib --------------------------------------------------------------------------
 
-    Args:
-        work: A function of this package.
-        arguments: Its arguments before the seeds.
-        seeds: All seeds.
-        workers: The number of worker processes. -1: as many as joblib's backend has.
-        least: The smallest size of a part, as long as every worker gets some seeds.
-        share: The number of parts per process.
+
+def spread(
+    work: Callable[..., Any], arguments: tuple[Any, ...], seeds: Sequence[Any], workers: int, least: int, share: int = 4
+) -> Iterator[tuple[int, Any]]:
+    """Call ``work``, a function of this package, in worker processes: for each part of the seeds (or of other items).
+
+    With -1 workers there are as many as joblib's backend has. A process gets about ``share`` parts, none of which is
+    smaller than ``least`` as long as every process gets some seeds.
 
     Yields:
         The number of seeds of a part, and the function's result; in the order of the seeds.
@@ -58,7 +64,7 @@ def spread(
     processes = max(1, joblib.effective_n_jobs(workers))
     size = max(1, ceil(len(seeds) / (share * processes)), min(least, ceil(len(seeds) / processes)))
     parts = [list(seeds[start : start + size]) for start in range(0, len(seeds), size)]
-    parcel = packed_with_names((work, arguments))
+    parcel = _pack_with_names((work, arguments))
     try:
         parallel = joblib.Parallel(n_jobs=workers, batch_size=1, return_as="generator")
     except ValueError:  # this backend returns nothing before all work is done
@@ -78,21 +84,13 @@ def spread(
                 outcomes.close()
 
 
-def _work(parcel: bytes, seeds: list[Any]) -> Any:
-    """Call the function, in a worker."""
-    work, arguments = _unpack_with_names(parcel)
-    return work(*arguments, seeds)
-
-
-# -- names of a script ----------------------------------------------------------------------------
-
 _IN_SCRIPT: Final = re.compile(rb"__main__\.([A-Za-z_]\w*)")
 
 _received: Final[set[str]] = set()
 """The names in this process's main module that came from another process's script."""
 
 
-def packed_with_names(thing: Any) -> bytes:
+def _pack_with_names(thing: Any) -> bytes:
     """Pickle an object for workers, with the functions of this process's script that it refers to by dotted name."""
     parcel, main = pack((thing, {})), sys.modules["__main__"]
     named = {name.decode(): getattr(main, name.decode(), None) for name in set(_IN_SCRIPT.findall(parcel))}
@@ -100,12 +98,247 @@ def packed_with_names(thing: Any) -> bytes:
     return pack((thing, named)) if named else parcel
 
 
-def _unpack_with_names(parcel: bytes) -> Any:
-    """Unpickle an object, in a worker. The functions it refers to by name are put into the main module."""
-    thing, named = unpack(parcel)
+def _work(parcel: bytes, seeds: list[Any]) -> Any:
+    """Call the function, in a worker. The functions it refers to by name are put into the main module."""
+    (work, arguments), named = unpack(parcel)
     main = sys.modules["__main__"]
     for name, found in named.items():
         if name in _received or not hasattr(main, name):
             setattr(main, name, found)
             _received.add(name)
-    return thing
+    return work(*arguments, seeds)
+
+
+# -- processes of their own -----------------------------------------------------------------------
+
+SECONDS_TO_CLOSE: Final = 10.0
+"""The seconds that a worker may take to close its object and to end."""
+
+EXIT: Final = b""
+"""The message that asks a worker to end."""
+
+
+def serve(pipe: Connection, other_end: Connection | None) -> None:
+    """Answer messages in a worker, each a packed pair: a callable that makes an object, then methods, and arguments.
+
+    ``other_end`` is the user's end of the pipe, if a fork has copied it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the user's process, which decides what to do
+    if other_end is not None:
+        other_end.close()
+    made: Any = None
+
+    def answer(message: bytes) -> Any:
+        nonlocal made
+        method, arguments = unpack(message)
+        if made is not None:
+            return getattr(made, method)(*arguments)
+        made = method(*arguments)
+        return None
+
+    try:
+        while (message := pipe.recv_bytes()) != EXIT:
+            pipe.send_bytes(pack_outcome(pack_plainly, answer, message))
+    except (EOFError, OSError):  # the user's process has ended
+        pass
+    finally:
+        if made is not None:
+            made.abandon()
+
+
+class Worker:
+    """A process with some of the simulations, as its user sees it.
+
+    Attributes:
+        part: The numbers of its simulations.
+        name: Its name in messages.
+        pipe: The user's end of the pipe.
+    """
+
+    def __init__(self, context: Any, number: int, part: range) -> None:
+        """Start the process."""
+        self.part = part
+        self.name = f"worker {number} (of the sub-environments {part.start} to {part.stop - 1})"
+        self.pipe, theirs = context.Pipe()
+        copied = self.pipe if context.get_start_method() == "fork" else None
+        name = f"simenv_marl {self.name}"
+        self._process = context.Process(target=serve, args=(theirs, copied), name=name, daemon=True)
+        try:
+            self._process.start()
+        except BaseException:
+            self.pipe.close()
+            raise
+        finally:
+            theirs.close()
+
+    def send(self, message: bytes) -> None:
+        """Send a message, or raise ``WorkerError`` if the worker is dead."""
+        try:
+            self.pipe.send_bytes(message)
+        except OSError:
+            raise self._died() from None
+
+    def receive(self, seconds: float | None = None) -> tuple[Any, BaseException | None] | None:
+        """Wait for the answer: a result, or None and an error. Return None if it does not come within some seconds.
+
+        Raises:
+            WorkerError: The worker is dead.
+        """
+        if not wait([self.pipe, self._process.sentinel], seconds):
+            return None
+        try:
+            if not self.pipe.poll():
+                raise EOFError
+            parcel = self.pipe.recv_bytes()
+        except (EOFError, OSError):
+            raise self._died() from None
+        result, error = unpack_outcome(parcel)
+        if error is not None:
+            annotate(error, f"simenv_marl: in {self.name}")
+        return result, error
+
+    def _died(self) -> WorkerError:
+        """Make the error that says how the worker died."""
+        self._process.join(1.0)  # the pipe closes a moment before the process ends
+        code = self._process.exitcode
+        how = "closed its pipe" if code is None else f"died with exit code {code}"
+        script = (
+            '. In a script, make environments with workers under `if __name__ == "__main__":`, because each worker'
+            " imports the script"
+            if code == 1  # an error has ended it before it could send a message
+            else ""
+        )
+        return WorkerError(
+            f"{self.name} {how}; it was killed, or a simulation ended the process. reset() starts new workers{script}"
+        )
+
+    def stop(self, seconds: float) -> None:
+        """End the process, by force if it does not end within some seconds."""
+        self.pipe.close()
+        process = self._process
+        process.join(seconds)
+        for force in (process.terminate, process.kill):
+            if process.exitcode is None:
+                force()
+                process.join(1.0)
+        if process.exitcode is not None:
+            process.close()
+
+
+class WorkerPool:
+    """Worker processes, each of which has an object with a part of the simulations.
+
+    No wait lasts for ever: a wait for an answer also ends when the worker dies, and a worker's pipe closes when its
+    user ends.
+
+    Attributes:
+        broken: Whether a worker has died, or a wait for an answer was interrupted. Then a reset starts all anew.
+        untouched: False: if a reset or a step fails, some simulations may have moved.
+        idle: True: no simulation runs in this process.
+    """
+
+    untouched, idle = False, True
+
+    def __init__(
+        self, make: Callable[..., Any], arguments: tuple[Any, ...], number: int, workers: int, context: Any
+    ) -> None:
+        """Start at most so many workers, each of which calls ``make`` with the arguments and a range of the numbers.
+
+        ``make`` is a function of this package. It returns an object that has the methods ``close`` and ``abandon``.
+        """
+        try:
+            self._context = context
+            if not isinstance(context, BaseContext):
+                self._context = multiprocessing.get_context("spawn" if context is None else context)
+        except (TypeError, ValueError):
+            raise OptionValueError(
+                f"context must be one of {', '.join(map(repr, multiprocessing.get_all_start_methods()))}, or a context"
+                f" of multiprocessing, not {short_repr(context)}"
+            ) from None
+        cuts = [number * place // min(workers, number) for place in range(min(workers, number) + 1)]
+        try:
+            self._recipes = {part: pack_plainly((make, (*arguments, part))) for part in map(range, cuts, cuts[1:])}
+        except Exception as error:
+            raise OptionValueError(
+                "the simulation, its points or its options cannot be sent to another process"
+                f" ({describe_error(error)}); pass a class or a factory of a module, or workers=0"
+            ) from error
+        self._process = os.getpid()
+        self._workers: list[Worker] = []
+        self._start()
+
+    def _start(self) -> None:
+        """Start all workers, and have them make their objects."""
+        self.broken = True
+        try:
+            for number, part in enumerate(self._recipes):
+                self._workers.append(Worker(self._context, number, part))
+            self._exchange(self._recipes.values())
+            self.broken = False
+        except BaseException:
+            self.abandon()
+            raise
+
+    def _exchange(self, messages: Iterable[bytes]) -> list[Any]:
+        """Send each worker its message, and return the answers of all, or raise the first error."""
+        try:
+            for worker, message in zip(self._workers, messages, strict=True):
+                worker.send(message)
+            answers: list[Any] = [worker.receive() for worker in self._workers]
+        except BaseException:
+            self.broken = True
+            raise
+        for _, error in answers:
+            if error is not None:
+                raise error
+        return [result for result, _ in answers]
+
+    def ask(self, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of each worker's object; return the results, or raise the first error.
+
+        Of lists and arrays, which have an item for each simulation, each worker gets its part.
+        """
+        if os.getpid() != self._process:
+            raise WorkerError(
+                "the workers belong to the process from which this one was forked; make a new environment"
+            )
+        if self.broken and method == "reset":
+            self.abandon()
+            self._start()
+        elif self.broken:
+            raise WorkerError("a worker is dead, or a wait for it was interrupted; reset() starts new workers")
+        messages = []
+        for part in self._recipes:
+            own = [a[part.start : part.stop] if isinstance(a, (list, np.ndarray)) else a for a in arguments]
+            messages.append(pack_plainly((method, own)))
+        return self._exchange(messages)
+
+    def close(self) -> None:
+        """Close the objects and end the workers, by force after some seconds. Raise the first error of an object."""
+        deadline = monotonic() + SECONDS_TO_CLOSE
+        asked = [] if self.broken or os.getpid() != self._process else self._workers
+        answers: list[Any] = []
+        try:
+            with suppress(WorkerError):  # nothing is left to close in a worker that is dead
+                for worker in asked:
+                    worker.send(pack_plainly(("close", ())))
+                answers = [worker.receive(max(deadline - monotonic(), 0.0)) for worker in asked]
+            if None in answers:
+                warn_user(f"workers did not close within {SECONDS_TO_CLOSE} s and are killed", ResourceWarning)
+            for _, error in filter(None, answers):
+                if error is not None:
+                    raise error
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """End the workers. A finalizer may call this; it raises no errors."""
+        if os.getpid() != self._process:
+            return  # the workers belong to the process of which this one is a fork
+        workers, self._workers = self._workers, []
+        for worker in workers:
+            with suppress(OSError):
+                worker.pipe.send_bytes(EXIT)
+        deadline = monotonic() + SECONDS_TO_CLOSE
+        for worker in workers:
+            worker.stop(max(deadline - monotonic(), 0.0))

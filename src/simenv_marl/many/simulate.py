@@ -110,9 +110,10 @@ def simulate_many(
     checked = checked_seeds(seeds)
     check_numbers(batch_size, workers)
     check_collect(collect)
-    arguments = (simulation, checked_policies(policies), points, collect, int(batch_size), options)
+    episodes = simulation, checked_policies(policies), points, options
+    arguments = episodes, collect, int(batch_size)
     if workers:  # errors show up before any work starts
-        _draw_up(simulation, policies or {}, points, options)
+        _draw_up(*episodes)
     with progress_bar(len(checked)) if progress else nullcontext() as bar:
         if not workers or not checked:
             return _simulate(*arguments, checked, bar)
@@ -128,16 +129,7 @@ def _draw_up(simulation: Any, policies: Mapping[Any, Any], points: Any, options:
     return Plan(simulation, points, {**options, "policies": policy_keys(policies)}, unattended=True)
 
 
-def _simulate(
-    simulation: Any,
-    policies: Mapping[Any, Any],
-    points: Any,
-    collect: Callable[[Any], Any] | None,
-    batch_size: int,
-    options: Mapping[str, Any],
-    seeds: list[int],
-    bar: Any = None,
-) -> list[Any]:
+def _simulate(episodes: tuple[Any, ...], collect: Any, batch_size: int, seeds: list[int], bar: Any = None) -> list[Any]:
     """Simulate some of the seeds, in this process."""
     results: list[Any] = [None] * len(seeds)
 
@@ -146,7 +138,7 @@ def _simulate(
         if bar is not None:
             bar.update()
 
-    run(_draw_up(simulation, policies, points, options), seeds, batch_size, finish)
+    run(_draw_up(*episodes), seeds, batch_size, finish)
     return results
 
 

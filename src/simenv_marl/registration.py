@@ -13,7 +13,7 @@ from gymnasium.wrappers import HumanRendering, RenderCollection
 from .core.options import ViewOptions
 from .core.plan import Plan
 from .core.points import Points
-from .envs.make import vector_env, view_class
+from .envs import vector_env, view_class
 from .errors import OptionValueError, UnknownPointError, short_repr
 from .simulation import RULE
 

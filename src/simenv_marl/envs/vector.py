@@ -24,7 +24,7 @@ from ..errors import (
     short_repr,
 )
 from ..simulation import RULE
-from .one_agent import OneAgentView
+from .base import OneAgentView
 from .vector_batch import Infos, SimulationBatch, State, SubEnvironmentType, checked_actions
 from .vector_workers import WorkerPool
 

@@ -14,7 +14,7 @@ from ..core.driver import SimulationExit
 from ..core.plan import Plan
 from ..core.rng import GlobalRandom
 from ..decision import DecisionPoint
-from ..envs.make import VIEWS, view_class
+from ..envs import VIEWS, view_class
 from ..hooks.patches import Installation
 from ..hooks.stacks import outside_simulation, stack_of
 from ..simulation import make_simulation, resetter

@@ -198,5 +198,6 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         elif pending is not None:
             self.agent_selection = pending.name
 
-    def _resume(self) -> None:
+    def begin_branch(self) -> None:
+        """Prepare the environment of a branch: see ``View``."""
         self.episode.just_ended = []  # they are in the books already

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from sys import modules
 from typing import Any, ClassVar
@@ -248,14 +248,10 @@ class View:
         made = _make_again(type(self), self._plan)
         made._session.replay(self._session)
         made.__setstate__(copy.deepcopy(self._state()))
-        made._resume()
         return made
 
-    def _resume(self) -> None:
-        """Take over the session's episode in mid-episode."""
-
     def begin_branch(self) -> None:
-        """Prepare the environment of a branch."""
+        """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
 
 
 def _class_of_package(view: type[View]) -> Any:
@@ -307,8 +303,8 @@ class AgentsView(View):
         if not self._plan.complete:  # the agents of the last episode may never appear again
             self._spaces = {}
         elif seed is not None:
-            for agent in self._spaces:
-                self._seed_spaces(agent)
+            for agent, pair in self._spaces.items():
+                _seed(pair, self._session.seed, agent)
         return results
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -340,28 +336,20 @@ class AgentsView(View):
     def _make_spaces(self, agent: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         definition = self._point(agent).definition
         made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
-        if self._session.seed is not None:
-            self._seed_spaces(agent)
+        _seed(made, self._session.seed, agent)
         return made
-
-    def _seed_spaces(self, agent: str) -> None:
-        seed: Any = self._session.seed
-        for space in self._spaces[agent]:
-            seed_space(space, seed, agent)
 
     def _point(self, agent: str) -> Point:
         """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
-        point = self._plan.roster.get(agent)
-        if point is not None:
-            return point
         episode = self._session.episode
         found = None if episode is None else episode.agent(agent)
-        if found is None:
+        point = self._plan.roster.get(agent) if found is None else found.point
+        if point is None:
             raise UnknownAgentError(
                 f"there is no agent {short_repr(agent)}; the agents now are {self.agents[:10]}"
                 f"{did_you_mean(agent, self.agents)}"
             )
-        return found.point
+        return point
 
     def _observation(self, episode: Episode, agent: str) -> Any:
         found = episode.agent(agent)
@@ -386,17 +374,16 @@ class OneAgentView(View, gym.Env[Any, Any]):
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The observation space. No other environment shares it."""
-        return self._seeded(copy.deepcopy(self._definition.observation_space))
+        return self._own_space(self._definition.observation_space)
 
     @cached_property
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The action space. No other environment shares it."""
-        return self._seeded(copy.deepcopy(self._definition.action_space))
+        return self._own_space(self._definition.action_space)
 
-    def _seeded(self, space: spaces.Space[Any]) -> spaces.Space[Any]:
-        seed = self._session.np_random_seed
-        if seed is not None and seed >= 0:
-            seed_space(space, seed, self._agent)
+    def _own_space(self, shared: spaces.Space[Any]) -> spaces.Space[Any]:
+        space = copy.deepcopy(shared)
+        _seed([space], self._session.np_random_seed, self._agent)
         return space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -408,9 +395,9 @@ class OneAgentView(View, gym.Env[Any, Any]):
             The observation and the info.
         """
         results: tuple[Any, dict[str, Any]] = self._start(seed, options)
-        for name in ("observation_space", "action_space") if seed is not None else ():
-            if name in vars(self):
-                self._seeded(vars(self)[name])
+        if seed is not None:
+            made = [vars(self)[name] for name in ("observation_space", "action_space") if name in vars(self)]
+            _seed(made, self._session.seed, self._agent)
         return results
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -437,3 +424,9 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     def _all_spaces(self) -> dict[str, spaces.Space[Any]]:
         return {self._agent: self.observation_space}
+
+
+def _seed(owned: Iterable[spaces.Space[Any]], seed: int | None, agent: str) -> None:
+    """Seed spaces of an agent, if there is a seed."""
+    for space in owned if seed is not None and seed >= 0 else ():
+        seed_space(space, seed, agent)

@@ -192,12 +192,13 @@ def _concatenate(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
 
 def _concatenate_actions(parts: list[Any]) -> spaces.Space[Any]:
     """Return the space of concatenated actions, which must be all continuous or all discrete."""
-    discrete = [isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)) and np.ndim(space.start) < 2 for space in parts]
-    if not any(discrete):
+    kinds = (spaces.Discrete, spaces.MultiDiscrete)
+    discrete = [space for space in parts if isinstance(space, kinds) and np.ndim(space.start) < 2]
+    if not discrete:
         return _concatenate(parts)
-    if not all(discrete):
-        kinds = ", ".join(map(str, parts))
-        raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {kinds}")
-    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in parts]
-    starts = [np.atleast_1d(space.start) for space in parts]
+    if len(discrete) < len(parts):
+        given = ", ".join(map(str, parts))
+        raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {given}")
+    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in discrete]
+    starts = [np.atleast_1d(space.start) for space in discrete]
     return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))

@@ -36,7 +36,7 @@ class SimulationEnv(OneAgentView):
         self._agent = str(plan.one_agent)
         self._definition = self._session.plan.active[0].definition
         if self._session.episode is not None:
-            self._resume()
+            self._begin(self._session.episode)
 
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
@@ -116,7 +116,8 @@ class SimulationEnv(OneAgentView):
         self._own = episode.agent(self._agent)
         return self._own.observation, self._own.info
 
-    def _resume(self) -> None:
+    def begin_branch(self) -> None:
+        """Prepare the environment of a branch: see ``View``."""
         self._begin(self.episode)
 
     def _clear(self) -> None:
@@ -141,14 +142,14 @@ class PlannerEnv(SimulationEnv):
         View.__init__(self, plan, session)
         self._shows = self._branched = False
         if session is not None:
-            self._resume()
+            self._find_agent()
 
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
         """Allow every plan: the agent is the one whose planner is being asked."""
         return plan
 
-    def _resume(self) -> None:
+    def _find_agent(self) -> None:
         episode: Any = self.episode
         self._own = episode.consulted or episode.pending
         self._agent, self._definition = self._own.name, self._own.point.definition
@@ -166,6 +167,7 @@ class PlannerEnv(SimulationEnv):
         """Turn this environment into a branch that waits for the agent only."""
         if not self._branched:
             self._branched = True
+            self._find_agent()
             self._session.step_out()
             single_out(self.episode, self._own)
 
@@ -178,22 +180,26 @@ class PlannerEnv(SimulationEnv):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """In a branch, answer the pending decision and run to the agent's next one."""
         if not self._branched:
-            raise ReentrancyError(
-                "a policy answers by what it returns; call step(action) only on branches of this environment"
-            )
+            raise _refusal("step")
         return super().step(action)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
         """Refuse the reset: this is the environment of one decision."""
-        raise ReentrancyError("a policy cannot reset the environment that it is given; it must return an action")
+        raise _refusal("reset")
 
     def close(self) -> None:
         """End a branch."""
         if not self._branched:
-            raise ReentrancyError("a policy cannot close the environment that it is given; it must return an action")
+            raise _refusal("close")
         super().close()
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         raise CopyError("the environment that a policy is given cannot be copied; use branch to continue it")
 
     __deepcopy__ = __reduce_ex__  # type: ignore[assignment]
+
+
+def _refusal(use: str) -> ReentrancyError:
+    return ReentrancyError(
+        f"a policy cannot {use} the environment that it is given: it must return an action; branch tries actions out"
+    )

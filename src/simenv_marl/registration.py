@@ -101,7 +101,8 @@ def make_view(recipe: str, module: str, view: str, point: str | None = None, **o
     simulation, points, options = _recall(recipe, module, view, point, options)
     mode = options.pop("render_mode", None)
     plan = Plan.draw_up(simulation, points, options)
-    modes, wrapper = plan.model.render_modes, None
+    modes = plan.model.render_modes
+    wrapper: Any = None
     if view in ("single", "joint") and isinstance(mode, str) and mode not in modes:
         if mode.endswith("_list") and mode.removesuffix("_list") in modes:
             mode, wrapper = mode.removesuffix("_list"), RenderCollection

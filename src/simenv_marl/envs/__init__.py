@@ -17,13 +17,9 @@ from .single import SimulationEnv
 from .vector import SimulationVectorEnv
 
 __all__ = [
-    "SimulationAECEnv",
-    "SimulationEnv",
-    "SimulationJointEnv",
-    "SimulationParallelEnv",
-    "SimulationVectorEnv",
+    "SimulationAECEnv", "SimulationEnv", "SimulationJointEnv", "SimulationParallelEnv", "SimulationVectorEnv",
     "pad_agents",
-]
+]  # fmt: skip
 
 VIEWS: Final[dict[str, Any]] = {
     "aec": SimulationAECEnv,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cached_property
 from sys import modules
 from typing import Any, ClassVar
@@ -41,6 +41,7 @@ class View:
     _option: ClassVar[str | None] = None  # the option that only this view takes
     _in_rounds: ClassVar[bool] = False  # whether all agents are updated when a step returns
     _finalizer: Any = None
+    _set_up: Callable[[], None]  # completes what is made
     _begin: Callable[[Episode], Any]  # makes the records of a new episode, and returns the results of its reset
     _all_spaces: Callable[[], dict[str, spaces.Space[Any]]]  # returns the observation spaces of all possible agents
     _observation: Callable[[Episode, str], Any]  # returns a copy of an agent's latest observation
@@ -61,6 +62,7 @@ class View:
         self.render_mode = plan.options.render_mode
         self._shows = self.render_mode == "human"  # render after every reset and step
         self._clear()
+        self._set_up()
 
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
@@ -112,11 +114,17 @@ class View:
 
     # -- the state --------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def state_space(self) -> spaces.Space[Any] | None:
         """The space of ``state()``, if the environment was made with one."""
         space = self._plan.options.state_space
-        return self._observed_together[1] if isinstance(space, str) else space
+        if not isinstance(space, str):
+            return space
+        parts = spaces.Tuple(self._all_spaces().values())
+        together = spaces.flatten_space(parts)
+        if not isinstance(together, spaces.Box):
+            raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
+        return together
 
     def state(self) -> Any:
         """Return the state of the simulation, for centralised critics, from the simulation's own ``state()``.
@@ -130,8 +138,8 @@ class View:
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
         if isinstance(self._plan.options.state_space, str):
-            parts, episode = self._observed_together[0], self.episode
-            value = spaces.flatten(parts, tuple(self._observation(episode, agent) for agent in self._all_spaces()))
+            episode, parts = self.episode, self._all_spaces().items()
+            value = np.concatenate([spaces.flatten(part, self._observation(episode, agent)) for agent, part in parts])
         else:
             tell = getattr(self.simulation, "state", None)
             if not callable(tell):
@@ -139,15 +147,6 @@ class View:
             with self._session.context():
                 value = tell()
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
-
-    @cached_property
-    def _observed_together(self) -> tuple[spaces.Tuple[Any], spaces.Space[Any]]:
-        """The spaces of all observations, and the space of their concatenation."""
-        parts = spaces.Tuple(self._all_spaces().values())
-        together = spaces.flatten_space(parts)
-        if not isinstance(together, spaces.Box):
-            raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
-        return parts, together
 
     # -- episodes ---------------------------------------------------------------------------------
 
@@ -222,7 +221,7 @@ class View:
         for name in view.__qualname__.split("."):
             found = getattr(found, name, None)
         if found is not view:  # a class that generate_env made and that its name does not lead to
-            view = _class_of_package(view)
+            view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
         return _make_again, (view, self._plan), self._state()
 
     def _state(self) -> dict[str, Any]:
@@ -254,15 +253,10 @@ class View:
         """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
 
 
-def _class_of_package(view: type[View]) -> Any:
-    """Return the class of this package from which a generated class is derived."""
-    return next(base for base in view.__mro__ if base.__module__.startswith(__package__))
-
-
 def _make_again(view: type[View], plan: Plan) -> View:
-    """Make an environment of a class from its plan alone."""
+    """Make an environment of a class from its plan alone. Generated classes have other arguments."""
     made = view.__new__(view)
-    _class_of_package(view).__init__(made, plan)
+    View.__init__(made, plan)
     return made
 
 
@@ -276,11 +270,9 @@ class AgentsView(View):
 
     agents: list[str]
 
-    def __init__(self, plan: Plan) -> None:
-        """Make the view of a plan: see ``View``."""
-        super().__init__(plan)
-        if plan.possible_agents is not None:
-            self.possible_agents = plan.possible_agents
+    def _set_up(self) -> None:
+        if self._plan.possible_agents is not None:
+            self.possible_agents = self._plan.possible_agents
         self._spaces: dict[str, tuple[spaces.Space[Any], spaces.Space[Any]]] = {}
 
     @classmethod
@@ -303,8 +295,7 @@ class AgentsView(View):
         if not self._plan.complete:  # the agents of the last episode may never appear again
             self._spaces = {}
         elif seed is not None:
-            for agent, pair in self._spaces.items():
-                _seed(pair, self._session.seed, agent)
+            self._seed_spaces(self._spaces)
         return results
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
@@ -336,8 +327,14 @@ class AgentsView(View):
     def _make_spaces(self, agent: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
         definition = self._point(agent).definition
         made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
-        _seed(made, self._session.seed, agent)
+        self._seed_spaces({agent: made})
         return made
+
+    def _seed_spaces(self, made: dict[str, tuple[spaces.Space[Any], spaces.Space[Any]]]) -> None:
+        seed: Any = self._session.seed
+        for agent, pair in made.items() if seed is not None else ():
+            for space in pair:
+                seed_space(space, seed, agent)
 
     def _point(self, agent: str) -> Point:
         """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
@@ -382,8 +379,9 @@ class OneAgentView(View, gym.Env[Any, Any]):
         return self._own_space(self._definition.action_space)
 
     def _own_space(self, shared: spaces.Space[Any]) -> spaces.Space[Any]:
-        space = copy.deepcopy(shared)
-        _seed([space], self._session.np_random_seed, self._agent)
+        space, seed = copy.deepcopy(shared), self._session.np_random_seed
+        if seed is not None and seed >= 0:
+            seed_space(space, seed, self._agent)
         return space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -395,9 +393,9 @@ class OneAgentView(View, gym.Env[Any, Any]):
             The observation and the info.
         """
         results: tuple[Any, dict[str, Any]] = self._start(seed, options)
-        if seed is not None:
-            made = [vars(self)[name] for name in ("observation_space", "action_space") if name in vars(self)]
-            _seed(made, self._session.seed, self._agent)
+        for name in ("observation_space", "action_space") if seed is not None else ():
+            if name in vars(self):
+                seed_space(vars(self)[name], self._session.seed, self._agent)  # type: ignore[arg-type]
         return results
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -424,9 +422,3 @@ class OneAgentView(View, gym.Env[Any, Any]):
 
     def _all_spaces(self) -> dict[str, spaces.Space[Any]]:
         return {self._agent: self.observation_space}
-
-
-def _seed(owned: Iterable[spaces.Space[Any]], seed: int | None, agent: str) -> None:
-    """Seed spaces of an agent, if there is a seed."""
-    for space in owned if seed is not None and seed >= 0 else ():
-        seed_space(space, seed, agent)

@@ -11,7 +11,6 @@ from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import Point
-from ..core.session import Session
 from ..core.spaces import duplicate
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE
@@ -120,12 +119,10 @@ class SimulationJointEnv(OneAgentView):
     _in_rounds = True
     _agent = "joint"
 
-    def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan: see ``View``. If not all agents are declared, this takes a reset."""
-        super().__init__(plan, session)
-        if not plan.complete:
-            self._plan = self._session.plan = self._declared(plan)
-        self.joint = self._definition = Joint(self._plan.roster, flatten=plan.options.flatten)
+    def _set_up(self) -> None:
+        if not self._plan.complete:
+            self._plan = self._session.plan = self._declared(self._plan)
+        self.joint = self._definition = Joint(self._plan.roster, flatten=self._plan.options.flatten)
 
     def _declared(self, plan: Plan) -> Plan:
         """Return the same plan with the agents that the simulation announces after a reset."""

@@ -40,15 +40,23 @@ def _is_present(agent: Agent) -> bool:
     return agent.present and not agent.ended
 
 
-def _info(agent: Agent, info: dict[str, Any]) -> dict[str, Any]:
-    """The info of an agent, with the entry ``"present"``. An absent agent has all actions legal."""
-    present = _is_present(agent)
-    if not present:
-        agent.clear_observation()
-        if agent.ended:
-            agent.observation = None  # so that ``state`` has blanks, too
-        info = agent.info | {key: info[key] for key in ("deciding", "acted") if key in info}
-    return {**info, "present": present}
+def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any], idle: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the rewards, terminations, truncations and infos of all possible agents, from those of the live ones.
+
+    ``idle`` is what the infos of agents that are not present have besides the open mask and the time.
+    """
+    episode, roster, padded = view.episode, view.possible_agents, {}
+    for name in roster:
+        agent: Any = episode.agent(name)
+        info, present = infos.get(name, idle), _is_present(agent)
+        if not present:
+            agent.clear_observation()
+            if agent.ended:
+                agent.observation = None  # so that ``state`` has blanks, too
+            info = agent.info | {key: info[key] for key in idle}
+        padded[name] = {**info, "present": present}
+    terminations, truncations = dict.fromkeys(roster, episode.terminated), dict.fromkeys(roster, episode.truncated)
+    return {name: rewards.get(name, 0.0) for name in roster}, terminations, truncations, padded
 
 
 class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
@@ -77,18 +85,10 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
 
     def _padded(self, results: Results) -> Results:
         """Add the agents that are not present to the results of a round, and let all agents end together."""
-        episode, roster = self.unwrapped.episode, self.possible_agents
-        observations, rewards, _, _, infos = results
-        found = {name: episode.agent(name) for name in roster}
-        absent = {name: agent.point.blank() for name, agent in found.items() if not _is_present(agent)}
-        idle = {"deciding": False, "acted": False}
-        return (
-            {name: absent[name] if name in absent else observations[name] for name in roster},
-            {name: rewards.get(name, 0.0) for name in roster},
-            dict.fromkeys(roster, episode.terminated),
-            dict.fromkeys(roster, episode.truncated),
-            {name: _info(agent, infos.get(name, idle)) for name, agent in found.items()},
-        )
+        view, (observations, rewards, _, _, infos) = self.unwrapped, results
+        agents = {name: view.episode.agent(name) for name in view.possible_agents}
+        padded = {name: observations[name] if _is_present(a) else a.point.blank() for name, a in agents.items()}
+        return padded, *_pad(view, rewards, infos, {"deciding": False, "acted": False})
 
 
 class PaddedAECEnv(BaseWrapper[str, Any, Any]):
@@ -128,14 +128,11 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
 
     def _update(self) -> None:
         """Read the rewards, infos and ends of a reset or a step."""
-        env, roster, episode = self.env, self.possible_agents, self.unwrapped.episode
-        infos = {name: env.infos.get(name, {}) for name in roster}
-        self.rewards = {name: env.rewards.get(name, 0.0) for name in roster}
+        env, episode = self.env, self.unwrapped.episode
+        rewards, infos = dict(env.rewards), dict(env.infos)
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
+        self.rewards, self.terminations, self.truncations, self.infos = _pad(self.unwrapped, rewards, infos, {})
         for name, reward in self.rewards.items():
             self._cumulative_rewards[name] += reward
-        self.infos = {name: _info(episode.agent(name), info) for name, info in infos.items()}
-        self.terminations = dict.fromkeys(roster, episode.terminated)
-        self.truncations = dict.fromkeys(roster, episode.truncated)
         self.agent_selection = self.agents[0] if episode.over else env.agent_selection

@@ -15,9 +15,8 @@ from ..core.delegation import single_out
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import asks_for_simulation
-from ..core.session import Session
 from ..errors import BranchError, CopyError, ReentrancyError, ViewError
-from .base import OneAgentView, View
+from .base import OneAgentView
 
 
 class SimulationEnv(OneAgentView):
@@ -30,10 +29,8 @@ class SimulationEnv(OneAgentView):
     _option = "agent"
     _own: Any = None  # its agent during an episode
 
-    def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan: see ``View``."""
-        super().__init__(plan, session)
-        self._agent = str(plan.one_agent)
+    def _set_up(self) -> None:
+        self._agent = str(self._plan.one_agent)
         self._definition = self._session.plan.active[0].definition
         if self._session.episode is not None:
             self._begin(self._session.episode)
@@ -137,11 +134,9 @@ class PlannerEnv(SimulationEnv):
     can be stepped; policies or rules answer for all other agents.
     """
 
-    def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the view of a session in whose episode a planner is being asked; None: of a new session, to replay."""
-        View.__init__(self, plan, session)
+    def _set_up(self) -> None:
         self._shows = self._branched = False
-        if session is not None:
+        if self._session.episode is not None:  # otherwise the session is going to replay one
             self._find_agent()
 
     @classmethod

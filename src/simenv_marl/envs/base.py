@@ -24,7 +24,10 @@ from ..core.spaces import duplicate, observation_cast
 from ..errors import UnknownAgentError, UnknownOptionError, ViewError, did_you_mean, short_repr
 from ..hooks.plugins import Entry
 
-_OWN = frozenset(("_deciding", "_definition", "_finalizer", "_own", "_plan", "_session", "joint", "metadata"))
+Spaces = tuple[spaces.Space[Any], spaces.Space[Any]]
+"""An observation space and an action space."""
+
+_OWN = frozenset(("_definition", "_finalizer", "_own", "_plan", "_session", "joint", "metadata"))
 """The attributes that no copy takes over."""
 
 
@@ -61,6 +64,7 @@ class View:
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
         self._shows = self.render_mode == "human"  # render after every reset and step
+        self._spaces: dict[str, Spaces] = {}  # by agent
         self._clear()
         self._set_up()
 
@@ -187,6 +191,10 @@ class View:
                 self._finalizer = weakref.finalize(self, session.abandon)
             self._end(session.end)
             results = self._begin(session.start(seed, options, in_rounds=self._in_rounds))
+            if not self._plan.complete:  # the agents of the last episode may never appear again
+                self._spaces = {}
+            for agent in self._spaces if seed is not None else ():
+                self._seed_spaces(agent)
             if self._shows:
                 self.render()
             return results
@@ -202,6 +210,17 @@ class View:
 
     def _clear(self) -> None:
         """Forget the records of the episode."""
+
+    def _make_spaces(self, agent: str, definition: Any) -> Spaces:
+        """Make the spaces of an agent, which no other environment shares, on demand: many may never need them."""
+        made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
+        self._seed_spaces(agent)
+        return made
+
+    def _seed_spaces(self, agent: str) -> None:
+        seed: Any = self._session.seed
+        for space in self._spaces[agent] if seed is not None else ():
+            seed_space(space, seed, agent)
 
     # -- copies -----------------------------------------------------------------------------------
 
@@ -273,7 +292,6 @@ class AgentsView(View):
     def _set_up(self) -> None:
         if self._plan.possible_agents is not None:
             self.possible_agents = self._plan.possible_agents
-        self._spaces: dict[str, tuple[spaces.Space[Any], spaces.Space[Any]]] = {}
 
     @classmethod
     def adapt(cls, plan: Plan) -> Plan:
@@ -289,26 +307,17 @@ class AgentsView(View):
         """Return the metadata of a plan's environments. The order of agents is an order of rounds only in rounds."""
         return super().metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
 
-    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
-        """Begin an episode as ``View`` does, and seed the agents' spaces."""
-        results = super()._start(seed, options)
-        if not self._plan.complete:  # the agents of the last episode may never appear again
-            self._spaces = {}
-        elif seed is not None:
-            self._seed_spaces(self._spaces)
-        return results
-
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The observation space of an agent. It is always the same object, and no other environment shares it.
 
         Raises:
             UnknownAgentError: There is no such agent.
         """
-        return (self._spaces.get(agent) or self._make_spaces(agent))[0]
+        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """The action space of an agent, as ``observation_space`` returns the observation space."""
-        return (self._spaces.get(agent) or self._make_spaces(agent))[1]
+        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[1]
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
@@ -323,18 +332,6 @@ class AgentsView(View):
     def action_spaces(self) -> dict[str, spaces.Space[Any]]:
         """The action spaces of all possible agents, as ``observation_spaces`` has the observation spaces."""
         return {agent: self.action_space(agent) for agent in self.possible_agents}
-
-    def _make_spaces(self, agent: str) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        definition = self._point(agent).definition
-        made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
-        self._seed_spaces({agent: made})
-        return made
-
-    def _seed_spaces(self, made: dict[str, tuple[spaces.Space[Any], spaces.Space[Any]]]) -> None:
-        seed: Any = self._session.seed
-        for agent, pair in made.items() if seed is not None else ():
-            for space in pair:
-                seed_space(space, seed, agent)
 
     def _point(self, agent: str) -> Point:
         """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
@@ -366,23 +363,15 @@ class OneAgentView(View, gym.Env[Any, Any]):
     _deciders: Callable[[Episode], list[Agent]]  # returns the agents whose decisions a step answers
     _np_random, _np_random_seed = View.np_random, View.np_random_seed  # where Gymnasium's checks look
 
-    # The spaces are made on demand, because many simulations side by side may never need them.
-
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The observation space. No other environment shares it."""
-        return self._own_space(self._definition.observation_space)
+        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[0]
 
     @cached_property
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The action space. No other environment shares it."""
-        return self._own_space(self._definition.action_space)
-
-    def _own_space(self, shared: spaces.Space[Any]) -> spaces.Space[Any]:
-        space, seed = copy.deepcopy(shared), self._session.np_random_seed
-        if seed is not None and seed >= 0:
-            seed_space(space, seed, self._agent)
-        return space
+        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[1]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the simulation and run it to its first decision.
@@ -392,11 +381,8 @@ class OneAgentView(View, gym.Env[Any, Any]):
         Returns:
             The observation and the info.
         """
-        results: tuple[Any, dict[str, Any]] = self._start(seed, options)
-        for name in ("observation_space", "action_space") if seed is not None else ():
-            if name in vars(self):
-                seed_space(vars(self)[name], self._session.seed, self._agent)  # type: ignore[arg-type]
-        return results
+        observation, info = self._start(seed, options)
+        return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """The mask of the legal actions, in the form that ``MaskablePPO`` of sb3-contrib expects.

@@ -9,7 +9,6 @@ from gymnasium import spaces
 
 from ..core.agent import Agent
 from ..core.episode import Episode
-from ..core.plan import Plan
 from ..core.point import Point
 from ..core.spaces import duplicate
 from ..errors import InvalidActionError, ViewError, short_repr
@@ -120,26 +119,22 @@ class SimulationJointEnv(OneAgentView):
     _agent = "joint"
 
     def _set_up(self) -> None:
-        if not self._plan.complete:
-            self._plan = self._session.plan = self._declared(self._plan)
-        self.joint = self._definition = Joint(self._plan.roster, flatten=self._plan.options.flatten)
-
-    def _declared(self, plan: Plan) -> Plan:
-        """Return the same plan with the agents that the simulation announces after a reset."""
         session = self._session
-        if not hasattr(session.simulation, "expected_calls"):
+        if not self._plan.complete:
+            if not hasattr(session.simulation, "expected_calls"):
+                session.close()
+                points = ", ".join(point.point.name for point in self._plan.active if point.agent is None)
+                raise ViewError(
+                    "all agents must be known when the environment is made, and a callable names those of"
+                    f" {points}; declare them with possible_agents=, let the simulation announce them"
+                    " (expected_calls), or name the one agent of a single view with agent="
+                )
+            agents = session.start(0, None, in_rounds=True).agents
+            roster = {name: agent.point for name, agent in agents.items()}
             session.close()
-            points = ", ".join(point.point.name for point in plan.active if point.agent is None)
-            raise ViewError(
-                f"all agents must be known when the environment is made, and a callable names those of {points};"
-                " declare them with possible_agents=, let the simulation announce them (expected_calls), or name"
-                " the one agent of a single view with agent="
-            )
-        agents = session.start(0, None, in_rounds=True).agents
-        roster = {name: agent.point for name, agent in agents.items()}
-        session.close()
-        session.np_random_seed = None
-        return plan.declared(roster)
+            session.seed = session.np_random_seed = None
+            self._plan = session.plan = self._plan.declared(roster)
+        self.joint = self._definition = Joint(self._plan.roster, flatten=self._plan.options.flatten)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a round with an action for each agent.

@@ -20,11 +20,7 @@ from .base import OneAgentView
 
 
 class SimulationEnv(OneAgentView):
-    """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``.
-
-    Attributes:
-        observation_space, action_space: The agent's spaces, which this environment does not share.
-    """
+    """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``."""
 
     _option = "agent"
     _own: Any = None  # its agent during an episode

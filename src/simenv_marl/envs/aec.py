@@ -134,6 +134,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                     agent.clear_observation()
                 self._join(agent)
         self._record(episode)
+        episode.unreported_end = False  # the books report it
 
     def _join(self, agent: Agent) -> None:
         """Enter an agent in the books."""

@@ -193,8 +193,8 @@ class View:
             results = self._begin(session.start(seed, options, in_rounds=self._in_rounds))
             if not self._plan.complete:  # the agents of the last episode may never appear again
                 self._spaces = {}
-            for agent in self._spaces if seed is not None else ():
-                self._seed_spaces(agent)
+            for agent in self._spaces:
+                self._seed_spaces(agent, seed)
             if self._shows:
                 self.render()
             return results
@@ -211,16 +211,16 @@ class View:
     def _clear(self) -> None:
         """Forget the records of the episode."""
 
-    def _make_spaces(self, agent: str, definition: Any) -> Spaces:
+    def _make_spaces(self, agent: str, definition: Any, seed: int | None) -> Spaces:
         """Make the spaces of an agent, which no other environment shares, on demand: many may never need them."""
         made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
-        self._seed_spaces(agent)
+        self._seed_spaces(agent, seed)
         return made
 
-    def _seed_spaces(self, agent: str) -> None:
-        seed: Any = self._session.seed
-        for space in self._spaces[agent] if seed is not None else ():
-            seed_space(space, seed, agent)
+    def _seed_spaces(self, agent: str, seed: int | None) -> None:
+        if seed is not None and seed >= 0:
+            for space in self._spaces[agent]:
+                seed_space(space, seed, agent)
 
     # -- copies -----------------------------------------------------------------------------------
 
@@ -313,11 +313,11 @@ class AgentsView(View):
         Raises:
             UnknownAgentError: There is no such agent.
         """
-        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[0]
+        return (self._spaces.get(agent) or self._own_spaces(agent))[0]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """The action space of an agent, as ``observation_space`` returns the observation space."""
-        return (self._spaces.get(agent) or self._make_spaces(agent, self._point(agent).definition))[1]
+        return (self._spaces.get(agent) or self._own_spaces(agent))[1]
 
     @property
     def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
@@ -332,6 +332,9 @@ class AgentsView(View):
     def action_spaces(self) -> dict[str, spaces.Space[Any]]:
         """The action spaces of all possible agents, as ``observation_spaces`` has the observation spaces."""
         return {agent: self.action_space(agent) for agent in self.possible_agents}
+
+    def _own_spaces(self, agent: str) -> Spaces:
+        return self._make_spaces(agent, self._point(agent).definition, self._session.seed)
 
     def _point(self, agent: str) -> Point:
         """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
@@ -366,12 +369,16 @@ class OneAgentView(View, gym.Env[Any, Any]):
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The observation space. No other environment shares it."""
-        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[0]
+        return self._own_spaces()[0]
 
     @cached_property
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The action space. No other environment shares it."""
-        return (self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition))[1]
+        return self._own_spaces()[1]
+
+    def _own_spaces(self) -> Spaces:
+        seed = self._session.np_random_seed
+        return self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition, seed)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the simulation and run it to its first decision.

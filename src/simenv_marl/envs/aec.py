@@ -72,9 +72,10 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             if episode.over:  # an error has ended it
                 self._clear()
             raise
-        self._cumulative_rewards[self.agent_selection] = 0.0
-        for name in self._rewarded:
-            self.rewards[name] = 0.0
+        selected = self.agent_selection
+        self.rewards[selected] = self._cumulative_rewards[selected] = 0.0
+        if self._rewarded:
+            self._clear_rewards()
         self._record(episode)
         if self._shows:
             self.render()
@@ -120,7 +121,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.agents = []
         self._places: dict[str, int] = {}  # of the agents, in the list of agents
         self._leaving: list[str] = []  # agents that have ended, and whose None step is to come, the next one last
-        self._rewarded: list[str] = []  # agents that the latest step has rewarded
+        self._rewarded: list[str] = []  # agents besides the selected one that the latest step has rewarded
         self.rewards: dict[str, float] = {}
         self._cumulative_rewards: dict[str, float] = {}
         self.terminations: dict[str, bool] = {}
@@ -147,7 +148,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
 
     def _record(self, episode: Episode) -> None:
         """Record the ends and the pending decision of a reset or a step."""
-        pending, rewarded = episode.pending, []
+        pending = episode.pending
         if pending is None or episode.just_ended:
             ended = [(agent, True, False) for agent in episode.just_ended]
             if episode.over:
@@ -162,8 +163,8 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                 self._cumulative_rewards[name] += agent.reward
                 self.infos[name] = agent.info
                 self.terminations[name], self.truncations[name] = terminated, truncated
-                rewarded.append(name)
-            self._leaving = rewarded[::-1]
+                self._rewarded.append(name)
+            self._leaving = self._rewarded[::-1]
             episode.just_ended = []
         if pending is not None:
             name = pending.name
@@ -172,9 +173,16 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             # It has had no other reward since its last step.
             self.rewards[name] = self._cumulative_rewards[name] = pending.reward
             self.infos[name] = pending.info
-            rewarded.append(name)
-        self._rewarded = rewarded
-        self.agent_selection = self._leaving[-1] if self._leaving else name
+        if self._leaving:
+            self._rewarded.append(name)
+            name = self._leaving[-1]
+        self.agent_selection = name
+
+    def _clear_rewards(self) -> None:
+        """Reset the rewards of the previous step."""
+        for name in self._rewarded:
+            self.rewards[name] = 0.0
+        self._rewarded = []
 
     def _dead_step(self, action: Any) -> None:
         """Take the final step of an agent that has ended."""
@@ -183,9 +191,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
                 f"the episode of {self.agent_selection!r} has ended: its only legal action is None, not"
                 f" {short_repr(action)}"
             )
-        for name in self._rewarded:
-            self.rewards[name] = 0.0
-        self._rewarded = []
+        self._clear_rewards()
         name = self._leaving.pop()
         for book in (self.rewards, self._cumulative_rewards, self.terminations, self.truncations, self.infos):
             del book[name]

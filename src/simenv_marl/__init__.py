@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from .core.branching import branch
     from .core.rng import reseed_generators
     from .decision import Definition, difference, make_step
-    from .envs.make import aec_env, generate_env, joint_env, parallel_env, single_env, vector_env
+    from .envs import aec_env, generate_env, joint_env, parallel_env, single_env, vector_env
     from .errors import SimEnvError
     from .experiments.evaluation import evaluate
     from .many.simulate import simulate, simulate_many
@@ -59,7 +59,7 @@ _MODULES = {
     "core.branching": ("branch",),
     "core.rng": ("reseed_generators",),
     "decision": ("Definition", "difference", "make_step"),
-    "envs.make": ("aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "vector_env"),
+    "envs": ("aec_env", "generate_env", "joint_env", "parallel_env", "single_env", "vector_env"),
     "errors": ("SimEnvError",),
     "experiments.evaluation": ("evaluate",),
     "many.simulate": ("simulate", "simulate_many"),

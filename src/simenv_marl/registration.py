@@ -3,8 +3,7 @@
 import importlib
 import re
 import sys
-from dataclasses import replace
-from typing import Any, NamedTuple, Unpack
+from typing import Any, Unpack
 
 import gymnasium
 import pettingzoo
@@ -13,22 +12,12 @@ from gymnasium.wrappers import HumanRendering, RenderCollection
 from .core.options import ViewOptions
 from .core.plan import Plan
 from .core.points import Points
-from .envs.make import vector_env, view_class
+from .envs import vector_env, view_class
 from .errors import OptionValueError, UnknownPointError, short_repr
 from .simulation import RULE
 
-
-class _Recipe(NamedTuple):
-    """What ``register_simulation`` was given, and the names of the active decision points."""
-
-    simulation: Any
-    points: Any
-    options: dict[str, Any]
-    active: list[str]
-
-
-_RECIPES: dict[str, _Recipe] = {}
-"""The recipes of the entry points below, by name and version."""
+_RECIPES: dict[str, tuple[Any, Any, dict[str, Any], list[str]]] = {}
+"""What ``register_simulation`` was given, and the names of the active decision points, by name and version."""
 
 
 def register_simulation(
@@ -55,37 +44,32 @@ def register_simulation(
     Raises:
         SimEnvError: Something cannot work. The subclass tells what.
     """
-    is_variant = hasattr(simulation, "environment_arguments")
     if name is None:
-        if not is_variant:
+        if not hasattr(simulation, "environment_arguments"):  # it is not a variant
             raise OptionValueError("register_simulation needs a name= for the ids")
         name = simulation.name
     if not isinstance(name, str) or not re.fullmatch(r"[\w-]+", name):
         raise OptionValueError(f"name must consist of letters, digits, _ and -, not {short_repr(name)}")
     if isinstance(version, bool) or not isinstance(version, int) or version < 0:
         raise OptionValueError(f"version must be a non-negative integer, not {short_repr(version)}")
-    if is_variant and "flatten" in simulation.options:  # an option of the joint view alone
-        others = dict(simulation.options)
-        options.setdefault("flatten", others.pop("flatten"))
-        simulation = replace(simulation, options=others)
     plan = Plan(simulation, points, options)
     recipe = f"{name}-v{version}"
-    where = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
-    _RECIPES[recipe] = _Recipe(simulation, points, dict(options), [point.point.name for point in plan.active])
+    _RECIPES[recipe] = simulation, points, dict(options), [point.point.name for point in plan.active]
     named = [point.point.name for point in plan.active if point.agent is not None or plan.one_agent is not None]
-    made: list[str] = []
-    single = [(title, {"view": "single", "point": point}) for point, title in zip(named, _titles(named), strict=True)]
+    views = {title: {"view": "single", "point": point} for point, title in zip(named, _titles(named), strict=True)}
     entry, vector_entry = f"{__name__}:make_view", f"{__name__}:make_vector_view"
-    for title, kwargs in [*single, ("Joint", {"view": "joint"})]:
+    where = {"recipe": recipe, "module": sys._getframe(1).f_globals.get("__name__", "__main__")}
+    made: list[str] = []
+    for title, kwargs in {**views, "Joint": {"view": "joint"}}.items():
         made.append(f"{name}/{title}-v{version}")
         gymnasium.registry.pop(made[-1], None)  # it may be registered again, as when a notebook's cell is rerun
         gymnasium.register(made[-1], entry, vector_entry_point=vector_entry, kwargs=where | kwargs)
     register: Any = getattr(pettingzoo, "register", None)
     if register is not None:  # PettingZoo has a registry since 1.26
+        made.append(f"{name}/coop_v{version}")
         for view in ("aec", "parallel"):
             getattr(pettingzoo, f"{view}_registry", {}).pop(f"{name}/coop-v{version}", None)
-            register(view, f"{name}/coop_v{version}", entry, kwargs=where | {"view": view})
-        made.append(f"{name}/coop_v{version}")
+            register(view, made[-1], entry, kwargs=where | {"view": view})
     return made
 
 
@@ -114,14 +98,15 @@ def make_view(recipe: str, module: str, view: str, point: str | None = None, **o
     Gymnasium reads render modes from the metadata of a class, which an entry point for many simulations lacks.
     Therefore this applies the wrapper by which Gymnasium supplies a render mode that the simulation lacks.
     """
-    known, options = _recipe(recipe, module, view, point, options)
+    simulation, points, options = _recall(recipe, module, view, point, options)
     mode = options.pop("render_mode", None)
-    plan = Plan(known.simulation, known.points, options)
+    plan = Plan(simulation, points, options)
+    modes = plan.render_modes
     wrapper: Any = None
-    if view in ("single", "joint") and isinstance(mode, str) and mode not in plan.render_modes:
-        if mode.endswith("_list") and mode.removesuffix("_list") in plan.render_modes:
+    if view in ("single", "joint") and isinstance(mode, str) and mode not in modes:
+        if mode.endswith("_list") and mode.removesuffix("_list") in modes:
             mode, wrapper = mode.removesuffix("_list"), RenderCollection
-        elif mode == "human" and "rgb_array" in plan.render_modes:
+        elif mode == "human" and "rgb_array" in modes:
             mode, wrapper = "rgb_array", HumanRendering
     env = view_class(plan, view)(plan.amended({"render_mode": mode}))
     return env if wrapper is None else wrapper(env)
@@ -129,29 +114,28 @@ def make_view(recipe: str, module: str, view: str, point: str | None = None, **o
 
 def make_vector_view(recipe: str, module: str, view: str, point: str | None = None, **options: Any) -> Any:
     """Make a vector environment. ``max_episode_steps``, which ``gymnasium.make_vec`` passes on, is ``max_steps``."""
-    known, options = _recipe(recipe, module, view, point, options)
+    simulation, points, options = _recall(recipe, module, view, point, options)
     limits = [options.get("max_steps"), options.pop("max_episode_steps", None)]
     options["max_steps"] = min((limit for limit in limits if limit is not None), default=None)
-    return vector_env(known.simulation, known.points, view=view, **options)
+    return vector_env(simulation, points, view=view, **options)
 
 
-def _recipe(name: str, module: str, view: str, point: str | None, options: Any) -> tuple[_Recipe, dict[str, Any]]:
-    """Return a recipe, and its options for a view."""
-    if name not in _RECIPES and module != "__main__":
+def _recall(recipe: str, module: str, view: str, point: str | None, options: Any) -> tuple[Any, Any, dict[str, Any]]:
+    """Return the simulation and the points of a recipe, and its options for a view."""
+    if recipe not in _RECIPES and module != "__main__":
         importlib.import_module(module)  # as in a process that has only the spec
-    known = _RECIPES.get(name)
-    if known is None:
+    if recipe not in _RECIPES:
         raise UnknownPointError(
-            f"no simulation is registered as {name!r} in this process; import the module that registers it, or"
+            f"no simulation is registered as {recipe!r} in this process; import the module that registers it, or"
             ' make the environment by "module:id"'
         )
-    merged = {**known.options, **options}
-    if view != "joint" and "flatten" not in options:
-        merged.pop("flatten", None)
+    simulation, points, registered, active = _RECIPES[recipe]
+    for_view = {} if view == "joint" else {"flatten": False}  # an option of the joint view alone
+    merged = {**registered, **for_view, **options}
     if point is not None:
-        rules = {other: RULE for other in known.active if other != point}
+        rules = {other: RULE for other in active if other != point}
         merged["policies"] = rules | dict(merged.get("policies") or {})
         if merged.get("agent") is None:
             merged.pop("possible_agents", None)
             merged.pop("undeclared", None)
-    return known, merged
+    return simulation, points, merged

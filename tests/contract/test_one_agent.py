@@ -330,6 +330,8 @@ def test_an_episode_of_forced_moves_alone_is_told_at_the_first_step() -> None:
         told[agent] = aec.last()[1:4]
         aec.step(None)
     assert told == dict.fromkeys(NAMES, (3.0, True, False))
+    with pytest.raises(EpisodeOverError):
+        aec.step(0)
     parallel = parallel_env(Forced, MOVE, skip_forced=True, possible_agents=list(NAMES))
     parallel.reset(seed=0)
     assert parallel.agents == list(NAMES)

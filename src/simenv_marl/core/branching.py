@@ -95,10 +95,10 @@ def branch(
         BaseException: Any exception of the function or ``reseed``, with a note that names the continuation.
     """
     view = pending_view(env, "branch")
-    can_fork = hasattr(os, "fork") and view.driver == "greenlet"
+    can_fork = hasattr(os, "fork") and view._session.plan.options.driver == "greenlet"
     _check(n, method, seeds, time_limit, can_fork=can_fork)
     if seeds is not None:
-        view.check_reseed()
+        view._session.check_reseed()
     depth = _depth.get() + 1
     if depth > DEEPEST:
         raise BranchError(
@@ -107,7 +107,7 @@ def branch(
         )
 
     forks = can_fork and method != "replay"
-    obstacles: dict[Any, str] = view.open_resources() if forks else {}
+    obstacles: dict[Any, str] = view._session.open_resources() if forks else {}
     loops = loops_on(obstacles) if obstacles else []
     for loop in loops:  # the pair of sockets that wakes an event loop is made anew
         obstacles.pop(loop._ssock.fileno(), None)
@@ -128,7 +128,7 @@ def branch(
             twin.begin_branch()
             if seeds is not None:
                 seed_process(int(seeds[number]))
-                twin.reseed(int(seeds[number]))
+                twin._session.reseed(int(seeds[number]))
             return function(continuation, number)
         finally:
             _depth.reset(token)

@@ -69,7 +69,7 @@ class PlannerPolicy:
             )
         episode = session.episode
         if not (episode.plan.solo or PLANNING.get()):
-            views = import_module("..envs.planner", __package__)  # by name, because views import the core
+            views = import_module("..envs.single", __package__)  # by name, because views import the core
             return self.answer(observation, info, views.PlannerEnv(session.plan, session))
         base = base_of(getattr(self.policy, "base", RULE), (episode.consulted or episode.pending).name)
         if base is RULE or not callable(base) or is_planner(base):

@@ -1,5 +1,14 @@
-"""Views: an episode as a PettingZoo or Gymnasium environment."""
+"""Views: an episode as a PettingZoo or Gymnasium environment, and the functions that make them."""
 
+import sys
+from typing import Any, Final, Unpack
+
+from gymnasium.vector import AutoresetMode
+
+from ..core.options import ViewOptions, explain_arguments
+from ..core.plan import Plan
+from ..core.points import Points
+from ..errors import OptionValueError, did_you_mean, short_repr
 from .aec import SimulationAECEnv
 from .joint import SimulationJointEnv
 from .padding import pad_agents
@@ -8,10 +17,143 @@ from .single import SimulationEnv
 from .vector import SimulationVectorEnv
 
 __all__ = [
-    "SimulationAECEnv",
-    "SimulationEnv",
-    "SimulationJointEnv",
-    "SimulationParallelEnv",
-    "SimulationVectorEnv",
+    "SimulationAECEnv", "SimulationEnv", "SimulationJointEnv", "SimulationParallelEnv", "SimulationVectorEnv",
     "pad_agents",
-]
+]  # fmt: skip
+
+VIEWS: Final[dict[str, Any]] = {
+    "aec": SimulationAECEnv,
+    "parallel": SimulationParallelEnv,
+    "single": SimulationEnv,
+    "joint": SimulationJointEnv,
+}
+"""The classes of the views of one simulation."""
+
+
+def view_class(plan: Plan, view: str | None) -> Any:
+    """Return the class of a view. None: single if one point with one agent is active, else AEC."""
+    if view is None:
+        view = "aec" if plan.one_agent is None else "single"
+    if not isinstance(view, str) or view not in VIEWS:
+        raise OptionValueError(
+            f"view must be None or one of {', '.join(map(repr, VIEWS))}, not"
+            f" {short_repr(view)}{did_you_mean(view, VIEWS)}"
+        )
+    VIEWS[view].adapt(plan)
+    return VIEWS[view]
+
+
+@explain_arguments
+def generate_env(
+    simulation: Any, points: Points = None, *, view: str | None = None, **options: Unpack[ViewOptions]
+) -> Any:
+    """Make an environment class for a simulation (paper, section 3.3).
+
+    The constructor of the class takes options as keyword arguments, which override those given here.
+
+    {arguments}
+        view: "aec", "parallel", "single" or "joint". None: single if one point with one agent is active, or if
+            ``agent=`` names one agent; else AEC.
+        {options}
+    """
+    plan = Plan(simulation, points, options)
+    base = view_class(plan, view)
+
+    def initialise(self: Any, **changes: Any) -> None:
+        current = Plan(simulation, points, options) if plan.stale else plan
+        base.__init__(self, current.amended(changes))
+
+    attributes = {
+        "__init__": initialise,
+        "__doc__": f"A view of {plan.name}: {', '.join(point.point.name for point in plan.active)}.",
+        "__module__": sys._getframe(1).f_globals.get("__name__", __name__),
+        "metadata": base.metadata_of(plan),
+    }
+    return type(f"{plan.name}Env", (base,), attributes)
+
+
+@explain_arguments
+def aec_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationAECEnv:
+    """Make a PettingZoo AEC environment whose agents decide at the decision points.
+
+    {arguments}
+        {options}
+    """
+    return SimulationAECEnv(Plan(simulation, points, options))
+
+
+@explain_arguments
+def parallel_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationParallelEnv:
+    """Make a PettingZoo parallel environment whose agents decide at the decision points.
+
+    {arguments}
+        {options}
+    """
+    return SimulationParallelEnv(Plan(simulation, points, options))
+
+
+@explain_arguments
+def single_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationEnv:
+    """Make a Gymnasium environment for the one active agent. If there are several, ``agent=`` names it.
+
+    If its decision point has a goal, the environment is goal-based: its observations are dicts of ``observation``,
+    ``achieved_goal`` and ``desired_goal``, and it has ``compute_reward``.
+
+    {arguments}
+        {options}
+    """
+    return SimulationEnv(Plan(simulation, points, options))
+
+
+@explain_arguments
+def joint_env(simulation: Any, points: Points = None, **options: Unpack[ViewOptions]) -> SimulationJointEnv:
+    """Make a Gymnasium environment with one agent that takes all decisions.
+
+    All agents must be known beforehand. With ``flatten=True``, their spaces must be ones that can be concatenated.
+
+    {arguments}
+        {options}
+    """
+    return SimulationJointEnv(Plan(simulation, points, options))
+
+
+@explain_arguments
+def vector_env(
+    simulation: Any,
+    points: Points = None,
+    *,
+    num_envs: int,
+    workers: int = 0,
+    view: str | None = None,
+    copy: bool = True,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    context: Any = None,
+    **options: Unpack[ViewOptions],
+) -> SimulationVectorEnv:
+    """Make a Gymnasium vector environment: many copies of a simulation, stepped together.
+
+    Each step returns what ``gymnasium.vector.SyncVectorEnv`` would return for as many single (or joint) views.
+
+    {arguments}
+        num_envs: The number of simulations.
+        workers: The number of worker processes. 0: all simulations are suspended in this process.
+        view: "single" or "joint". None: single if one point with one agent is active, else joint.
+        copy: Whether ``reset`` and ``step`` return new arrays of observations. Otherwise they return the same arrays
+            every time, and the next call overwrites them.
+        autoreset_mode: When a simulation is reset after its episode has ended, as in Gymnasium:
+            ``AutoresetMode.NEXT_STEP``, ``SAME_STEP`` or ``DISABLED``.
+        context: The start method of workers: "spawn" (the default), "forkserver", "fork", or a context of
+            ``multiprocessing``.
+        {options}
+    """
+    return SimulationVectorEnv(
+        simulation,
+        points,
+        options,
+        view,
+        num_envs=num_envs,
+        workers=workers,
+        copy=copy,
+        autoreset_mode=autoreset_mode,
+        context=context,
+    )

@@ -10,7 +10,7 @@ from ..core.episode import Episode
 from ..core.spaces import duplicate
 from ..errors import InvalidActionError, short_repr
 from ..simulation import RULE
-from .agents import AgentsView
+from .base import AgentsView
 
 
 class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
@@ -42,16 +42,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             NoDecisionError: The simulation ended without a decision.
             BaseException: Any exception of the model, a mapping or a policy.
         """
-        with self._session.exclusive():
-            episode = self._start(seed, options)
-            with self._session.context():
-                for agent in episode.agents.values():
-                    if not (agent.present or episode.over):
-                        agent.clear_observation()
-                    self._join(agent)
-            self._record(episode)
-            if self._shows:
-                self.render()
+        self._start(seed, options)
 
     def step(self, action: Any) -> None:
         """Answer the decision of ``agent_selection`` and run to the next one.
@@ -85,11 +76,7 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.rewards[selected] = self._cumulative_rewards[selected] = 0.0
         if self._rewarded:
             self._clear_rewards()
-        agent = episode.pending
-        if agent is None or episode.just_ended:
-            self._record(episode)
-        else:
-            self._select(agent)
+        self._record(episode)
         if self._shows:
             self.render()
 
@@ -105,24 +92,19 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         Raises:
             ResetNeededError: There is no episode, or all agents have taken their final step.
         """
-        agent, observation = self._deciding, None
-        if agent is not None:
-            name = agent.name
-            if observe:
-                observation = agent.observation
-                observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
-        elif self._leaving:
+        episode, observation = self._session.episode, None
+        if self._leaving:
             name = self.agent_selection
             observation = self.observe(name) if observe else None
-        else:
+        elif episode is None or episode.pending is None:
             raise self._session.refusal()
-        return (
-            observation,
-            self._cumulative_rewards[name],
-            self.terminations[name],
-            self.truncations[name],
-            self.infos[name],
-        )
+        else:
+            name = episode.pending.name
+            if observe:
+                observation = episode.pending.observation
+                observation = observation.copy() if type(observation) is ndarray else duplicate(observation)
+        reward = self._cumulative_rewards[name]
+        return observation, reward, self.terminations[name], self.truncations[name], self.infos[name]
 
     def observe(self, agent: str) -> Any:
         """Return the latest observation of an agent of this episode, as a new copy.
@@ -131,14 +113,13 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
             UnknownAgentError: There is no such agent.
             ResetNeededError: There is no episode.
         """
-        return self._observation(self._running(), agent)
+        return self._observation(self.episode, agent)
 
     # -- PettingZoo's books -----------------------------------------------------------------------
 
     def _clear(self) -> None:
         self.agents = []
         self._places: dict[str, int] = {}  # of the agents, in the list of agents
-        self._deciding: Agent | None = None  # the agent that is selected for its decision
         self._leaving: list[str] = []  # agents that have ended, and whose None step is to come, the next one last
         self._rewarded: list[str] = []  # agents besides the selected one that the latest step has rewarded
         self.rewards: dict[str, float] = {}
@@ -146,6 +127,15 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.terminations: dict[str, bool] = {}
         self.truncations: dict[str, bool] = {}
         self.infos: dict[str, dict[str, Any]] = {}
+
+    def _begin(self, episode: Episode) -> None:
+        with self._session.context():
+            for agent in episode.agents.values():
+                if not (agent.present or episode.over):
+                    agent.clear_observation()
+                self._join(agent)
+        self._record(episode)
+        episode.unreported_end = False  # the books report it
 
     def _join(self, agent: Agent) -> None:
         """Enter an agent in the books."""
@@ -156,51 +146,37 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         self.terminations[name] = self.truncations[name] = False
         self.infos[name] = agent.info
 
-    def _select(self, agent: Agent) -> None:
-        """Record a decision that has arisen."""
-        self._deciding = agent
-        name = self.agent_selection = agent.name
-        if name not in self.rewards:
-            self._join(agent)
-        # It has had no other reward since its last step.
-        self.rewards[name] = self._cumulative_rewards[name] = agent.reward
-        self.infos[name] = agent.info
-
     def _record(self, episode: Episode) -> None:
         """Record the ends and the pending decision of a reset or a step."""
-        for agent in episode.just_ended:
-            self._dismiss(agent, terminated=True, truncated=False)
-        if episode.over:
-            # Those that have never decided come last.
-            for agent in sorted(episode.agents.values(), key=lambda agent: not agent.decided):
-                self._dismiss(agent, terminated=episode.terminated, truncated=episode.truncated)
-        self._leaving.reverse()
-        if episode.pending is not None:
-            self._select(episode.pending)
-            self._rewarded.append(episode.pending.name)
-        episode.just_ended = []
-        self._select_next()
-
-    def _dismiss(self, agent: Agent, *, terminated: bool, truncated: bool) -> None:
-        """Record the last reward and the end of an agent, whose ``None`` step comes next."""
-        name = agent.name
-        if name not in self.rewards:
-            self._join(agent)
-        self.rewards[name] = agent.reward
-        self._cumulative_rewards[name] += agent.reward
-        self.infos[name] = agent.info
-        self.terminations[name], self.truncations[name] = terminated, truncated
-        self._rewarded.append(name)
-        self._leaving.append(name)
-
-    def _select_next(self) -> None:
-        """Select the next agent that takes its final step, or else the one that decides."""
+        pending = episode.pending
+        if pending is None or episode.just_ended:
+            ended = [(agent, True, False) for agent in episode.just_ended]
+            if episode.over:
+                # Those that have never decided come last.
+                others = sorted(episode.agents.values(), key=lambda agent: not agent.decided)
+                ended += [(agent, episode.terminated, episode.truncated) for agent in others]
+            for agent, terminated, truncated in ended:
+                name = agent.name
+                if name not in self.rewards:
+                    self._join(agent)
+                self.rewards[name] = agent.reward
+                self._cumulative_rewards[name] += agent.reward
+                self.infos[name] = agent.info
+                self.terminations[name], self.truncations[name] = terminated, truncated
+                self._rewarded.append(name)
+            self._leaving = self._rewarded[::-1]
+            episode.just_ended = []
+        if pending is not None:
+            name = pending.name
+            if name not in self.rewards:
+                self._join(pending)
+            # It has had no other reward since its last step.
+            self.rewards[name] = self._cumulative_rewards[name] = pending.reward
+            self.infos[name] = pending.info
         if self._leaving:
-            self.agent_selection, self._deciding = self._leaving[-1], None
-            return
-        self._deciding = self._running().pending
-        if self._deciding is not None:
-            self.agent_selection = self._deciding.name
+            self._rewarded.append(name)
+            name = self._leaving[-1]
+        self.agent_selection = name
 
     def _clear_rewards(self) -> None:
         """Reset the rewards of the previous step."""
@@ -223,8 +199,12 @@ class SimulationAECEnv(AgentsView, AECEnv[str, Any, Any]):
         place, mover = self._places.pop(name), self.agents.pop()
         if mover != name:
             self.agents[place], self._places[mover] = mover, place
-        self._select_next()
+        pending = self.episode.pending
+        if self._leaving:
+            self.agent_selection = self._leaving[-1]
+        elif pending is not None:
+            self.agent_selection = pending.name
 
-    def _resume_from_replay(self) -> None:
-        self._running().just_ended = []  # they are in the books already
-        self._select_next()
+    def begin_branch(self) -> None:
+        """Prepare the environment of a branch: see ``View``."""
+        self.episode.just_ended = []  # they are in the books already

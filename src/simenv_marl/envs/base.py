@@ -1,4 +1,4 @@
-"""The base class of all views: the session, rendering, the state, copies, and what branches need."""
+"""What views have in common: the session, spaces, the state, rendering, copies, and what branches and planners need."""
 
 from __future__ import annotations
 
@@ -9,18 +9,25 @@ from functools import cached_property
 from sys import modules
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
+from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
+from ..core.point import Point
 from ..core.provenance import describe
-from ..core.session import Session, checked_seed
-from ..core.spaces import observation_cast
-from ..errors import UnknownOptionError, ViewError
+from ..core.session import Session, checked_seed, seed_space
+from ..core.spaces import duplicate, observation_cast
+from ..errors import UnknownAgentError, UnknownOptionError, ViewError, did_you_mean, short_repr
 from ..plugins import Entry
 
-_OWN = frozenset(("_deciding", "_finalizer", "_made_of", "_own", "_plan", "_session", "joint", "metadata"))
+Spaces = tuple[spaces.Space[Any], spaces.Space[Any]]
+"""An observation space and an action space."""
+
+_OWN = frozenset(("_definition", "_finalizer", "_own", "_plan", "_session", "joint", "metadata"))
 """The attributes that no copy takes over."""
 
 
@@ -30,15 +37,17 @@ class View:
     Attributes:
         metadata: Its name, and the render modes of its simulation.
         render_mode: What ``render`` returns.
-        takes: The options that only this view takes.
-        in_rounds: Whether all agents are updated when a step returns.
     """
 
     metadata: dict[str, Any]
     render_mode: str | None
-    takes: ClassVar[tuple[str, ...]] = ()
-    in_rounds: ClassVar[bool] = False
+    _option: ClassVar[str | None] = None  # the option that only this view takes
+    _in_rounds: ClassVar[bool] = False  # whether all agents are updated when a step returns
     _finalizer: Any = None
+    _set_up: Callable[[], None]  # completes what is made
+    _begin: Callable[[Episode], Any]  # makes the records of a new episode, and returns the results of its reset
+    _all_spaces: Callable[[], dict[str, spaces.Space[Any]]]  # returns the observation spaces of all possible agents
+    _observation: Callable[[Episode, str], Any]  # returns a copy of an agent's latest observation
 
     def __init__(self, plan: Plan, session: Session | None = None) -> None:
         """Make the view of a plan, of a session that its owner closes, or else of a new session.
@@ -46,23 +55,30 @@ class View:
         Raises:
             SimEnvError: Something in the plan cannot work.
         """
-        self.check(plan)
+        adapted = self.adapt(plan)
         super().__init__()
-        self._plan = self._made_of = plan
-        self._session = Session(plan) if session is None else session
+        self._plan = plan
+        self._session = Session(adapted) if session is None else session
         if session is None:
             self._finalizer = weakref.finalize(self, self._session.abandon)
         self.metadata = self.metadata_of(plan)
         self.render_mode = plan.options.render_mode
         self._shows = self.render_mode == "human"  # render after every reset and step
+        self._spaces: dict[str, Spaces] = {}  # by agent
         self._clear()
+        self._set_up()
 
     @classmethod
-    def check(cls, plan: Plan) -> None:
-        """Check that a plan allows this view, or raise ``UnknownOptionError`` or ``ViewError``."""
+    def adapt(cls, plan: Plan) -> Plan:
+        """Check that a plan allows this view, and return the plan of its sessions.
+
+        Raises:
+            UnknownOptionError, ViewError: It does not.
+        """
         for option, view in (("flatten", "joint"), ("agent", "single")):
-            if getattr(plan.options, option) and option not in cls.takes:
+            if getattr(plan.options, option) and option != cls._option:
                 raise UnknownOptionError(f"{option} is an option of the {view} view only")
+        return plan
 
     @classmethod
     def metadata_of(cls, plan: Plan) -> dict[str, Any]:
@@ -77,8 +93,7 @@ class View:
     @property
     def plugins(self) -> list[Entry]:
         """The handlers of the option ``plugins``: tuples of handler, dotted name of the target, and position."""
-        plugins = self._plan.plugins
-        return [] if plugins is None else plugins.entries
+        return [] if self._plan.plugins is None else self._plan.plugins.entries
 
     def provenance(self) -> dict[str, Any]:
         """Return what ``simenv_marl.experiments.provenance`` describes, with the seed of the latest episode."""
@@ -100,11 +115,19 @@ class View:
             _ = self._session.np_random  # draws a seed
         return self._session.np_random_seed  # type: ignore[return-value]
 
-    @property
+    # -- the state --------------------------------------------------------------------------------
+
+    @cached_property
     def state_space(self) -> spaces.Space[Any] | None:
         """The space of ``state()``, if the environment was made with one."""
         space = self._plan.options.state_space
-        return self._observed_together[1] if isinstance(space, str) else space
+        if not isinstance(space, str):
+            return space
+        parts = spaces.Tuple(self._all_spaces().values())
+        together = spaces.flatten_space(parts)
+        if not isinstance(together, spaces.Box):
+            raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
+        return together
 
     def state(self) -> Any:
         """Return the state of the simulation, for centralised critics, from the simulation's own ``state()``.
@@ -118,31 +141,25 @@ class View:
             ResetNeededError: With ``state_space="observations"``: there is no episode.
         """
         if isinstance(self._plan.options.state_space, str):
-            parts, space = self._observed_together
-            return np.asarray(spaces.flatten(parts, self._all_observations(self._running()))).astype(space.dtype)
-        tell = getattr(self.simulation, "state", None)
-        if not callable(tell):
-            raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
-        with self._session.context():
-            value = tell()
+            episode, parts = self.episode, self._all_spaces().items()
+            value = np.concatenate([spaces.flatten(part, self._observation(episode, agent)) for agent, part in parts])
+        else:
+            tell = getattr(self.simulation, "state", None)
+            if not callable(tell):
+                raise NotImplementedError(f"{type(self.simulation).__name__} has no method state()")
+            with self._session.context():
+                value = tell()
         return np.array(value) if self.state_space is None else observation_cast(self.state_space)(value)
 
-    @cached_property
-    def _observed_together(self) -> tuple[spaces.Tuple[Any], spaces.Space[Any]]:
-        """The spaces of all observations, and the space of their concatenation."""
-        parts = spaces.Tuple(self._all_observation_spaces())
-        together = spaces.flatten_space(parts)
-        if not isinstance(together, spaces.Box):
-            raise ViewError(f'state_space="observations" needs spaces that can be flattened, not {parts}')
-        return parts, together
+    # -- episodes ---------------------------------------------------------------------------------
 
-    def _all_observation_spaces(self) -> list[spaces.Space[Any]]:
-        """Return the spaces of all observations."""
-        raise NotImplementedError
-
-    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
-        """Return all observations."""
-        raise NotImplementedError
+    @property
+    def episode(self) -> Episode:
+        """The running episode, or the one that has just ended; raise ``ResetNeededError`` if there is none."""
+        episode = self._session.episode
+        if episode is None:
+            raise self._session.refusal()
+        return episode
 
     def render(self) -> Any:
         """Render the simulation in ``render_mode``. Without a render mode, warn and return None.
@@ -164,16 +181,25 @@ class View:
                 # The finalizer would keep the session alive, and with it an environment that its own parts refer to.
                 self._finalizer.detach()
 
-    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Episode:
-        """End the current episode, and begin another, which ends if the environment is abandoned."""
-        seed = checked_seed(seed)
-        if self._finalizer is not None and not self._finalizer.alive:
-            self._finalizer = weakref.finalize(self, self._session.abandon)
-        self._end(self._session.end)
-        return self._session.start(seed, options, in_rounds=self.in_rounds)
+    def _start(self, seed: int | None, options: dict[str, Any] | None) -> Any:
+        """Begin another episode, which ends if the environment is abandoned. Return the results of the reset."""
+        session = self._session
+        with session.exclusive():
+            seed = checked_seed(seed)
+            if self._finalizer is not None and not self._finalizer.alive:
+                self._finalizer = weakref.finalize(self, session.abandon)
+            self._end(session.end)
+            results = self._begin(session.start(seed, options, in_rounds=self._in_rounds))
+            if not self._plan.complete:  # the agents of the last episode may never appear again
+                self._spaces = {}
+            for agent in self._spaces:
+                self._seed_spaces(agent, seed)
+            if self._shows:
+                self.render()
+            return results
 
     def _end(self, end: Callable[[], None]) -> None:
-        """End the episode, and forget it unless that was refused."""
+        """End the episode, and forget its records unless that was refused."""
         try:
             end()
         finally:
@@ -184,19 +210,25 @@ class View:
     def _clear(self) -> None:
         """Forget the records of the episode."""
 
-    def _running(self) -> Episode:
-        """The running episode, or the one that has just ended; raise ``ResetNeededError`` if there is none."""
-        episode = self._session.episode
-        if episode is None:
-            raise self._session.refusal()
-        return episode
+    def _make_spaces(self, agent: str, definition: Any, seed: int | None) -> Spaces:
+        """Make the spaces of an agent, which no other environment shares, on demand: many may never need them."""
+        made = self._spaces[agent] = copy.deepcopy((definition.observation_space, definition.action_space))
+        self._seed_spaces(agent, seed)
+        return made
+
+    def _seed_spaces(self, agent: str, seed: int | None) -> None:
+        if seed is not None and seed >= 0:
+            for space in self._spaces[agent]:
+                seed_space(space, seed, agent)
+
+    # -- copies -----------------------------------------------------------------------------------
 
     def __copy__(self) -> Any:
         return copy.deepcopy(self)
 
     def __deepcopy__(self, memory: dict[int, Any]) -> Any:
         """Make an environment like this one, with a simulation of its own. It needs a reset."""
-        made = memory[id(self)] = _make_again(type(self), self._made_of)
+        made = memory[id(self)] = _make_again(type(self), self._plan)
         made.__setstate__(copy.deepcopy(self._state(), memory))
         return made
 
@@ -207,75 +239,178 @@ class View:
         for name in view.__qualname__.split("."):
             found = getattr(found, name, None)
         if found is not view:  # a class that generate_env made and that its name does not lead to
-            view = _class_of_package(view)
-        return _make_again, (view, self._made_of), self._state()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._restore(state)
-        self._clear()
+            view = next(base for base in view.__mro__ if base.__module__.startswith(__package__))
+        return _make_again, (view, self._plan), self._state()
 
     def _state(self) -> dict[str, Any]:
         """Return what a copy takes over."""
         own = {name: value for name, value in vars(self).items() if name not in _OWN}
         return own | {"session": self._session.snapshot()}
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        """Take over the state of another environment, with the records of its episode."""
+    def __setstate__(self, state: dict[str, Any]) -> None:
         self._session.restore(state.pop("session"))
         vars(self).update(state)
+        if self._session.episode is None:  # otherwise it was replayed, and has the same records
+            self._clear()
 
     # -- branches and planners --------------------------------------------------------------------
 
-    episode = property(_running)
-
-    @property
-    def driver(self) -> str:
-        """The name of the driver, which switches between the simulation and its user."""
-        return self._plan.options.driver
-
     def check_pending(self) -> None:
         """Check that a decision is pending, or raise ``ResetNeededError`` or ``ReentrancyError``."""
-        if self._running().pending is None:
+        if self.episode.pending is None:
             raise self._session.refusal()
-
-    def open_resources(self) -> dict[Any, str]:
-        """Describe what the simulation has opened that a forked process would share: see ``Session``."""
-        return self._session.open_resources()
-
-    def check_reseed(self) -> None:
-        """Check that the random numbers ahead can be drawn anew: see ``Session.check_reseed``."""
-        self._session.check_reseed()
-
-    def reseed(self, seed: int) -> None:
-        """Reseed the simulation: see ``Session.reseed``."""
-        self._session.reseed(seed)
 
     def replayed(self) -> Any:
         """Make an environment in exactly the same state in mid-episode, or raise as ``Session.replay``."""
-        made = _make_again(type(self), self._made_of)
-        made._restore(copy.deepcopy(self._state()))
+        made = _make_again(type(self), self._plan)
         made._session.replay(self._session)
-        made._resume_from_replay()
+        made.__setstate__(copy.deepcopy(self._state()))
         return made
 
-    def _resume_from_replay(self) -> None:
-        """Take over the session's episode in mid-episode."""
-
     def begin_branch(self) -> None:
-        """Prepare the environment of a branch."""
-
-    def stop_showing(self) -> None:
-        """Stop rendering, in a branch."""
-        self._shows = False
-
-
-def _class_of_package(view: type[View]) -> Any:
-    """Return the class of this package from which a generated class is derived."""
-    return next(base for base in view.__mro__ if base.__module__.startswith(__package__))
+        """Prepare the environment of a branch, which was forked in mid-episode, or replayed."""
 
 
 def _make_again(view: type[View], plan: Plan) -> View:
-    """Make an environment of a class from its plan alone."""
+    """Make an environment of a class from its plan alone. Generated classes have other arguments."""
     made = view.__new__(view)
-    _class_of_package(view).__init__(made, plan)
+    View.__init__(made, plan)
     return made
+
+
+class AgentsView(View):
+    """A view with several agents: a PettingZoo environment.
+
+    Attributes:
+        agents: The names of the current agents.
+        possible_agents: The names of all agents. It exists only if they are known beforehand.
+    """
+
+    agents: list[str]
+
+    def _set_up(self) -> None:
+        if self._plan.possible_agents is not None:
+            self.possible_agents = self._plan.possible_agents
+
+    @classmethod
+    def adapt(cls, plan: Plan) -> Plan:
+        """Check that a plan allows this view: see ``View``."""
+        if isinstance(plan.options.state_space, str) and plan.possible_agents is None:
+            raise ViewError(
+                'state_space="observations" needs to know all agents beforehand: declare them in possible_agents='
+            )
+        return super().adapt(plan)
+
+    @classmethod
+    def metadata_of(cls, plan: Plan) -> dict[str, Any]:
+        """Return the metadata of a plan's environments. The order of agents is an order of rounds only in rounds."""
+        return super().metadata_of(plan) | {"is_parallelizable": cls._in_rounds}
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The observation space of an agent. It is always the same object, and no other environment shares it.
+
+        Raises:
+            UnknownAgentError: There is no such agent.
+        """
+        return (self._spaces.get(agent) or self._own_spaces(agent))[0]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The action space of an agent, as ``observation_space`` returns the observation space."""
+        return (self._spaces.get(agent) or self._own_spaces(agent))[1]
+
+    @property
+    def observation_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """The observation spaces of all possible agents, by name, for learners that read all at once.
+
+        Raises:
+            AttributeError: Not all agents are known beforehand, and so there is no ``possible_agents`` either.
+        """
+        return {agent: self.observation_space(agent) for agent in self.possible_agents}
+
+    @property
+    def action_spaces(self) -> dict[str, spaces.Space[Any]]:
+        """The action spaces of all possible agents, as ``observation_spaces`` has the observation spaces."""
+        return {agent: self.action_space(agent) for agent in self.possible_agents}
+
+    def _own_spaces(self, agent: str) -> Spaces:
+        return self._make_spaces(agent, self._point(agent).definition, self._session.seed)
+
+    def _point(self, agent: str) -> Point:
+        """The decision point of an agent; raise ``UnknownAgentError`` if there is no such agent."""
+        episode = self._session.episode
+        found = None if episode is None else episode.agent(agent)
+        point = self._plan.roster.get(agent) if found is None else found.point
+        if point is None:
+            raise UnknownAgentError(
+                f"there is no agent {short_repr(agent)}; the agents now are {self.agents[:10]}"
+                f"{did_you_mean(agent, self.agents)}"
+            )
+        return point
+
+    def _observation(self, episode: Episode, agent: str) -> Any:
+        found = episode.agent(agent)
+        if found is None or found.observation is None:
+            return self._point(agent).blank()
+        return duplicate(found.observation)
+
+    def _all_spaces(self) -> dict[str, spaces.Space[Any]]:
+        return self.observation_spaces
+
+
+class OneAgentView(View, gym.Env[Any, Any]):
+    """A view with one agent: a Gymnasium environment."""
+
+    _agent: str
+    _definition: Any  # has the spaces, of which this environment has copies
+    _deciders: Callable[[Episode], list[Agent]]  # returns the agents whose decisions a step answers
+    _np_random, _np_random_seed = View.np_random, View.np_random_seed  # where Gymnasium's checks look
+
+    @cached_property
+    def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+        """The observation space. No other environment shares it."""
+        return self._own_spaces()[0]
+
+    @cached_property
+    def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+        """The action space. No other environment shares it."""
+        return self._own_spaces()[1]
+
+    def _own_spaces(self) -> Spaces:
+        seed = self._session.np_random_seed
+        return self._spaces.get(self._agent) or self._make_spaces(self._agent, self._definition, seed)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the simulation and run it to its first decision.
+
+        The arguments and errors are those of ``SimulationAECEnv.reset``.
+
+        Returns:
+            The observation and the info.
+        """
+        observation, info = self._start(seed, options)
+        return observation, info
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """The mask of the legal actions, in the form that ``MaskablePPO`` of sb3-contrib expects.
+
+        Returns:
+            A bool array. For a ``Discrete`` it has shape ``(n,)``. For a ``MultiDiscrete`` it is the concatenation of
+            the masks of the parts. If the decision point does not restrict its actions, all entries are True.
+
+        Raises:
+            ViewError: The action space is neither ``Discrete`` nor ``MultiDiscrete``, and so has no masks.
+            ResetNeededError: There is no episode.
+        """
+        if not isinstance(self.action_space, (spaces.Discrete, spaces.MultiDiscrete)):
+            raise ViewError(
+                f"action masks need a Discrete or MultiDiscrete action space, not {self.action_space}; a joint"
+                " environment of discrete actions has a MultiDiscrete with flatten=True"
+            )
+        parts: list[Any] = []
+        for agent in self._deciders(self.episode):
+            mask = agent.point.open_mask() if agent.mask is None else agent.mask
+            parts += mask if isinstance(mask, tuple) else (mask,)
+        return np.concatenate(parts).astype(np.bool_)
+
+    def _all_spaces(self) -> dict[str, spaces.Space[Any]]:
+        return {self._agent: self.observation_space}

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from ..core.agent import Agent
 from ..core.episode import Episode
-from ..core.plan import Plan
 from ..core.point import Point
-from ..core.session import Session
 from ..core.spaces import duplicate
 from ..errors import InvalidActionError, ViewError, short_repr
 from ..simulation import RULE
-from .one_agent import OneAgentView
+from .base import OneAgentView
 
 
 class Joint:
@@ -44,7 +43,7 @@ class Joint:
 
     def actions(self, episode: Episode, action: Any) -> dict[str, Any]:
         """Return the actions of the live agents, or raise ``InvalidActionError`` if one is missing."""
-        actions: Mapping[str, Any]
+        actions = action
         if action is RULE:
             actions = dict.fromkeys(self.roster, RULE)
         elif self._flatten:
@@ -59,8 +58,6 @@ class Joint:
                 f"a joint action is a dict with an action for each of {', '.join(self.roster)}; given:"
                 f" {short_repr(given)}"
             )
-        else:
-            actions = action
         return {name: actions[name] for name in self.roster if name in episode.agents}
 
     def check(self, episode: Episode, action: Any) -> None:
@@ -74,11 +71,8 @@ class Joint:
         """Return the observations of all agents; an agent that has ended keeps its last observation."""
         observations = {}
         for name, point in self.roster.items():
-            agent = episode.agent(name)
-            if agent is None or agent.observation is None:
-                observations[name] = point.blank()
-            else:
-                observations[name] = duplicate(agent.observation)
+            observation = (episode.agents.get(name) or episode.ended[name]).observation
+            observations[name] = point.blank() if observation is None else duplicate(observation)
         if self._flatten:
             return np.concatenate(list(observations.values())).astype(self.observation_space.dtype)
         return observations
@@ -92,12 +86,12 @@ class Joint:
 
     def inform(self, episode: Episode) -> dict[str, Any]:
         """Return the info of a step or a reset, with the time since the previous one."""
-        agents = {name: episode.agent(name) for name in self.roster}
+        agents = {name: episode.agents.get(name) or episode.ended[name] for name in self.roster}
         info: dict[str, Any] = {
             "deciding": episode.pending.name if episode.pending is not None else "",
-            "acted": {name: agent is not None and agent.acted for name, agent in agents.items()},
+            "acted": {name: agent.acted for name, agent in agents.items()},
         }
-        masks = {name: duplicate(agent.mask) for name, agent in agents.items() if agent and agent.mask is not None}
+        masks = {name: duplicate(agent.mask) for name, agent in agents.items() if agent.mask is not None}
         if masks:
             info["action_mask"] = masks
         if episode.clock is not None:
@@ -105,11 +99,6 @@ class Joint:
             episode.last_time = info["time"] = now
             info["elapsed"] = 0.0 if before is None else now - before
         return info
-
-    def masks(self, episode: Episode) -> list[Any]:
-        """Return the action masks of all agents."""
-        agents = [(point, episode.agent(name)) for name, point in self.roster.items()]
-        return [point.open_mask() if agent is None or agent.mask is None else agent.mask for point, agent in agents]
 
 
 class SimulationJointEnv(OneAgentView):
@@ -125,33 +114,27 @@ class SimulationJointEnv(OneAgentView):
             and one-dimensional ``MultiDiscrete`` action spaces become one ``MultiDiscrete``.
     """
 
-    takes = ("flatten",)
-    in_rounds = True
+    _option = "flatten"
+    _in_rounds = True
     _agent = "joint"
 
-    def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan: see ``View``. If not all agents are declared, this takes a reset."""
-        super().__init__(plan, session)
-        if not plan.complete:
-            self._plan = self._made_of = self._session.plan = self._declared(plan)
-        self.joint = Joint(self._plan.roster, flatten=plan.options.flatten)
-
-    def _declared(self, plan: Plan) -> Plan:
-        """Return the same plan with the agents that the simulation announces after a reset."""
+    def _set_up(self) -> None:
         session = self._session
-        if not hasattr(session.simulation, "expected_calls"):
+        if not self._plan.complete:
+            if not hasattr(session.simulation, "expected_calls"):
+                session.close()
+                points = ", ".join(point.point.name for point in self._plan.active if point.agent is None)
+                raise ViewError(
+                    "all agents must be known when the environment is made, and a callable names those of"
+                    f" {points}; declare them with possible_agents=, let the simulation announce them"
+                    " (expected_calls), or name the one agent of a single view with agent="
+                )
+            agents = session.start(0, None, in_rounds=True).agents
+            roster = {name: agent.point for name, agent in agents.items()}
             session.close()
-            points = ", ".join(point.point.name for point in plan.active if point.agent is None)
-            raise ViewError(
-                f"all agents must be known when the environment is made, and a callable names those of {points};"
-                " declare them with possible_agents=, let the simulation announce them (expected_calls), or name"
-                " the one agent of a single view with agent="
-            )
-        agents = session.start(0, None, in_rounds=True).agents
-        roster = {name: agent.point for name, agent in agents.items()}
-        session.close()
-        session.np_random_seed = None
-        return plan.declared(roster)
+            session.seed = session.np_random_seed = None
+            self._plan = session.plan = self._plan.declared(roster)
+        self.joint = self._definition = Joint(self._plan.roster, flatten=self._plan.options.flatten)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Play a round with an action for each agent.
@@ -174,24 +157,21 @@ class SimulationJointEnv(OneAgentView):
         if session.lock is not None and not session.lock.held:  # the lock also covers reading the results
             with session.lock:
                 return SimulationJointEnv.step(self, action)
-        episode, joint = self._running(), self.joint
+        episode, joint = self.episode, self.joint
         episode.play(joint.actions(episode, action))
         if self._shows:
             self.render()
         info = joint.inform(episode)
         return joint.observe(episode), joint.reward(episode), episode.terminated, episode.truncated, info
 
-    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        return deepcopy((self.joint.observation_space, self.joint.action_space))
-
-    def _first_results(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
+    def _begin(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
         return self.joint.observe(episode), self.joint.inform(episode)
 
-    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
-        return (self.joint.observe(episode),)
+    def _observation(self, episode: Episode, agent: str) -> Any:
+        return self.joint.observe(episode)
 
-    def _masks(self, episode: Episode) -> list[Any]:
-        return self.joint.masks(episode)
+    def _deciders(self, episode: Episode) -> list[Agent]:
+        return [episode.agents.get(name) or episode.ended[name] for name in self.joint.roster]
 
 
 def _concatenate(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
@@ -204,15 +184,13 @@ def _concatenate(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
 
 def _concatenate_actions(parts: list[Any]) -> spaces.Space[Any]:
     """Return the space of concatenated actions, which must be all continuous or all discrete."""
-    discrete = [
-        isinstance(space, spaces.Discrete) or (isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1)
-        for space in parts
-    ]
-    if not any(discrete):
+    kinds = (spaces.Discrete, spaces.MultiDiscrete)
+    discrete = [space for space in parts if isinstance(space, kinds) and np.ndim(space.start) < 2]
+    if not discrete:
         return _concatenate(parts)
-    if not all(discrete):
-        kinds = ", ".join(map(str, parts))
-        raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {kinds}")
-    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in parts]
-    starts = [np.atleast_1d(space.start) for space in parts]
+    if len(discrete) < len(parts):
+        given = ", ".join(map(str, parts))
+        raise ViewError(f"flatten=True needs actions that are all continuous or all discrete, not {given}")
+    numbers = [np.atleast_1d(space.nvec if isinstance(space, spaces.MultiDiscrete) else space.n) for space in discrete]
+    starts = [np.atleast_1d(space.start) for space in discrete]
     return spaces.MultiDiscrete(np.concatenate(numbers), start=np.concatenate(starts))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 from pettingzoo import AECEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
 from ..core.agent import Agent
 from ..errors import ViewError, short_repr
-from .agents import AgentsView
+from .base import AgentsView
 from .parallel import Results
 
 
@@ -35,19 +35,28 @@ def pad_agents(env: Any) -> PaddedAECEnv | PaddedParallelEnv:
     return PaddedAECEnv(env) if isinstance(env, AECEnv) else PaddedParallelEnv(env)
 
 
-def _is_present(agent: Agent | None) -> bool:
+def _is_present(agent: Agent) -> bool:
     """Whether an agent is live and was observed."""
-    return agent is not None and agent.present and not agent.ended
+    return agent.present and not agent.ended
 
 
-def _info(agent: Agent | None, info: dict[str, Any]) -> dict[str, Any]:
-    """The info of an agent, with the entry ``"present"``. An absent agent has all actions legal."""
-    if agent is not None and not _is_present(agent):
-        agent.clear_observation()
-        if agent.ended:
-            agent.observation = None  # so that ``state`` has blanks, too
-        info = agent.info | {key: info[key] for key in ("deciding", "acted") if key in info}
-    return {**info, "present": _is_present(agent)}
+def _pad(view: AgentsView, rewards: dict[str, float], infos: dict[str, Any], idle: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the rewards, terminations, truncations and infos of all possible agents, from those of the live ones.
+
+    ``idle`` is what the infos of agents that are not present have besides the open mask and the time.
+    """
+    episode, roster, padded = view.episode, view.possible_agents, {}
+    for name in roster:
+        agent: Any = episode.agent(name)
+        info, present = infos.get(name, idle), _is_present(agent)
+        if not present:
+            agent.clear_observation()
+            if agent.ended:
+                agent.observation = None  # so that ``state`` has blanks, too
+            info = agent.info | {key: info[key] for key in idle}
+        padded[name] = {**info, "present": present}
+    terminations, truncations = dict.fromkeys(roster, episode.terminated), dict.fromkeys(roster, episode.truncated)
+    return {name: rewards.get(name, 0.0) for name in roster}, terminations, truncations, padded
 
 
 class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
@@ -56,9 +65,8 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
     @property
     def agents(self) -> list[str]:
         """All possible agents while there is an episode."""
-        view = cast("AgentsView", self.unwrapped)
-        episode = view._session.episode
-        return [] if episode is None or episode.over else list(view.possible_agents)
+        episode = self.unwrapped._session.episode
+        return [] if episode is None or episode.over else list(self.possible_agents)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment; return the observations and infos of all possible agents."""
@@ -68,28 +76,19 @@ class PaddedParallelEnv(BaseParallelWrapper[str, Any, Any]):
 
     def step(self, actions: Any) -> Results:
         """Play a round; return the results of all possible agents."""
-        view = cast("AgentsView", self.unwrapped)
         if isinstance(actions, Mapping) and self.agents:
-            absent = {name for name in view.possible_agents if not _is_present(view.episode.agents.get(name))}
+            agents = self.unwrapped.episode.agents
+            absent = {name for name in self.possible_agents if name not in agents or not agents[name].present}
             actions = {name: action for name, action in actions.items() if name not in absent}
-        results = cast("Results", super().step(actions))
+        results: Results = super().step(actions)
         return self._padded(results) if results[0] else results  # they are empty after the end of the episode
 
     def _padded(self, results: Results) -> Results:
         """Add the agents that are not present to the results of a round, and let all agents end together."""
-        view = cast("AgentsView", self.unwrapped)
-        episode, roster = view.episode, view.possible_agents
-        observations, rewards, _, _, infos = results
-        found = {name: episode.agent(name) for name in roster}
-        absent = {name: view._point(name).blank() for name, agent in found.items() if not _is_present(agent)}
-        idle = {"deciding": False, "acted": False}
-        return (
-            {name: absent[name] if name in absent else observations[name] for name in roster},
-            {name: rewards.get(name, 0.0) for name in roster},
-            dict.fromkeys(roster, episode.terminated),
-            dict.fromkeys(roster, episode.truncated),
-            {name: _info(agent, infos.get(name, idle)) for name, agent in found.items()},
-        )
+        view, (observations, rewards, _, _, infos) = self.unwrapped, results
+        agents = {name: view.episode.agent(name) for name in view.possible_agents}
+        padded = {name: observations[name] if _is_present(a) else a.point.blank() for name, a in agents.items()}
+        return padded, *_pad(view, rewards, infos, {"deciding": False, "acted": False})
 
 
 class PaddedAECEnv(BaseWrapper[str, Any, Any]):
@@ -115,29 +114,25 @@ class PaddedAECEnv(BaseWrapper[str, Any, Any]):
         try:
             super().step(action)
         finally:
-            if not cast("AgentsView", self.unwrapped).agents:  # an error has ended the episode
+            if not self.unwrapped.agents:  # an error has ended the episode
                 self.agents = []
         self._cumulative_rewards[selected] = 0.0
         self._update()
 
     def observe(self, agent: str) -> Any:
         """Return the latest observation of an agent; zero, with all actions legal, if it is not present."""
-        view = cast("AgentsView", self.unwrapped)
-        found = view.episode.agent(agent)
+        found = self.unwrapped.episode.agent(agent)
         if found is not None and not _is_present(found):
-            return view._point(agent).blank()
+            return found.point.blank()
         return super().observe(agent)
 
     def _update(self) -> None:
         """Read the rewards, infos and ends of a reset or a step."""
-        env, roster, episode = self.env, self.possible_agents, cast("AgentsView", self.unwrapped).episode
-        infos = {name: env.infos.get(name, {}) for name in roster}
-        self.rewards = {name: env.rewards.get(name, 0.0) for name in roster}
+        env, episode = self.env, self.unwrapped.episode
+        rewards, infos = dict(env.rewards), dict(env.infos)
         while not episode.over and env.terminations[env.agent_selection]:
             env.step(None)
+        self.rewards, self.terminations, self.truncations, self.infos = _pad(self.unwrapped, rewards, infos, {})
         for name, reward in self.rewards.items():
             self._cumulative_rewards[name] += reward
-        self.infos = {name: _info(episode.agent(name), info) for name, info in infos.items()}
-        self.terminations = dict.fromkeys(roster, episode.terminated)
-        self.truncations = dict.fromkeys(roster, episode.truncated)
         self.agent_selection = self.agents[0] if episode.over else env.agent_selection

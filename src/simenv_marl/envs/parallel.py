@@ -8,7 +8,7 @@ from pettingzoo import ParallelEnv
 from ..core.episode import Episode
 from ..core.spaces import duplicate
 from ..simulation import Sentinel
-from .agents import AgentsView
+from .base import AgentsView
 
 Results = tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]
 """The results of a step: observations, rewards, terminations, truncations and infos, by agent."""
@@ -26,7 +26,7 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         agents: The live agents.
     """
 
-    in_rounds = True
+    _in_rounds = True
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -38,13 +38,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
         Returns:
             The observations and the infos, by agent.
         """
-        with self._session.exclusive():
-            episode = self._start(seed, options)
-            self.agents = [*episode.agents, *(agent.name for agent in episode.just_ended)]
-            if self._shows:
-                self.render()
-            observations, *_, infos = self._results(episode)
-            return observations, infos
+        observations, *_, infos = self._start(seed, options)
+        self.agents = list(observations)
+        return observations, infos
 
     def step(self, actions: Mapping[str, Any] | Sentinel) -> Results:
         """Play a round.
@@ -81,14 +77,14 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 self.agents = []
             raise
         self.agents = [] if episode.over else list(episode.agents)
-        results = self._results(episode)
+        results = self._begin(episode)
         if self._shows:
             self.render()
         return results
 
-    def _results(self, episode: Episode) -> Results:
-        """Return the results of a step, by agent."""
-        agents, ended = episode.agents, episode.just_ended
+    def _begin(self, episode: Episode) -> Results:
+        """Return the results of a reset or a step, by agent."""
+        agents, ended, pending = episode.agents, episode.just_ended, episode.pending
         if ended:
             agents = {agent.name: agent for agent in ended} | agents
         terminations, truncations = dict.fromkeys(agents, episode.terminated), dict.fromkeys(agents, episode.truncated)
@@ -102,11 +98,9 @@ class SimulationParallelEnv(AgentsView, ParallelEnv[str, Any, Any]):
                 agent.handed_out = observation  # the caller may change it
             observations[name], rewards[name] = observation, agent.reward
             infos[name] = info = agent.info
-            info["deciding"], info["acted"] = False, agent.acted
+            info["deciding"], info["acted"] = agent is pending, agent.acted
         for agent in ended:
             terminations[agent.name], truncations[agent.name] = True, False
-        if episode.pending is not None:
-            episode.pending.info["deciding"] = True
         return results
 
     def _clear(self) -> None:

@@ -1,44 +1,38 @@
-"""The single view: a Gymnasium environment of one agent."""
+"""The single view: a Gymnasium environment of one agent. A planner gets it for the agent for which it decides."""
 
-import copy
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from ..core.actions import open_mask
 from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
 from ..core.point import asks_for
-from ..core.session import Session
-from ..errors import ViewError
-from .one_agent import OneAgentView
+from ..errors import BranchError, CopyError, ReentrancyError, ViewError
+from .base import OneAgentView
 
 
 class SimulationEnv(OneAgentView):
-    """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``.
+    """A simulation as a Gymnasium environment of one agent. Made by ``single_env`` and ``generate_env``."""
 
-    Attributes:
-        observation_space, action_space: The agent's spaces, which this environment does not share.
-    """
-
-    takes = ("agent",)
+    _option = "agent"
     _own: Any = None  # its agent during an episode
 
-    def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan: see ``View``."""
-        super().__init__(plan, session)
-        self._agent = str(plan.one_agent)
+    def _set_up(self) -> None:
+        self._agent = str(self._plan.one_agent)
+        self._definition = self._session.plan.active[0].definition
         if self._session.episode is not None:
-            self._own = self._session.episode.agent(self._agent)
+            self._begin(self._session.episode)
 
     @classmethod
-    def check(cls, plan: Plan) -> None:
-        """Check that a plan allows this view: see ``View``."""
-        super().check(plan)
+    def adapt(cls, plan: Plan) -> Plan:
+        """Check that a plan allows this view, and put the goals of its point, if it has any, into the observations."""
         if plan.one_agent is None:
             points = ", ".join(point.point.name for point in plan.active)
             raise ViewError(
@@ -46,6 +40,24 @@ class SimulationEnv(OneAgentView):
                 f" agent; active are {points}. Name the agent with agent=, name one point in points=, answer the"
                 " others with policies=, or use aec_env"
             )
+        definition = plan.active[0].definition
+        if definition.goal_space is None:
+            return super().adapt(plan)
+        parts: dict[str, Any] = {
+            "observation": definition.observation_space_mapping,
+            "achieved_goal": definition.achieved_goal_mapping,
+            "desired_goal": definition.desired_goal_mapping,
+        }
+        asking = {key: asks_for(part, "_simulation") for key, part in parts.items()}
+
+        def observe(*args: Any, _simulation: Any, **kwargs: Any) -> dict[str, Any]:
+            given = {"_simulation": _simulation}
+            return {key: part(*args, **kwargs, **given if asking[key] else {}) for key, part in parts.items()}
+
+        goal: Any = definition.goal_space
+        space = spaces.Dict({"observation": definition.observation_space, "achieved_goal": goal, "desired_goal": goal})
+        changed = replace(definition, observation_space=space, observation_space_mapping=observe)
+        return super().adapt(plan).redefined(plan.active[0].point, changed)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Answer the pending decision with an action, or ``RULE``, and run to the next one.
@@ -71,81 +83,113 @@ class SimulationEnv(OneAgentView):
             return own.observation, own.reward, True, False, own.info
         return own.observation, own.reward, episode.terminated, episode.truncated, own.info
 
-    def _make_spaces(self) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
-        definition = self._plan.active[0].definition
-        return copy.deepcopy((definition.observation_space, definition.action_space))
+    @property
+    def compute_reward(self) -> Callable[[Any, Any, Any], float | NDArray[np.float64]]:
+        """A function that returns the rewards for other goals, if the decision point has a goal.
 
-    def _first_results(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
-        self._own = own = episode.agent(self._agent)
-        assert own is not None
-        return own.observation, own.info
+        Its arguments are the achieved goals, of shape ``goal_space.shape``, or ``(n, *goal_space.shape)`` for n steps;
+        the desired goals, of the same shape; and the info of the step, or a sequence of n infos. It returns the reward,
+        or an array of n rewards.
 
-    def _all_observations(self, episode: Episode) -> tuple[Any, ...]:
-        return (self._own.observation,)
+        Raises:
+            AttributeError: The decision point has no goal.
+        """
+        compute = self._definition.compute_reward
+        if compute is None:
+            raise AttributeError(f"{type(self).__name__} has no compute_reward: its decision point has no goal_space=")
 
-    def _masks(self, episode: Episode) -> list[Any]:
-        mask = self._own.mask
-        return [open_mask(self.action_space) if mask is None else mask]
+        def compute_reward(achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:
+            reward = np.asarray(compute(achieved_goal, desired_goal, info), np.float64)
+            return float(reward) if reward.ndim == 0 else reward
 
-    def _resume_from_replay(self) -> None:
-        self._own = self._running().agents[self._agent]
+        return compute_reward
+
+    def _begin(self, episode: Episode) -> tuple[Any, dict[str, Any]]:
+        self._own = episode.agent(self._agent)
+        return self._own.observation, self._own.info
+
+    def begin_branch(self) -> None:
+        """Prepare the environment of a branch: see ``View``."""
+        self._begin(self.episode)
 
     def _clear(self) -> None:
         self._own = None
 
+    def _observation(self, episode: Episode, agent: str) -> Any:
+        return self._own.observation
 
-class SimulationGoalEnv(SimulationEnv):
-    """The single view of a point with a goal: a ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``."""
-
-    def __init__(self, plan: Plan, session: Session | None = None) -> None:
-        """Make the environment of a plan: see ``View``."""
-        self.check(plan)
-        self._definition = plan.active[0].definition
-        super().__init__(with_goals(plan), session)
-        self._made_of = plan
-
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> float | NDArray[np.float64]:
-        """Return the rewards for other goals.
-
-        Args:
-            achieved_goal: The achieved goals, of shape ``goal_space.shape``, or ``(n, *goal_space.shape)`` for n steps.
-            desired_goal: The desired goals, of the same shape.
-            info: The info of the step, or a sequence of n infos.
-
-        Returns:
-            The reward, or an array of n rewards.
-        """
-        compute = self._definition.compute_reward
-        assert compute is not None
-        reward = np.asarray(compute(achieved_goal, desired_goal, info), np.float64)
-        return float(reward) if reward.ndim == 0 else reward
+    def _deciders(self, episode: Episode) -> list[Agent]:
+        return [self._own]
 
 
-def with_goals(plan: Plan) -> Plan:
-    """Return the same plan with goals in the observations of its one decision point."""
-    definition = plan.active[0].definition
-    parts: dict[str, Any] = {
-        "observation": definition.observation_space_mapping,
-        "achieved_goal": definition.achieved_goal_mapping,
-        "desired_goal": definition.desired_goal_mapping,
-    }
-    asking = {key for key, part in parts.items() if asks_for(part, "_simulation")}
+class PlannerEnv(SimulationEnv):
+    """The single view of an agent whose planner is being asked, for ``branch`` and the functions built on it.
 
-    def observe_with_goals(*args: Any, **kwargs: Any) -> dict[str, Any]:
-        return {key: part(*args, **kwargs) for key, part in parts.items()}
+    The decision is pending until the planner returns an action. A branch is an ordinary environment of the agent, which
+    can be stepped; policies or rules answer for all other agents.
+    """
 
-    def observe_with_simulation(*args: Any, _simulation: Any, **kwargs: Any) -> dict[str, Any]:
-        given = {"_simulation": _simulation}
-        return {key: part(*args, **kwargs, **given if key in asking else {}) for key, part in parts.items()}
+    def _set_up(self) -> None:
+        self._shows = self._branched = False
+        if self._session.episode is not None:  # otherwise the session is going to replay one
+            self._find_agent()
 
-    goal: Any = definition.goal_space
-    space = spaces.Dict({"observation": definition.observation_space, "achieved_goal": goal, "desired_goal": goal})
-    mapping = observe_with_simulation if asking else observe_with_goals
-    changed = replace(definition, observation_space=space, observation_space_mapping=mapping)
-    return plan.redefined(plan.active[0].point, changed)
+    @classmethod
+    def adapt(cls, plan: Plan) -> Plan:
+        """Allow every plan: the agent is the one whose planner is being asked."""
+        return plan
+
+    def _find_agent(self) -> None:
+        episode: Any = self.episode
+        self._own = episode.consulted or episode.pending
+        self._agent, self._definition = self._own.name, self._own.point.definition
+
+    def replayed(self) -> Any:
+        """Make a copy for ``branch`` that stands at the same decision, by a replay."""
+        if self.episode.plan.solo:
+            raise BranchError(
+                "a branch of the environment that a policy is given cannot be branched again by replay; use"
+                ' method="fork"'
+            )
+        return super().replayed()
+
+    def begin_branch(self) -> None:
+        """Turn this environment into a branch that waits for the agent only."""
+        if not self._branched:
+            self._branched = True
+            self._find_agent()
+            self._session.step_out()
+            self.episode.single_out(self._own)
+
+    def check_pending(self) -> None:
+        """Refuse a branch after the planner has returned its action."""
+        episode = self.episode
+        if (episode.pending or episode.consulted) is not self._own:
+            raise episode.refusal()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """In a branch, answer the pending decision and run to the agent's next one."""
+        if not self._branched:
+            raise _refusal("step")
+        return super().step(action)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> NoReturn:
+        """Refuse the reset: this is the environment of one decision."""
+        raise _refusal("reset")
+
+    def close(self) -> None:
+        """End a branch."""
+        if not self._branched:
+            raise _refusal("close")
+        super().close()
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise CopyError("the environment that a policy is given cannot be copied; use branch to continue it")
+
+    __deepcopy__ = __reduce_ex__  # type: ignore[assignment]
 
 
-def single_view(plan: Plan) -> type[SimulationEnv]:
-    """Return the class of the single view for a plan."""
-    SimulationEnv.check(plan)
-    return SimulationEnv if plan.active[0].definition.goal_space is None else SimulationGoalEnv
+def _refusal(use: str) -> ReentrancyError:
+    return ReentrancyError(
+        f"a policy cannot {use} the environment that it is given: it must return an action; branch tries actions out"
+    )

@@ -26,7 +26,7 @@ from ..errors import (
 )
 from ..many.parallel import WorkerPool
 from ..simulation import RULE
-from .one_agent import OneAgentView
+from .base import OneAgentView
 from .vector_batch import SimulationBatch, checked_actions
 
 

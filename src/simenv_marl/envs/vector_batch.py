@@ -18,9 +18,9 @@ from ..core.stacking import stacker
 from ..decision import decision_points
 from ..errors import InvalidActionError, OptionValueError, annotate, short_repr
 from ..many.batch import close_all, step_all
+from .base import OneAgentView
 from .joint import Joint, SimulationJointEnv
-from .one_agent import OneAgentView
-from .single import single_view, with_goals
+from .single import SimulationEnv
 
 Infos = list[tuple[int, dict[str, Any]]]
 """Infos, each with the number of its sub-environment, in the order in which they must be merged."""
@@ -66,8 +66,7 @@ class SimulationBatch:
         self.joint: Joint | None = None
         self.view: type[OneAgentView] = SimulationJointEnv
         if view == "single":
-            self.view, self.view_plan = single_view(plan), plan
-            self.plan = plan if plan.active[0].definition.goal_space is None else with_goals(plan)
+            self.view, self.view_plan, self.plan = SimulationEnv, plan, SimulationEnv.adapt(plan)
             definition = self.plan.active[0].definition
             self.observation_space = deepcopy(definition.observation_space)
             self.action_space = deepcopy(definition.action_space)

@@ -108,7 +108,7 @@ class Player:
 
     def start(self) -> None:
         """Prepare a branch."""
-        self.view.stop_showing()
+        self.view._shows = False
         if isinstance(self.view, SimulationEnv) and isinstance(self.base, Mapping):
             self.episode.delegate(self.base)  # the simulation answers for all other agents
 

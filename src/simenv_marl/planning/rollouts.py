@@ -197,7 +197,7 @@ class Rollouts:
         decision = [player.episode.seed, number, crc32(player.agent.encode(errors="surrogatepass"))]
         self._entropy = [*decision, _KEY, *(() if options.seed is None else (options.seed,))]
         try:
-            player.view.check_reseed()
+            player.view._session.check_reseed()
             self.reseeds = True
         except BranchError:
             self.reseeds = False

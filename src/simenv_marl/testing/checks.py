@@ -15,7 +15,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 
 from ..core.actions import MASK
 from ..core.plan import Plan
-from ..envs.make import VIEWS, view_class
+from ..envs import VIEWS, view_class
 from ..errors import AgentError, InvalidActionError, error_text, short_repr
 from ..simulation import RULE, make_simulation, takes
 from .fingerprint import ABSENT, STATE, describe_differences, general

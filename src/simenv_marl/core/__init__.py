@@ -5,16 +5,13 @@ Each module imports only from those below it::
     branching                   exact continuations of an episode
     provenance                  the record of what an environment was made of
     session                     the simulation of one environment, over all its episodes
-    episode                     one episode, and the life cycle of a decision
-    rounds, run                 rounds of the parallel and joint views; the run on the simulation's stack
-    plan                        the checked description of an environment
-    agent, roster               one agent; who decides where
-    threads                     the driver that runs a simulation in a thread
-    planner, greenlets          policies that get the environment; the driver that runs a simulation in a greenlet
+    episode, plan               one episode, and the life cycle of a decision; the checked description of an environment
+    agent, rounds, run          one agent; rounds of the parallel and joint views; the run on the simulation's stack
     point                       decision points and other events
+    greenlets, threads          the two drivers: a simulation runs in a greenlet, or in a thread
     driver                      the switch between a simulation's stack and its user's; what a simulation has opened
-    context, points             the user's side, with its global generators; points by their names
-    actions                     checks of actions
+    context, points             the user's side, with its global generators; points, agents and policies by their names
+    actions, planner            checks of actions; policies that get the environment
     spaces, stacking            casts and checks of single values; stacks of many
     rng, options, packing       seeds of generators; options; pickles for other processes
 """

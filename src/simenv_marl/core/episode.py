@@ -32,7 +32,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from math import inf
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from greenlet import getcurrent
 
@@ -44,12 +44,15 @@ from .actions import ILLEGAL
 from .agent import Agent
 from .context import ExclusiveLock, GlobalRandom
 from .driver import WAIT, Driver
-from .plan import Plan
-from .point import Point
-from .roster import declared_agents, two_arguments
+from .planner import two_arguments
+from .points import declared_agents
 from .rounds import Rounds
 from .run import Run
 from .spaces import duplicate
+
+if TYPE_CHECKING:
+    from .plan import Plan
+    from .point import Point
 
 LONGEST_TAPE: Final = 200_000
 """How many answers are kept for a replay. The limit keeps a simulation that never ends from filling the memory."""

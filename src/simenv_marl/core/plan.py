@@ -34,8 +34,21 @@ from .greenlets import GreenletDriver
 from .options import Options
 from .planner import DeferredPolicy, PlannerPolicy, bind_session
 from .point import EndAgent, Point, Removal, given_simulation
-from .points import NamedPoint, by_name, find_points, have_instances, locate, own_points, owner_class, portable
-from .roster import agent_names, declared_agents, mentions_agents, resolve_policies, resolve_roster
+from .points import (
+    NamedPoint,
+    agent_names,
+    by_name,
+    declared_agents,
+    find_points,
+    have_instances,
+    locate,
+    mentions_agents,
+    own_points,
+    owner_class,
+    portable,
+    resolve_policies,
+    resolve_roster,
+)
 from .threads import ThreadDriver
 
 DRIVERS: Final[Mapping[str, Callable[..., Driver]]] = {"greenlet": GreenletDriver, "thread": ThreadDriver}

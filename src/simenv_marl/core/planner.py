@@ -14,8 +14,7 @@ from typing import Any, Final
 from weakref import ref
 
 from ..errors import OptionValueError, short_repr
-from ..simulation import RULE, positional
-from .point import asks_for
+from ..simulation import RULE, asks_for, positional
 
 PLANNING: Final[ContextVar[bool]] = ContextVar("simenv_marl.planning", default=False)
 """Whether this code runs in a branch in which a planner tries a candidate action."""
@@ -30,6 +29,13 @@ def takes_info(policy: Callable[..., Any]) -> bool:
 def is_planner(policy: Any) -> bool:
     """Return whether a policy has a keyword-only parameter ``_environment``."""
     return asks_for(policy, "_environment")
+
+
+def two_arguments(policy: Callable[..., Any]) -> Callable[[Any, Any], Any]:
+    """Make a policy callable with observation and info, even if it takes no info or asks for the environment."""
+    if is_planner(policy):
+        return PlannerPolicy(policy)
+    return policy if takes_info(policy) else lambda observation, info: policy(observation)
 
 
 def base_of(base: Any, agent: str) -> Any:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from types import FunctionType
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -15,7 +14,7 @@ from gymnasium import spaces as gym_spaces
 
 from ..decision import DecisionPoint, Definition, inverse
 from ..errors import InvalidActionError, MaskError, short_repr, warn_user
-from ..simulation import RULE
+from ..simulation import RULE, asks_for
 from . import actions, spaces
 from .actions import ILLEGAL, MASK
 from .points import NamedPoint
@@ -28,23 +27,6 @@ MAPPINGS: Final = (
     "agent", "action_mask_mapping", "achieved_goal_mapping", "desired_goal_mapping",
 )  # fmt: skip
 """The parts of a definition, besides ``removed_by``, that get the simulation if they ask for it."""
-
-
-def asks_for(function: Any, name: str) -> bool:
-    """Whether a function has a keyword-only parameter with a given name."""
-    if not callable(function):
-        return False
-    if type(function) is FunctionType and not hasattr(function, "__wrapped__"):
-        code = function.__code__
-        return name in code.co_varnames[code.co_argcount : code.co_argcount + code.co_kwonlyargcount]
-    try:
-        parameter = inspect.signature(function).parameters.get(name)
-    except (TypeError, ValueError):
-        return False
-    if parameter is None or parameter.kind is not parameter.KEYWORD_ONLY:
-        return False
-    own = inspect.signature(function, follow_wrapped=False).parameters  # a wrapper may pass it on as **kwargs
-    return name in own or any(p.kind is p.VAR_KEYWORD for p in own.values())
 
 
 def given_simulation(definition: Definition, simulation: Any) -> Definition:

@@ -11,11 +11,11 @@ from ..errors import InvalidActionError, UnknownAgentError, short_repr, warn_use
 from ..hooks.stacks import EVALUATING
 from ..simulation import RULE, Sentinel
 from .actions import ILLEGAL
-from .agent import Agent
 from .driver import WAIT
 from .spaces import duplicate
 
 if TYPE_CHECKING:
+    from .agent import Agent
     from .episode import Episode
 
 MANY_ROUNDS: Final = 100

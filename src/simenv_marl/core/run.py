@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import (
     ClosedError,
@@ -16,10 +16,12 @@ from ..errors import (
     short_repr,
     warn_user,
 )
-from .agent import Agent
 from .context import ExclusiveLock, GlobalRandom, environment_context
 from .driver import Driver
-from .plan import Plan
+
+if TYPE_CHECKING:
+    from .agent import Agent
+    from .plan import Plan
 
 
 class Run:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ..core.agent import Agent
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.point import asks_for
 from ..errors import BranchError, CopyError, ReentrancyError, ViewError
+from ..simulation import asks_for
 from .base import OneAgentView
 
 

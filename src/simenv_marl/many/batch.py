@@ -24,9 +24,8 @@ from ..core.context import reuse_resources
 from ..core.driver import WAIT
 from ..core.episode import Episode
 from ..core.plan import Plan
-from ..core.planner import DeferredPolicy, PlannerPolicy, is_planner
+from ..core.planner import DeferredPolicy, PlannerPolicy, is_planner, two_arguments
 from ..core.point import Point
-from ..core.roster import two_arguments
 from ..core.session import Session
 from ..core.spaces import duplicate
 from ..core.stacking import rows, stacker

@@ -1,7 +1,5 @@
 """Random generators: those that all code in the process shares, and those of a simulation; new seeds for futures."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterator
 from gc import get_referents

@@ -15,9 +15,9 @@ from ..core.plan import Plan
 from ..core.planner import PlannerPolicy, is_planner
 from ..core.points import Points
 from ..core.spaces import same
-from ..core.stacking import rows, stacker, taken
-from ..errors import DefinitionError, InvalidActionError, OptionValueError, short_repr
-from ..many.batch import BatchPolicy, PolicyKey, policy_keys, run
+from ..core.stacking import stacker, taken
+from ..errors import DefinitionError, OptionValueError, short_repr
+from ..many.batch import BatchPolicy, PolicyKey, policy_keys, read_answers, run
 from ..many.parallel import progress_bar, spread
 from ..many.simulate import check_collect, check_numbers, checked_policies, checked_seeds
 from ..simulation import RULE
@@ -354,17 +354,8 @@ def _agreements(one: NDArray[Any], other: NDArray[Any], tolerance: float) -> NDA
 
 def _ask(policy: Any, batch_policy: BatchPolicy, observations: Any, infos: Any, identities: Any) -> list[Any]:
     """Ask a policy for one action for each decision, and drop the extras."""
-    number, answers = len(identities), batch_policy.answers(observations, infos, identities)
-    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
-        answers = answers[0]
-    actions = [RULE] * number if answers is RULE else rows(answers, integers=False)
-    if actions is None or len(actions) != number:
-        returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
-        raise InvalidActionError(
-            f"{short_repr(policy)} was asked for {number} decisions at once and returned {returned}; it must return"
-            " one action for each row of the observations, in their order"
-        )
-    return actions
+    answers = batch_policy.answers(observations, infos, identities)
+    return read_answers(answers, policy, len(identities))[0]
 
 
 def policy_name(policy: Any) -> str:

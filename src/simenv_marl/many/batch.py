@@ -175,22 +175,33 @@ class Group:
         try:
             identities = [(episode.seed, episode.turns) for episode in waiting] if asked.identifying else ()
             answers = _each(agents) if asked.asking else asked.answers(observations, infos, identities)
-            extras: Mapping[str, Any] = {}
-            if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
-                answers, extras = answers
-            actions = [RULE] * len(waiting) if answers is RULE else rows(answers, integers=self._discrete)
-            if actions is None or len(actions) != len(waiting):
-                returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
-                raise InvalidActionError(
-                    f"{asked!r} was asked for {len(waiting)} decisions at once and returned {returned}; it must return"
-                    " one action for each row of the observations, in their order"
-                )
+            return read_answers(answers, asked, len(waiting), integers=self._discrete)
         except BaseException as error:
             number, seeds = len(waiting), ", ".join(str(episode.seed) for episode in waiting[:5])
             seeds = f"{'seed' if number == 1 else 'seeds'} {seeds}{' and others' if number > 5 else ''}"
             annotate(error, f"simenv_marl: in {asked!r}, asked for {number} decisions at once; {seeds}")
             raise
-        return actions, extras
+
+
+def read_answers(
+    answers: Any, policy: Any, number: int, *, integers: bool = False
+) -> tuple[list[Any], Mapping[str, Any]]:
+    """Return the actions and the extras in what a policy has returned for a number of decisions.
+
+    Raises:
+        InvalidActionError: It has not returned one action for each.
+    """
+    extras: Mapping[str, Any] = {}
+    if type(answers) is tuple and len(answers) == 2 and isinstance(answers[1], Mapping):
+        answers, extras = answers
+    actions = [RULE] * number if answers is RULE else rows(answers, integers=integers)
+    if actions is None or len(actions) != number:
+        returned = short_repr(answers) if actions is None else f"{len(actions)} actions"
+        raise InvalidActionError(
+            f"{short_repr(policy)} was asked for {number} decisions at once and returned {returned}; it must return"
+            " one action for each row of the observations, in their order"
+        )
+    return actions, extras
 
 
 def _each(agents: Sequence[Any]) -> Any:

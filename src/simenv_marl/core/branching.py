@@ -95,7 +95,7 @@ def branch(
         BaseException: Any exception of the function or ``reseed``, with a note that names the continuation.
     """
     view = pending_view(env, "branch")
-    can_fork = hasattr(os, "fork") and view._session.plan.options.driver == "greenlet"
+    can_fork = hasattr(os, "fork") and view.driver == "greenlet"
     _check(n, method, seeds, time_limit, can_fork=can_fork)
     if seeds is not None:
         view._session.check_reseed()

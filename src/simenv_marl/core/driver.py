@@ -229,7 +229,7 @@ class Driver:
         job, self._job = self._job, None
         try:
             if self._events or self._handled:
-                self._enter_hooks()
+                self.enter_hooks()
             result = job()
         except BaseException as error:
             return FAILED, [self._explain(error)], None
@@ -291,9 +291,10 @@ class Driver:
     def show(self) -> None:
         """On the stack, enter all hooks, so that the driver takes part in calls."""
         if getcurrent() is self.stack:
-            self._enter_hooks()
+            self.enter_hooks()
 
-    def _enter_hooks(self) -> None:
+    def enter_hooks(self) -> None:
+        """Enter all hooks with the interceptors that they need now. Any code may call this."""
         stack = self.stack
         if stack is not None:
             for hook in (*self._events, *self._handled):
@@ -321,7 +322,7 @@ class Driver:
             if self._refused is None and self._process_refused is None:
                 self._refused = error
                 self._events = dict.fromkeys(self._events, _REFUSED)
-                self._enter_hooks()
+                self.enter_hooks()
             raise error
 
         return refuse
@@ -329,7 +330,7 @@ class Driver:
     def refuse_all(self, where: str) -> None:
         """Refuse all decisions in this process. Only the model gets the errors."""
         self._process_refused = where
-        self._enter_hooks()
+        self.enter_hooks()
 
     def refusal(self) -> WrongThreadError:
         """Make the error that tells the user of a refused decision."""

@@ -91,6 +91,11 @@ class View:
         return self._session.simulation
 
     @property
+    def driver(self) -> str:
+        """The name of the driver: "greenlet" or "thread"."""
+        return self._plan.options.driver
+
+    @property
     def plugins(self) -> list[Entry]:
         """The handlers of the option ``plugins``: tuples of handler, dotted name of the target, and position."""
         return [] if self._plan.plugins is None else self._plan.plugins.entries

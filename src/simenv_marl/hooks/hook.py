@@ -292,7 +292,7 @@ class Hook(Target):
             if isinstance(key, greenlet):
                 driver = STACKS.get(key, OUTSIDE)
                 if driver is not OUTSIDE:
-                    driver.show()
+                    driver.enter_hooks()
             elif key not in self.slot and (key is not None or not replaced):  # garbage collection may change the slot
                 interceptors.pop(key, None)
         interceptors.roots = set() if self.slot or replaced else _ROOTS

@@ -124,7 +124,7 @@ class Driver:
         lost: Whether no thread of this process can resume the simulation any more.
         at_home: Whether this code runs in the simulation's thread.
         own_thread: Whether the simulation has a thread of its own.
-        opened: The sockets, processes and threads that the simulation has opened: see ``open_resources``.
+        opened: The sockets, processes and threads that the simulation has opened; None before the first one.
     """
 
     __slots__ = (
@@ -148,7 +148,7 @@ class Driver:
         """Prepare a driver. The first job begins the stack. ``opened``: what was opened on an earlier stack."""
         self.plugins = plugins
         self._handled: tuple[Hook, ...] = () if plugins is None else tuple(plugins.hooks)
-        self.opened: WeakSet[Any] = WeakSet() if opened is None else opened
+        self.opened = opened
         self.stack: greenlet | None = None
         self.caller: greenlet | None = None
         self.given_up: str | None = None
@@ -397,6 +397,8 @@ def _noting(method: Any) -> Any:
             self.run = partial(_run_registered, driver, self.run)  # type: ignore[method-assign]
         method(self, *args, **kwargs)
         if driver is not None:
+            if driver.opened is None:  # made when it is needed, because an empty one takes a kilobyte
+                driver.opened = WeakSet()
             driver.opened.add(self)
 
     return note
@@ -412,10 +414,10 @@ def _run_registered(driver: Driver, run: Callable[[], None]) -> None:
         STACKS.pop(here, None)
 
 
-def open_resources(opened: Iterable[Any]) -> dict[Any, str]:
+def open_resources(opened: Iterable[Any] | None) -> dict[Any, str]:
     """Describe each thing that is still alive or open, in a few words; sockets by their descriptor."""
     found: dict[Any, str] = {}
-    for thing in list(opened):
+    for thing in list(opened or ()):
         if isinstance(thing, socket) and thing.fileno() >= 0:
             found[thing.fileno()] = f"a socket (descriptor {thing.fileno()})"
         elif isinstance(thing, Thread) and thing.is_alive():

@@ -80,7 +80,7 @@ class PlannerPolicy:
         base = base_of(getattr(self.policy, "base", RULE), (episode.consulted or episode.pending).name)
         if base is RULE or not callable(base) or is_planner(base):
             return RULE
-        return base(observation, info) if takes_info(base) else base(observation)
+        return two_arguments(base)(observation, info)
 
     def answer(self, observation: Any, info: Any, environment: Any) -> Any:
         """Ask the planner for an action, and give it an environment."""

@@ -70,9 +70,9 @@ class Joint:
     def observe(self, episode: Episode) -> Any:
         """Return the observations of all agents; an agent that has ended keeps its last observation."""
         observations = {}
-        for name, point in self.roster.items():
-            observation = (episode.agents.get(name) or episode.ended[name]).observation
-            observations[name] = point.blank() if observation is None else duplicate(observation)
+        for name, agent in self.agents(episode).items():
+            observation = agent.observation
+            observations[name] = agent.point.blank() if observation is None else duplicate(observation)
         if self._flatten:
             return np.concatenate(list(observations.values())).astype(self.observation_space.dtype)
         return observations
@@ -84,9 +84,13 @@ class Joint:
             reward += agent.reward
         return reward
 
+    def agents(self, episode: Episode) -> dict[str, Agent]:
+        """The agents of an episode, live or ended, in the order of the roster."""
+        return {name: episode.agents.get(name) or episode.ended[name] for name in self.roster}
+
     def inform(self, episode: Episode) -> dict[str, Any]:
         """Return the info of a step or a reset, with the time since the previous one."""
-        agents = {name: episode.agents.get(name) or episode.ended[name] for name in self.roster}
+        agents = self.agents(episode)
         info: dict[str, Any] = {
             "deciding": episode.pending.name if episode.pending is not None else "",
             "acted": {name: agent.acted for name, agent in agents.items()},
@@ -171,7 +175,7 @@ class SimulationJointEnv(OneAgentView):
         return self.joint.observe(episode)
 
     def _deciders(self, episode: Episode) -> list[Agent]:
-        return [episode.agents.get(name) or episode.ended[name] for name in self.joint.roster]
+        return list(self.joint.agents(episode).values())
 
 
 def _concatenate(parts: list[spaces.Space[Any]]) -> spaces.Space[Any]:
